@@ -194,7 +194,7 @@ FAULTS = {
     f"K: {FLAT}\nimage_width: -4\nimage_height: 2\n": ": image_width must be a whole number, 0 or more",
     f"K: {FLAT}\nK: {FLAT}\n": ":2: the key 'K' appears twice",
     "K: [\n": ":2: is not valid YAML",
-    '{"K": [1, NaN]}': ": is not valid JSON (NaN is no number)",
+    '{"K": [1, NaN]}': ": is not valid JSON (NaN is not a number)",
     '{"K": 1, "K": 2}': ": is not valid JSON (a key appears twice)",
     "<opencv_storage>\n<K>": ":2: is not valid XML",
     "<html/>": ": is <html> and not OpenCV's <opencv_storage>",

@@ -21,8 +21,8 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
+from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.fitting_in import fitted_in
 from neurocal_cli.io.exchange.formats import FORMATS
 from neurocal_cli.io.exchange.reading import read_cameras
 
@@ -42,8 +42,8 @@ def lens(model: str, skew: float = 0.0, name: str = "camera") -> Camera:
 
 def written(cameras: CameraSet, target: str, folder: Path, ending: str = ".file") -> list[Path]:
     """The files of a format, as `convert` writes them."""
-    fitted = fitted_in(cameras, FORMATS[target], force=False)
-    files = FORMATS[target].text(fitted.cameras, ending)
+    adapted = adapt_cameras(cameras, FORMATS[target], force=False)
+    files = FORMATS[target].text(adapted.cameras, ending)
     folder.mkdir(exist_ok=True)
     places = [folder / (name or f"single{ending}") for name in files]
     for place, content in zip(places, files.values(), strict=True):
@@ -115,7 +115,7 @@ def test_a_chain_of_four_cameras_goes_through_kalibr_colmap_and_mrcal(tmp_path: 
             same_pose(pose, expected)
     assert len(written(given, "mrcal", tmp_path / "mrcal")) == 4
     with pytest.raises(InputError, match="holds 2 cameras at most, and there are 4"):
-        fitted_in(given, FORMATS["opencv"], force=True)
+        adapt_cameras(given, FORMATS["opencv"], force=True)
 
 
 @settings(max_examples=30, deadline=None)
@@ -138,17 +138,17 @@ def test_any_pose_between_two_cameras_comes_back(
 def test_programs_that_ignore_skew_get_the_nearest_camera_without_it(tmp_path: Path) -> None:
     skewed = lens("plumb_bob", 1.5)
     for target in ("opencv", "ros"):
-        fitted = fitted_in(CameraSet((skewed,)), FORMATS[target], force=False)
-        (loss,) = fitted.losses
+        adapted = adapt_cameras(CameraSet((skewed,)), FORMATS[target], force=False)
+        (loss,) = adapted.losses
         assert "ignore skew" in loss
-        camera = fitted.cameras.cameras[0]
+        camera = adapted.cameras.cameras[0]
         assert camera.A[0, 1] == 0
         error = np.hypot(*(camera.project(some_points())[0] - skewed.project(some_points())[0]).T)
         ignored = replace(skewed, intrinsics=Intrinsics(*skewed.intrinsics.values()[:4]))
         plain = np.hypot(*(ignored.project(some_points())[0] - skewed.project(some_points())[0]).T)
         assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(plain**2))
     for target in ("neurocal", "matlab", "json", "npz"):
-        assert not fitted_in(CameraSet((skewed,)), FORMATS[target], force=False).losses
+        assert not adapt_cameras(CameraSet((skewed,)), FORMATS[target], force=False).losses
         same(read_back(written(CameraSet((skewed,)), target, tmp_path)).cameras[0], skewed)
 
 
@@ -156,21 +156,21 @@ def test_the_loss_in_pixels_is_that_of_the_pixels_of_the_image() -> None:
     """The nearest plumb_bob of a rational lens, measured on another grid."""
     given = lens("rational")
     with pytest.raises(InputError, match=r"mrcal|Kalibr") as caught:
-        fitted_in(CameraSet((given,)), FORMATS["kalibr"], force=False)
-    fitted = fitted_in(CameraSet((given,)), FORMATS["kalibr"], force=True)
-    assert fitted.losses[0].split(";")[1] in str(caught.value)
-    stated = float(fitted.losses[0].split(" px rms")[0].split()[-1])
+        adapt_cameras(CameraSet((given,)), FORMATS["kalibr"], force=False)
+    adapted = adapt_cameras(CameraSet((given,)), FORMATS["kalibr"], force=True)
+    assert adapted.losses[0].split(";")[1] in str(caught.value)
+    stated = float(adapted.losses[0].split(" px rms")[0].split()[-1])
     u, v = np.meshgrid(np.linspace(0, 639, 80), np.linspace(0, 479, 60))
     pixels = np.column_stack([u.ravel(), v.ravel()])
     rays = given.unproject(pixels)
-    error = fitted.cameras.cameras[0].project(rays)[0] - pixels
+    error = adapted.cameras.cameras[0].project(rays)[0] - pixels
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(stated, rel=0.2)
 
 
 def test_lengths_of_unknown_unit_are_not_taken_for_metres() -> None:
     given = CameraSet((lens("none"), lens("none")), (RIGHT,))
     with pytest.raises(InputError, match="the unit of OpenCV's file is not known; give --unit"):
-        fitted_in(given, FORMATS["kalibr"], force=True)
+        adapt_cameras(given, FORMATS["kalibr"], force=True)
 
 
 # Files of other programs as they are, and what must not be guessed from them.
@@ -230,11 +230,11 @@ REFUSED = {
     "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1.2, D: [1, 2, 3, 4, 5]}": "and 5 coefficients of the",
     "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1, D: [1, 2, 3, 4], distortion_model: plumb_bob}": "'plumb_bob'",
     "1 THIN_PRISM_FISHEYE 640 480 1 2 3\n": ":1: the camera model 'THIN_PRISM_FISHEYE' is not known",
-    "# a list\n1 OPENCV 640 480 1 2 3\n": ":2: is no line of a OPENCV camera",
-    "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not how they stand",
+    "# a list\n1 OPENCV 640 480 1 2 3\n": ":2: is not the line of a camera with the model OPENCV",
+    "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not their relative poses",
     "{ 'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1] }": "the lens model 'CAHVOR' is not known",
-    "{ 'lensmodel': __import__('os') }": "is no camera model of mrcal",
-    "M1: [1,0,1,0,1,1,0,0,1]\nM2: [1,0,1,0,1,1,0,0,1]\n": "holds two cameras, but not R and T",
+    "{ 'lensmodel': __import__('os') }": "is not a camera model of mrcal",
+    "M1: [1,0,1,0,1,1,0,0,1]\nM2: [1,0,1,0,1,1,0,0,1]\n": "holds two cameras, but not their relative pose",
 }
 
 

@@ -183,7 +183,7 @@ REFUSED = {
     '{"corners": [[["a", 2]]]}': "corners must be the same number",
     "1 2 3\n": "/file: holds places alone",
     "1 2 3\n1 2\n": ":2: must be a row of 2 numbers or of 3",
-    "# filename x y level\na 1\n": ":2: is no line 'filename x y level'",
+    "# filename x y level\na 1\n": ":2: is not a line 'filename x y level'",
     "Calibration results \n====================\n": "Kalibr has no file of corners",
 }
 

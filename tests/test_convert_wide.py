@@ -23,8 +23,8 @@ from neurocal_cli.commands.convert import convert
 from neurocal_cli.distortion.nearest_camera import nearest_camera, with_model
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_files import read_intrinsics
+from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.fitting_in import fitted_in
 from neurocal_cli.io.exchange.formats import FORMATS
 from neurocal_cli.io.exchange.reading import read_cameras
 
@@ -32,9 +32,9 @@ KEPT = [(name, model) for name, target in FORMATS.items() for model in WIDE if m
 
 
 def written(cameras: CameraSet, target: str, place: Path, ending: str = ".file") -> Path:
-    fitted = fitted_in(cameras, FORMATS[target], force=False)
-    assert not fitted.losses
-    (content,) = FORMATS[target].text(fitted.cameras, ending).values()
+    adapted = adapt_cameras(cameras, FORMATS[target], force=False)
+    assert not adapted.losses
+    (content,) = FORMATS[target].text(adapted.cameras, ending).values()
     path = place / f"single{ending}"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
@@ -257,13 +257,13 @@ def test_a_camera_is_its_own_nearest(f: float, k: tuple[float, float], centre: t
 def test_a_format_without_the_model_gets_the_nearest_under_force_alone(target: str) -> None:
     cameras = CameraSet((wide_camera("double_sphere"),))
     with pytest.raises(InputError, match=r"has no distortion model double_sphere; the nearest of its models"):
-        fitted_in(cameras, FORMATS[target], force=False)
-    fitted = fitted_in(cameras, FORMATS[target], force=True)
-    model = fitted.cameras.cameras[0].distortion.model
+        adapt_cameras(cameras, FORMATS[target], force=False)
+    adapted = adapt_cameras(cameras, FORMATS[target], force=True)
+    model = adapted.cameras.cameras[0].distortion.model
     assert (
         model == {"mrcal": "rational", "ros": "fisheye", "colmap": "fisheye", "matlab": "plumb_bob"}[target]
     )
-    assert ("it does not show" in fitted.losses[0]) == (target in ("mrcal", "matlab"))
+    assert ("it does not show" in adapted.losses[0]) == (target in ("mrcal", "matlab"))
 
 
 # The command

@@ -1,6 +1,5 @@
-"""The calibration methods that the paper compares its network with, and OpenCV's.
+"""The methods that the paper compares with its network, and OpenCV's `calibrateCamera`.
 
-Each is a function of a `Problem` that returns a `Found`, which `calibrate_by` makes into a `Calibration` as
-for the network. None of them shares its algorithm with the network, so each is also an independent check
-of it.
+Each is a function of a `Problem` that returns a `Found`; `calibrate_by` converts it to a `Calibration` as for
+the network. None of them shares its solution method with the network, so each is also an independent check.
 """

@@ -1,4 +1,4 @@
-"""A calibration by one of the baselines: the same checks, result and refusals as the network's."""
+"""Calibrate by one of the baselines, with the same checks, result and refusals as for the network."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ BASELINES: dict[str, Callable[[Problem], Found]] = {
 _ASSUMING: dict[str, Callable[[Problem], Problem]] = {"tsai": with_known_centre, "opencv": without_skew}
 
 
-def as_posed(method: str, problem: Problem) -> Problem:
-    """The problem that a method solves: some methods take more parameters as given than the user does."""
+def problem_for_method(method: str, problem: Problem) -> Problem:
+    """The problem that a method solves; some methods take more parameters as given than the user."""
     return _ASSUMING[method](problem) if method in _ASSUMING else problem
 
 
@@ -54,16 +54,16 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     -------
     Calibration
         Its standard deviations come from the normal matrix at the solution. If the method does not minimise
-        the reprojection error, they are those of least squares, and a warning says so.
+        the reprojection error, they are those of a least-squares fit, and a warning says so.
 
     Raises
     ------
     UsageError
-        A problem that the method cannot solve.
+        The method cannot solve this kind of problem.
     InputError, DegenerateGeometryError
-        Points that do not determine a solution, with the reason.
+        The points do not determine a solution; the message gives the reason.
     """
-    found = BASELINES[method](as_posed(method, _unweighted(problem)))
+    found = BASELINES[method](problem_for_method(method, _unweighted(problem)))
     solution = _solution(found)
     calibration = calibration_of(solution, Rejected(), trainer="none", method=method, seed=0, name=name)
     warnings = (*found.remarks, *calibration.warnings)
@@ -86,9 +86,9 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
 
 
 def _unweighted(problem: Problem) -> Problem:
-    """The problem without the covariances that `detect` measures: (3) has none, and they may be wrong.
+    """Remove the covariances measured by `detect`, because (3) has none and they may be wrong.
 
-    Standard deviations that the user states are kept.
+    A sigma stated by the user is kept.
     """
     covariance, views = problem.points.covariance, problem.views
     if covariance is None or not measured(covariance):
@@ -98,7 +98,7 @@ def _unweighted(problem: Problem) -> Problem:
 
 
 def _solution(found: Found) -> Solution:
-    """The method's answer as a `Solution` of the problem, with the normal matrices of the measured points."""
+    """Convert the result to a solution of the problem, with normal matrices for the measured covariances."""
     problem, state = found.problem, found.state
     residuals = point_residuals(problem.views, state) * problem.views.pixel_scale
     order = problem.views.order

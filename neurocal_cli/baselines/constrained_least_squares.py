@@ -9,26 +9,26 @@ import numpy as np
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-_SINGULAR = 1e-12  # of a diagonal entry over the largest, below which rounding rules
+_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
 
 
 def smallest(rows: Array, constrained: int) -> Array:
     """Minimise ``|C y + D z|`` over y, and over z with ``|z| = 1``, where ``rows = [C D]``.
 
-    QR eliminates y; z is then the smallest right singular vector of D's triangular remainder
-    (Faugeras and Toscani 1986 do the same on the normal equations, which loses half of the digits).
+    QR eliminates y. Then z is the smallest right singular vector of the triangular remainder of D. Faugeras
+    and Toscani (1986) do the same with the normal equations, which costs half of the digits.
 
     Parameters
     ----------
     rows : (K, m, n) array
         K problems of m equations each.
     constrained : int
-        Columns of D, the last ones.
+        Number of columns of D, the last ones.
 
     Returns
     -------
     solution : (K, n) array
-        (y, z), each up to its sign.
+        (y, z); the sign is arbitrary for each problem.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a baseline returns, and how it becomes a calibration."""
+"""Result of a baseline."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 @frozen_dataclass(eq=False)
 class Found:
-    """The answer of a baseline.
+    """Result of a baseline.
 
     Attributes
     ----------
     problem : Problem
-        The problem solved; a method may take more parameters as given than the user did.
+        The solved problem; a method may take more parameters as given than the user.
     state : CameraState
         Normalised.
     minimised : bool
-        Whether the state is a minimum of the reprojection error, which only least squares on (3) ensures.
+        Whether the reprojection error is at a minimum, as with least squares on (3).
     iterations : int
     converged : bool
-        False where an iteration was cut short.
+        False if an iteration ended early.
     remarks : tuple of str
-        Warnings for the user.
+        Remarks for the user.
     """
 
     problem: Problem
@@ -35,7 +35,7 @@ class Found:
 
 
 def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
-    """Restore a given distortion, which was removed from the pixels for a pinhole-only method."""
+    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
     distortion = problem.distortion
     if distortion.model == "none" or problem.free_distortion:
         return problem, state

@@ -1,4 +1,4 @@
-"""SciPy's least squares for the baselines, independent of this package's own minimiser."""
+"""SciPy's least squares for the baselines, independent of this package's own descent."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_DENSE = 150  # unknowns up to which MINPACK is quicker than a sparse trust region
+_DENSE = 150  # greatest number of unknowns for which MINPACK is faster than a sparse trust region
 _TOLERANCE = 1e-12
 _MOST = 200  # steps
-_STEP = 1.5e-8  # of differences
+_STEP = 1.5e-8  # relative step of forward differences
 
 
 @frozen_dataclass(eq=False)
-class Least:
+class Minimum:
     """A minimum.
 
     Attributes
@@ -38,18 +38,19 @@ def least_squares(
     start: Array,
     view: NDArray[np.intp] | None = None,
     shared: int = 0,
-) -> Least:
+) -> Minimum:
     """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns of views, by a trust region.
 
     Parameters
     ----------
     residuals : callable
-        From unknowns (n,) to residuals (m,).
+        Maps unknowns (n,) to residuals (m,).
     start : (n,) array
     view : (m,) int array, optional
-        View of each residual. None: every residual depends on every unknown.
+        View of each residual. Without it, every residual may depend on every unknown.
     shared : int
-        With `view`: the first unknowns, which all views share; the others are each view's own, in order.
+        With `view`: number of the first unknowns, which all views share; the others belong to single views,
+        in order.
     """
     from scipy.optimize import least_squares as minimise
 
@@ -73,13 +74,13 @@ def least_squares(
             max_nfev=_MOST,
             **options,
         )
-    return Least(found.x, int(found.njev or found.nfev), bool(found.status > 0))
+    return Minimum(found.x, int(found.njev or found.nfev), bool(found.status > 0))
 
 
 def _differences(
     residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp] | None, shared: int, sparse: bool
 ) -> Any:
-    """Jacobian (m, n) by finite differences; the unknowns of different views are varied together."""
+    """Derivatives (m, n) by forward differences; the unknowns of different views are varied together."""
     at = residuals(x)
     if view is None:
         view, shared = np.zeros(len(at), dtype=np.intp), len(x)

@@ -1,25 +1,24 @@
-"""Linear calibration in closed form, without iteration (Faugeras and Toscani 1986; Zhang 2000).
+"""Linear calibration in closed form, without initial values (Faugeras and Toscani 1986; Zhang 2000).
 
 Solid views. Each point gives two equations that are linear in P,
 
     (p_1.M + p_14) - u (p_3.M + p_34) = 0,   (p_2.M + p_24) - v (p_3.M + p_34) = 0,
 
-and their squares are minimised with |p_3| = 1, the constraint of Faugeras and Toscani. It makes the answer
-independent of the coordinates: if the world is rotated, shifted or scaled, or the pixels are shifted or
-scaled, the sum of squares and |p_3| change by constant factors only. The naive constraint p_34 = 1 lacks
-this property. It weights the points according to the choice of the world's origin, and fails if that origin
-lies in the camera's focal plane, as the corner of a room may.
+and the sum of their squares is minimised with |p_3| = 1. With this constraint of Faugeras and Toscani, the
+solution does not depend on the coordinates: under rotation, shift and scaling of the world, and under shift
+and scaling of the pixels, the sum of squares and |p_3| change only by constant factors. The naive constraint
+p_34 = 1 lacks this invariance. It weights the points depending on the world's origin, and fails if the origin
+lies in the camera's focal plane, as may happen if it is a corner of a room and the camera stands behind it.
 
-Flat views have no third column of P. Their homographies are found with the whole of H of unit length, in
-normalised coordinates (Hartley 1997).
+Flat views have no third column of P. Their homographies H are estimated with unit norm of H, in normalised
+coordinates (Hartley 1997).
 
 Intrinsics. Zhang's closed form for omega = A^-T A^-1: the columns of each A^-1 P are perpendicular and of
 equal length, which gives two linear equations in omega for a flat view and five for a solid one. For a single
-solid view this is the decomposition of Faugeras. A given centre and a given right angle set entries of omega
-to zero.
+solid view this is the decomposition of Faugeras. A given centre and a given right angle are zeros of omega.
 
-The residuals are algebraic, not pixel errors, so the answer is not the minimum of (3) and is more sensitive
-to noise.
+The squares are not those of pixel errors, so this is not the minimum of (3), and noise has more effect than
+necessary.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ def linear(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        A distortion model, which linear calibration cannot estimate.
+        Distortion is to be estimated, which linear calibration cannot.
     DegenerateGeometryError
-        Too few points in a view; noise so large that no camera fits.
+        A view has too few points, or noise leaves no valid camera.
     """
     if problem.free_distortion:
         raise UsageError("the method linear estimates no distortion; give distortion none, or another method")
@@ -59,7 +58,7 @@ def linear(problem: Problem) -> Found:
 
 
 def linear_state(problem: Problem) -> CameraState:
-    """The camera and the poses, normalised, without distortion."""
+    """Camera and poses, normalised, without distortion."""
     check_points(problem)
     if problem.type == 4:
         return _camera_of_given_poses(problem)
@@ -73,18 +72,18 @@ def linear_state(problem: Problem) -> CameraState:
 
 
 def whole_groups(problem: Problem, fewest: tuple[int, int]) -> list[tuple[NDArray[np.intp], bool]]:
-    """The flat and the solid views, each with enough points of its own.
+    """Group the views into flat and solid ones; each view must have enough points.
 
     Parameters
     ----------
     problem : Problem
     fewest : (int, int)
-        Points of a flat and of a solid view.
+        Least number of points of a flat and of a solid view.
 
     Raises
     ------
     DegenerateGeometryError
-        A view with too few points.
+        A view has too few points.
     """
     views, flat = problem.views, begin_flat(problem)
     needed = np.where(flat, *fewest)
@@ -99,12 +98,12 @@ def whole_groups(problem: Problem, fewest: tuple[int, int]) -> list[tuple[NDArra
 
 
 def _products(views: Views, members: NDArray[np.intp], flat: bool) -> Array:
-    """A D of each view in normalised coordinates, its centroid in front; (K, 3, I)."""
+    """Product A D of each view in normalised coordinates, with the centroid in front; (K, 3, I)."""
     patterns = views.patterns(members, flat, int(views.counts.max()))
     Z, uv, w = patterns.inputs, patterns.targets[..., :2], np.sqrt(patterns.weights)[..., None]
     K, _, n = Z.shape
     zero = np.zeros_like(Z)
-    # Columns: p_1 p_14, p_2 p_24, then p_34 and p_3, which the constraint is on.
+    # The columns are p_1 p_14, p_2 p_24, then p_34, and p_3, which is constrained.
     last = np.roll(Z, 1, axis=2)
     rows = [
         np.concatenate([a, b, -uv[..., k, None] * last], axis=2) * w
@@ -127,7 +126,7 @@ def _refuse_mirrored(problem: Problem, groups: list[Group]) -> None:
             )
 
 
-# omega's entries 11, 12, 22, 13, 23, 33 in the products a.omega.b.
+# Rows and columns of omega's entries 11, 12, 22, 13, 23, 33.
 _ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
@@ -139,7 +138,7 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     equations = []
     for group in groups:
         columns = np.swapaxes(shift @ group.product, 1, 2)[:, :-1]  # (K, 2 or 3, 3)
-        # Equal and perpendicular columns: the scale of each view's product does not matter.
+        # Normalise, so that the weight of a view does not depend on the scale of its product.
         columns = columns / np.sqrt((columns**2).sum(axis=(1, 2), keepdims=True))
         pairs = [(0, 1)] if group.flat else [(0, 1), (0, 2), (1, 2)]
         equations += [_product_of(columns[:, a], columns[:, b]) for a, b in pairs]
@@ -177,7 +176,7 @@ def _upper_factor(omega: Array) -> Array:
 
 
 def _camera_of_given_poses(problem: Problem) -> CameraState:
-    """Type 4: with the poses given, (3) is linear in A's entries and separates into two linear problems."""
+    """Type 4: with given poses, (3) is linear in A's entries, and solved by linear least squares."""
     views = problem.views
     assert problem.poses is not None  # type 4
     R = np.stack([problem.poses[name].R for name in views.names])

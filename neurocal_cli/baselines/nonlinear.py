@@ -1,7 +1,7 @@
-"""Nonlinear calibration: Levenberg-Marquardt on the pixel error (3) from the linear answer.
+"""Nonlinear calibration: Levenberg-Marquardt on the pixel error (3) from the linear solution.
 
-The paper's second method of comparison. It uses MINPACK through SciPy with finite differences: it shares only
-the projection with `bundle_adjustment`, and reaches the same minimum.
+This is the paper's second method for comparison. The descent is MINPACK's, through SciPy, with numerical
+derivatives. It shares only the projection with `bundle_adjustment`, and ends at the same minimum.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from neurocal_cli.geometry import Array
 
 
 def nonlinear(problem: Problem) -> Found:
-    """Minimise the pixel error from the linear answer.
+    """Minimise the pixel error from the linear solution.
 
     Raises
     ------
     DegenerateGeometryError
-        As `linear`.
+        See `linear`.
     """
     return descend(*as_seen(problem, linear_state(problem)))
 
 
 def descend(problem: Problem, start: CameraState) -> Found:
-    """Minimise the pixel error (3) from any normalised state; a pinhole's distortion starts at zero."""
+    """Minimise the pixel error (3) from a normalised state; free distortion is added to a pinhole."""
     model = problem.distortion.model
     if problem.free_distortion and start.model != model:
         start = replace(start, model=model, k=pinhole_coefficients(model))
@@ -42,7 +42,7 @@ def descend(problem: Problem, start: CameraState) -> Found:
     error, V, F = whitened_residuals(problem.views), len(start.R), len(free)
 
     def state(x: Array) -> CameraState:
-        """At steps from the start: of the camera's free numbers, then of each pose's."""
+        """State at steps from the start: of the camera's free parameters, then of each pose."""
         by_camera = np.zeros((1, 5 + len(start.k)))
         by_camera[0, free] = x[:F]
         by_pose = x[F:].reshape(V, 6) if problem.free_poses else np.zeros((V, 6))
@@ -54,7 +54,7 @@ def descend(problem: Problem, start: CameraState) -> Found:
 
 
 def whitened_residuals(views: Views) -> Callable[[CameraState], Array]:
-    """Function from a state to its (2 N,) residuals in normalised pixels, u and v of point by point."""
+    """Function from a state to its whitened residuals (2 N,) in normalised pixels, u and v of each point."""
     batches = views.batches
     factors = batches.whitening
 

@@ -1,8 +1,8 @@
 """OpenCV's `calibrateCamera`, the most widely used tool, for comparison.
 
-It has no skew; its distortion model is set to the requested one. Flat boards start from its closed form.
-Other targets need an initial camera: as in its tutorials, the centre is the middle of the image and the focal
-length is the image's width.
+It has no skew; its distortion model is set to the requested one. For flat boards it computes initial values
+in closed form. For other targets it needs an initial camera, which is that of tutorials: with the centre in
+the middle of the image and a focal length equal to the image's width.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
 def without_skew(problem: Problem) -> Problem:
-    """The problem as OpenCV solves it: with zero skew given."""
+    """The problem that OpenCV solves: with right angles given."""
     free = problem.free.copy()
     free[1] = False
     return replace(problem, free=free, fixed=problem.fixed | {"theta"})
@@ -42,9 +42,9 @@ def opencv(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        Types 3 and 4; a distortion model that OpenCV lacks.
+        The problem is of type 3 or 4, or OpenCV does not have the distortion model.
     DegenerateGeometryError
-        OpenCV fails, with its reason, or returns numbers that are not a camera.
+        OpenCV refuses the points, or its result is not a valid camera.
     """
     import cv2
 
@@ -79,13 +79,13 @@ def opencv(problem: Problem) -> Found:
     width = len(problem.free_camera) - 5
     state = CameraState(np.array([A[ENTRIES]]), R, t, names, np.array(k, dtype=float).ravel()[:width])
     if not (np.isfinite(state.entries).all() and (state.entries[0, [0, 2]] > 0).all()):
-        raise DegenerateGeometryError("OpenCV ended at numbers that are no camera")
+        raise DegenerateGeometryError("OpenCV's result is not a valid camera; use the method neuro")
     remarks = ("OpenCV's calibrateCamera has no skew: theta is a right angle",)
     return Found(problem, normalised(state, views), minimised=True, remarks=remarks)
 
 
 def _flags(cv2: object, model: str) -> int:
-    """Flags that leave the coefficients of a model free, and no others."""
+    """Flags that free only the coefficients of a model."""
     free = {
         "none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 2, "plumb_bob": 3, "rational": 6,
         "thin_prism": 6, "tilted": 6,

@@ -1,24 +1,24 @@
-"""Tsai's two stages (Tsai 1987): the radial alignment of each view, then the remaining parameters.
+"""Tsai's two-stage calibration (Tsai 1987): radial alignment of each view, then the remaining parameters.
 
-With the image's centre c known and the image axes at right angles, a radial distortion moves a pixel along
-the ray from c, whatever its law. So (x, y) = m - c has the direction of (s X_c, Y_c), s = alpha_u / alpha_v:
+With a known image centre c and perpendicular image axes, any radial distortion moves a pixel along the ray
+from c. So (x, y) = m - c has the direction of (s X_c, Y_c), s = alpha_u / alpha_v:
 
     x (r_2.M + t_y) = y s (r_1.M + t_x)
 
-1. R, t_x and t_y of each view from these equations, which are linear in s r_1, s t_x and r_2 over t_y. That
-   fails where t_y is 0: Tsai asks the user for a world's origin that is imaged well above or below the
-   centre; here the origin is moved to the target's point that is imaged farthest from the centre's row. Solid
-   views determine s. A flat view gives two columns of R without their last entries; these follow because the
-   columns are orthonormal, with the sign that makes the focal length positive.
-2. alpha_v and t_z by linear least squares, then with k1 (and s, where all views are flat) by nonlinear least
-   squares on the pixels. R, t_x and t_y stay.
+1. R, t_x and t_y of each view from these equations, linear in s r_1, s t_x and r_2 over t_y. They fail if t_y
+   is 0. Tsai requires a world origin that is seen well above or below the centre; here the origin is
+   moved to the target point that is farthest above or below. Solid views determine s. A flat view gives two
+   columns of R; the rest follows from unit length and perpendicularity of the rows, with the sign for which
+   the focal length is positive.
+2. alpha_v and t_z by linear least squares; then both and k1 (and s, if all views are flat) by nonlinear least
+   squares on the pixels. R, t_x and t_y stay fixed.
 
-The distortion acts as everywhere in this package, x' = x (1 + k1 r^2); Tsai's own polynomial removes it
-instead. Stage 1 depends on neither.
+The distortion is x' = x (1 + k1 r^2), as everywhere in this package; Tsai's polynomial removes the
+distortion. Stage 1 is independent of both.
 
-The coefficients of stage 1's equations are noisy too, so its result is biased (tests/test_tsai.py; with the
-origin of the paper's scene left in place, the bias would be ten times as large). Stage 2 does not remove the
-bias, and an error of the centre affects all parameters.
+The coefficients of the equations of stage 1 also contain noise, so its results are biased
+(tests/test_tsai.py; without moving the origin, the bias for the paper's scene would be ten times as large).
+Stage 2 does not correct this, and a wrong centre affects all parameters.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Least, least_squares
+from neurocal_cli.baselines.least_squares import Minimum, least_squares
 from neurocal_cli.baselines.linear import whole_groups
 from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
 from neurocal_cli.bundle_adjustment.observability import check_points
@@ -42,7 +42,7 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 
-_FEWEST = 5, 7  # points of a flat and of a solid view: one equation each
+_FEWEST = 5, 7  # points of a flat and of a solid view; each gives one equation
 _DISTORTIONS = ("none", "k1")
 
 
@@ -57,9 +57,9 @@ def tsai(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        Type 4; a distortion other than k1; no image centre.
+        The problem is of type 4, or has a distortion other than k1, or the image centre is unknown.
     DegenerateGeometryError
-        Too few points; equations that no camera satisfies.
+        There are too few points, or no camera satisfies the equations.
     """
     if problem.type == 4:
         raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
@@ -78,12 +78,12 @@ def tsai(problem: Problem) -> Found:
 
 
 def with_known_centre(problem: Problem) -> Problem:
-    """The problem as Tsai solves it: with the image centre and zero skew given (types 1 and 2).
+    """The problem that Tsai's method solves: with image centre and right angles given (types 1 and 2).
 
     Raises
     ------
     UsageError
-        Type 1, and neither a centre nor an image size comes with the points.
+        The problem is of type 1, and the points have neither a centre nor an image size.
     """
     if problem.type in (3, 4):
         return problem
@@ -113,15 +113,15 @@ def _remarks(problem: Problem) -> tuple[str, ...]:
 
 @frozen_dataclass(eq=False)
 class _Alignment:
-    """The result of stage 1 for a group of views.
+    """Result of stage 1 for a group of views.
 
     Attributes
     ----------
     views : (K,) int array
     flat : bool
     rows : (K, 2, 4) array
-        s r_1 with s t_x, and r_2 with t_y; of flat views up to scale, in the coordinates of the plane,
-        without the entries that the plane does not determine.
+        s r_1 with s t_x, and r_2 with t_y. For flat views they are in the coordinates of the plane, up to
+        scale, and without the third column of R.
     """
 
     views: NDArray[np.intp]
@@ -130,7 +130,7 @@ class _Alignment:
 
     @property
     def aspect(self) -> Array:
-        """(K,) s of each solid view."""
+        """(K,) s from each solid view."""
         return np.asarray(np.linalg.norm(self.rows[:, 0, :3], axis=1))
 
     def poses(self, s: float, sign: Array) -> tuple[Array, Array, Array]:
@@ -149,18 +149,18 @@ class _Alignment:
 
 
 def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bool) -> _Alignment:
-    """Stage 1: the radial alignment of some views; x and y (N,) are the points from the centre."""
+    """Stage 1: radial alignment of some views; x and y (N,) are the points relative to the centre."""
     patterns = views.patterns(members, flat, int(views.counts.max()))
     M, w = patterns.inputs[..., :-1], np.sqrt(patterns.weights)[..., None]
     rank = np.minimum(np.arange(M.shape[1]), views.counts[members][:, None] - 1)
     place = views.first[members][:, None] + rank
     px, py = x[place][..., None], y[place][..., None]
-    # The world's origin, moved as Tsai requires: to the point imaged farthest from the line y = 0.
+    # Move the world's origin to the point that is seen farthest from the line y = 0.
     highest = np.abs(py * (w > 0)).argmax(axis=1)[:, :, None]
     origin = np.take_along_axis(M, highest, axis=1)
     M = M - origin
     n = M.shape[2]
-    # Unknowns s r_1, s t_x and r_2, all over t_y, and 1.
+    # The unknowns are s r_1, s t_x and r_2, all over t_y, and 1.
     found = smallest(np.concatenate([-py * M, -py, px * M, px], axis=2) * w, 1)
     found = found / found[:, -1:]
     r1, r2 = found[:, :n], found[:, n + 1 : -1]
@@ -170,14 +170,14 @@ def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bo
     rows[:, 1, 3] = 1.0 - (r2 * origin[:, 0]).sum(axis=1)
     if not flat:
         rows /= np.linalg.norm(r2, axis=1)[:, None, None]
-    # t_y < 0 if the points would project to the side of the centre opposite to their image.
+    # t_y is negative if the points would otherwise lie on the wrong side of the centre.
     X, Y = M @ r1[..., None] + found[:, None, n, None], M @ r2[..., None] + 1.0
     side = ((px * X + py * Y) * w**2).sum(axis=(1, 2))
     return _Alignment(members, flat, rows * np.where(side < 0, -1.0, 1.0)[:, None, None])
 
 
 class _Stages:
-    """Both stages of all views, as functions of the parameters that stage 2 varies."""
+    """Both stages for all views, as functions of the parameters of stage 2."""
 
     def __init__(self, problem: Problem, x: Array, y: Array) -> None:
         self.views = problem.views
@@ -222,11 +222,11 @@ class _Stages:
         one = views.weights
         gg, gm, mm = total(g, g, one), total(g, m, one), total(m, m, one)
         wgm, wmm = total(g, m, one * w), total(m, m, one * w)
-        alone, right = gg - gm**2 / mm, wgm - gm * wmm / mm  # of each view's f, its t_z taken out
+        alone, right = gg - gm**2 / mm, wgm - gm * wmm / mm  # of each view's f, with t_z eliminated
         flat = np.zeros(views.n_views, dtype=bool)
         for group in self.groups:
             flat[group.views] = group.flat
-        other = flat & (right < 0)  # the other sign of a flat view's depths fits better, with f > 0
+        other = flat & (right < 0)  # the other sign of a flat view's pose makes f positive
         self.sign[other] *= -1
         right, wmm = np.where(other, -right, right), np.where(other, -wmm, wmm)
         if f is None:
@@ -245,7 +245,7 @@ def _poses_of_given_camera(problem: Problem) -> CameraState:
     return CameraState(entries[None], R, t)
 
 
-def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
+def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     """Types 1 and 2: both stages."""
     views, centre = problem.views, problem.normalised_entries[3:]
     stages = _Stages(problem, *(views.pixels - centre).T)
@@ -257,7 +257,7 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
             "the radial alignment of these points has no positive focal length; tilt the target more, check "
             "the image centre and that each pixel belongs to its point, or use the method neuro"
         )
-    # Stage 2: f, s if no solid view determines it, k1 if requested, and t_z of each view.
+    # Stage 2: f, s if there is no solid view, k1 if it is to be estimated, and t_z of each view.
     model = problem.distortion.model if problem.free_distortion else "none"
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])

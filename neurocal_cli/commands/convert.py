@@ -150,15 +150,15 @@ def convert(
 def _write_cameras(
     cameras: CameraSet, target: str, model: str | None, force: bool, output: str
 ) -> dict[str, Any]:
-    """Write cameras; return the summary for programs."""
-    from neurocal_cli.io.exchange.fitting_in import fitted_in
+    """Write cameras; what there is to say of them, for programs."""
+    from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
     from neurocal_cli.io.exchange.formats import FORMATS
 
     wanted = FORMATS[target]
-    fitted = fitted_in(cameras, wanted, force, model)
-    contents = wanted.text(fitted.cameras, os.path.splitext(output)[1].lower())
-    note(fitted.remarks)
-    warn(fitted.losses)
+    adapted = adapt_cameras(cameras, wanted, force, model)
+    contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
+    note(adapted.remarks)
+    warn(adapted.losses)
     _write(contents, output, target)
     written = [
         {
@@ -167,14 +167,14 @@ def _write_cameras(
             "image_size": camera.image_size,
             "moved": None if moved is None else asdict(moved),
         }
-        for camera, moved in zip(fitted.cameras.cameras, fitted.moved, strict=True)
+        for camera, moved in zip(adapted.cameras.cameras, adapted.moved, strict=True)
     ]
     return {
         "from": cameras.program,
         "to": target,
         "cameras": written,
-        "n_views": len(fitted.cameras.poses),
-        "warnings": [*fitted.losses, *fitted.remarks],
+        "n_views": len(adapted.cameras.poses),
+        "warnings": [*adapted.losses, *adapted.remarks],
     }
 
 

@@ -158,16 +158,16 @@ def _wanted(
     board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None
 ) -> DetectionOptions:
     from neurocal_cli.detection.batch import DetectionOptions
-    from neurocal_cli.detection.memory import Memory
+    from neurocal_cli.detection.cache import DetectionCache
     from neurocal_cli.io.board_yaml import format_board
 
     kind = cast("Points", points)
-    memory = None
+    known = None
     if cache is not None:
         _check_folder("--cache", cache)
-        memory = Memory(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
+        known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    return DetectionOptions(board, kind, gamma, overlay is not None, strict, memory)
+    return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
 
 
 def _examined(

@@ -1,1 +1,1 @@
-"""Comparison of the network with the other methods on the same points."""
+"""Comparison of the network with other methods on the same points."""

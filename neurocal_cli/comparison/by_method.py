@@ -1,4 +1,4 @@
-"""One interface for all methods, each with the distortion model nearest to the requested one."""
+"""One function for all methods, each with the distortion model that is nearest to the requested one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 def calibrate_with(
     method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
 ) -> Calibration:
-    """Calibrate a camera with no given parameters (type 1) from all points by a method; the target is given.
+    """Calibrate a camera by a method, with nothing known (type 1), from all points of a given target.
 
     Parameters
     ----------
@@ -23,14 +23,14 @@ def calibrate_with(
         One of `METHODS`; backprop is the network with the paper's trainer, opencv is `calibrateCamera`.
     points : Correspondences
     model : str
-        Distortion model; linear has none, and tsai k1 alone.
+        Distortion model; linear uses none, and tsai at most k1.
     skew : bool
     seed : int
 
     Raises
     ------
     NeurocalError
-        The method fails.
+        The method has no solution.
     """
     if method == "opencv":
         return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))
@@ -47,5 +47,5 @@ def calibrate_with(
         skew=skew,
         outliers="keep",
         seed=seed,
-        target="given",  # the other methods do not estimate it
+        target="given",  # the other methods cannot estimate the target
     )

@@ -1,4 +1,4 @@
-"""All methods on a user's own points: errors, time, parameters; for a pair the paper's Table 2 too."""
+"""Compare all methods on a user's points: errors, time, parameters; for two cameras the paper's Table 2."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Progress = Callable[[str, float], None]
 
 @frozen_dataclass(eq=False)
 class Compared:
-    """The result of one method for one camera's points.
+    """Result of a method for the points of one camera.
 
     Attributes
     ----------
     calibration : Calibration or None
-        None if the method fails.
+        None if the method has no solution.
     held_out_px : float [px]
-        Rms error of five-fold cross-validation; NaN if the method fails on a fold.
+        Five-fold cross-validation error (rms); nan if a fold has no solution.
     seconds : float
-        Of the calibration.
+        Time of the calibration.
     problem : str
-        Why the method failed.
+        Reason why there is no solution.
     """
 
     calibration: Calibration | None
@@ -44,15 +44,15 @@ class Compared:
 
 @frozen_dataclass(eq=False)
 class Comparison:
-    """The result of `compare`.
+    """Result of `compare`.
 
     Attributes
     ----------
     points : tuple of Correspondences
-        Of one camera or two, as given to every method.
+        Points of one or two cameras, the same for all methods.
     cameras : tuple of dict of Compared by method
     stereo : dict of StereoEvaluation by method, or None
-        Of two cameras, each calibrated alone as in the paper's section 5.2; for one camera None.
+        For two cameras, each calibrated alone as in the paper's section 5.2; None for one camera.
     notes : tuple of str
     """
 
@@ -71,26 +71,26 @@ def compare(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Calibrate one camera or two by every method.
+    """Calibrate one or two cameras by every method.
 
     Parameters
     ----------
     points : one or two of Correspondences
-        With two, their views are paired by name.
+        Views of two cameras are paired by name.
     methods : sequence of str
-        Of `by_method.METHODS`.
+        From `by_method.METHODS`.
     distortion : str
-        auto: the model that the network's calibration chooses.
+        With auto, all methods use the model selected by the network's calibration.
     skew : bool
     outliers : {"reject", "keep"}
-        reject: points that the network's calibration rejects are left out for all methods.
+        With reject, points that the network's calibration rejects are left out for all methods.
     seed : int
     progress : callable, optional
 
     Raises
     ------
     NeurocalError
-        Points for which the network's calibration fails too.
+        The network's calibration has no solution.
     """
     report = progress or (lambda stage, share: None)
     notes: list[str] = []
@@ -124,9 +124,9 @@ def _compared(method: str, points: Correspondences, model: str, skew: bool, seed
 
 
 def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> float:
-    """Rms error [px] of held-out points of each view, which neither the camera nor the pose was fitted to."""
+    """Rms error [px] of held-out points, to which neither the camera nor the view's pose was fitted."""
     rng = np.random.default_rng(seed)
-    # Every fifth point of each view, in a random order of its points.
+    # A fold is every fifth point of each view, in a random order of its points.
     order = np.lexsort((rng.random(len(points)), points.view_index))
     fold = np.empty(len(points), dtype=np.intp)
     fold[order] = np.arange(len(points)) % _FOLDS
@@ -142,7 +142,7 @@ def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed
 
 
 def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
-    """(N, 2) predicted minus seen [px]."""
+    """(N, 2) predicted minus observed pixels."""
     poses = [calibration.views[name].pose for name in points.view_names]
     R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
     inside = (R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]

@@ -92,7 +92,7 @@ def _triangulation(comparison: Comparison) -> list[list[str]]:
 
 
 def _below(comparison: Comparison) -> list[str]:
-    """The method with the lowest errors, and why methods failed."""
+    """Lines about the methods with the lowest errors, and about methods without a solution."""
     lines = []
     for side, camera in enumerate(comparison.cameras):
         name = f"{_SIDES[side]} camera: " if len(comparison.cameras) == 2 else ""
@@ -110,7 +110,7 @@ def _below(comparison: Comparison) -> list[str]:
 
 
 def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
-    """The best method, with those that are equal to it in the table's digits."""
+    """A line about the best method, with all methods that have the same digits in the table."""
     known = {method: error for method, error in errors.items() if math.isfinite(error)}
     if not known:
         return []
@@ -125,7 +125,7 @@ def _px(value: float) -> str:
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
-    """The comparison as values that JSON can hold; a number that does not exist is None."""
+    """The comparison as values for JSON; missing numbers are None."""
     found: dict[str, Any] = {
         "n_points": [len(points) for points in comparison.points],
         "cameras": [

@@ -1,4 +1,4 @@
-"""Detection of chessboards in images, and measurement of the mid-points of their square edges.
+"""Detect chessboards in images, and measure the mid-points of their square edges.
 
 Data flows one way, from an image to mid-points with covariances:
 
@@ -8,13 +8,13 @@ Step                                        Module
 image -> levels of a pyramid                `finding.levels`
 -> saddle points of the brightness          `finding.saddles` (`finding.subpixel`)
 -> links along edges -> seeds               `finding.links`, `finding.seeds`
--> lattices that grow                       `finding.from_links`, `finding.grow` (`finding.lattice`,
+-> growing lattices                         `finding.from_links`, `finding.grow` (`finding.lattice`,
                                             `finding.predict`, `finding.vertex_check`)
 -> grids, one for each plane                `finding.grids` (`finding.folds`, `overlaps`, `merge`, `accept`,
                                             `stretch`)
 -> identity: the board's coordinates        `identity.identify` (`ends`, `trim`, `placement`,
                                             `linear_camera`)
--> edge fits, each to all its pixels        `fitting.grid_fit` (`initial_fit`, `edge_pixels`, `edge_fit`,
+-> edge fits to all pixels nearby           `fitting.grid_fit` (`initial_fit`, `edge_pixels`, `edge_fit`,
                                             `edge_profile`, `common_parameters`, `fit_quality`)
 -> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.map_fit`
 -> mid-points or vertices with covariance   `measuring`

@@ -1,4 +1,4 @@
-"""Many image files, in one process or several, in the order they were given."""
+"""Detect boards in many image files, in one process or several, in the given order."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
 
 if TYPE_CHECKING:
-    from neurocal_cli.detection.memory import Memory
+    from neurocal_cli.detection.cache import DetectionCache
 
-_WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
-_KEPT = 31 << 20  # bytes; glibc does not adapt to blocks of 32 MiB and more
+_WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
+_KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold
 
 
 @frozen_dataclass
 class DetectionOptions:
-    """What to detect, and how.
+    """Options of a detection.
 
     Attributes
     ----------
@@ -39,11 +39,11 @@ class DetectionOptions:
     points : {"midpoints", "edges", "vertices"}
     gamma : float, optional
     overlay : bool
-        Whether to draw what was found.
+        Whether to draw the detection.
     strict : bool
         Raise unexpected errors instead of reporting them as the problem of one image.
-    memory : Memory, optional
-        Cache of detections.
+    cache : DetectionCache, optional
+        Outcomes of earlier runs; new ones are added.
     """
 
     board: Board
@@ -51,7 +51,7 @@ class DetectionOptions:
     gamma: float | None = None
     overlay: bool = False
     strict: bool = False
-    memory: Memory | None = None
+    cache: DetectionCache | None = None
 
 
 @frozen_dataclass(eq=False)
@@ -67,9 +67,9 @@ class Outcome:
     notes : tuple of str
         Remarks for the user on the image and its detection.
     overlay : bytes, optional
-        A PNG, also of images without the board.
+        A PNG; images without the board have one, too.
     shown : (cols, rows), optional
-        Inner vertices of another board that the image shows.
+        Number of inner vertices of another board in the image.
     """
 
     path: str
@@ -81,7 +81,7 @@ class Outcome:
 
 
 def default_jobs(images: int) -> int:
-    """Number of processes for a number of images."""
+    """Default number of processes for a number of images."""
     return max(1, min(usable_cores(), images // _WORTH_A_PROCESS))
 
 
@@ -93,11 +93,11 @@ def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1)
     paths : sequence of str
     options : DetectionOptions
     jobs : int
-        Processes to share the work; the outcomes are the same for any number.
+        Number of processes; it does not change the outcomes.
     """
     jobs = min(jobs, len(paths))
     if jobs <= 1:
-        keep_memory()
+        retain_freed_memory()
     yield from work_through(partial(detect_file, options=options), paths, jobs, _start_worker)
 
 
@@ -105,7 +105,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
     """Detect the board in one image file; errors become the outcome's problem."""
     try:
         data, source = read_bytes(path)
-        known = None if options.memory is None else options.memory.recall(data)
+        known = None if options.cache is None else options.cache.find(data)
         if known is not None:
             return _named(known, path, source)
         image = parse_image(data, source)
@@ -113,8 +113,8 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         return Outcome(path, problem=str(error))
     try:
         found = _detected(image, options)
-        if options.memory is not None:
-            options.memory.keep(data, found)
+        if options.cache is not None:
+            options.cache.store(data, found)
         return _named(found, path, source)
     except NeurocalError as error:
         problem = str(error)
@@ -128,12 +128,12 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
 
 
 def _named(found: Outcome, path: str, source: str) -> Outcome:
-    """The outcome of an image, with its name."""
+    """Add the name of the image to an outcome."""
     return replace(found, path=path, problem=found.problem and f"{source}: {found.problem}")
 
 
 def _detected(image: Image, options: DetectionOptions) -> Outcome:
-    """The outcome of an image, without its name."""
+    """Detect the board in an image; the outcome has no name of the image yet."""
     grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:
@@ -149,7 +149,7 @@ def _detected(image: Image, options: DetectionOptions) -> Outcome:
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:
-    """Remarks on an incomplete detection; the same texts for all images."""
+    """Remarks on an incomplete detection; their texts do not depend on the image."""
     seen = {one.plane.name for one in found.located}
     names = [plane.name for plane in board.planes if plane.name not in seen]
     if names:
@@ -158,12 +158,12 @@ def _remarks(found: Detection, board: Board) -> Iterator[str]:
         yield "most points are rejected: the image may be blurred, or the board may reflect; see --overlay"
 
 
-def keep_memory() -> None:
-    """Make the C library keep the memory of one image for the next.
+def retain_freed_memory() -> None:
+    """Make the C library reuse the memory of one image for the next.
 
-    glibc returns large blocks to the system, which costs a page fault for every 4 KiB of the next image,
-    until a large block has been freed once: from then on it keeps twice as much (malloc's dynamic
-    threshold). Other C libraries are not affected. Nothing is written into the block.
+    By default glibc returns large blocks to the system, which costs a page fault for every 4 KiB of the next
+    image. Once a large block has been freed, glibc keeps up to twice its size (malloc's dynamic threshold).
+    Other C libraries are not affected. Nothing is written into the block.
     """
     np.empty(_KEPT, dtype=np.uint8)
 
@@ -172,4 +172,4 @@ def _start_worker() -> None:
     """Prepare a worker process, which uses one core."""
     start_worker()
     cv2.setNumThreads(1)
-    keep_memory()
+    retain_freed_memory()

@@ -1,6 +1,6 @@
-"""From one image to labelled points, and from several images to the points of a calibration.
+"""Detect labelled points in one image, and gather those of several images for a calibration.
 
-`detect_points` runs all steps on one image: `find_grids`, `identify`, `measure`, and labels.
+`detect_points` runs all steps on one image: `find_grids`, `identify`, `measure` and `label`.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-_FEWEST = 8  # points; fewer determine hardly more than the pose
-_STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: from a point's index to the other end of its edge
-_PREFIXES = ("h:", "v:", "")  # by kind: of a point's id
+_FEWEST = 8  # points; fewer determine little more than the pose
+_STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
+_PREFIXES = ("h:", "v:", "")  # by kind: prefix of a point's id
 
 
 @frozen_dataclass(eq=False)
 class Labels:
-    """Points of a plane.
+    """Labels of the points of a plane.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Labels:
     kind : (N,) int array
         `EDGE_H` along the plane's x axis, `EDGE_V` along its y axis, or `VERTEX`.
     place : (N, 2) int array
-        The vertex (c, r) that the id names.
+        The vertex (c, r) named in the id.
     """
 
     plane: Plane
@@ -60,7 +60,7 @@ class Labels:
 
     @property
     def order(self) -> NDArray[np.intp]:
-        """The board's own order: by kind, row by row."""
+        """Indices that sort the points by kind and then row by row."""
         return np.lexsort((self.place[:, 0], self.place[:, 1], self.kind))
 
 
@@ -71,20 +71,19 @@ class Detection:
     Attributes
     ----------
     ids : tuple of N str
-        The same for the same point of the board in all images, unless `warnings` says otherwise.
+        A point of the board has the same id in all images, unless `warnings` says otherwise.
     world : (N, 3) array [the board's unit]
     pixels : (N, 2) array [px]
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit vector across the edge of each mid-point, the direction in which it was measured; None for
-        vertices.
+        Unit normal of the edge of each mid-point, the direction in which it is measured; None for vertices.
     image_size : (width, height) [px]
     rejected : int
-        Number of points rejected for their fits.
+        Number of points rejected by the quality tests of their fits.
     warnings : tuple of str
     located : tuple of Located
-        The grids that belong to the board, for pictures; empty where it was found in an earlier run.
+        The grids that belong to the board, for pictures; empty if the detection comes from the cache.
     measured : tuple of Measured
         The points measured on each of them.
     """
@@ -116,17 +115,17 @@ def detect_points(
         Grey, of 8 or 16 bits.
     board : Board
     points : {"midpoints", "edges", "vertices"}
-        Mid-points of the edges between inner vertices, those of the edges to the rim as well, or the inner
-        vertices.
+        Mid-points of the edges between inner vertices; these and the mid-points of the edges to the rim; or
+        the inner vertices.
     gamma : float, optional
         Of the camera, if known: pixels are ``light^(1 / gamma)``.
     grids : list of Grid, optional
-        Result of `find_grids` for the image, if already computed.
+        Result of `find_grids` for the image, if it is already known.
 
     Raises
     ------
     NoBoardError
-        The image does not show the board, or not enough of it. The message says why.
+        The image does not show the board, or not enough of it. The message gives the reason.
     """
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
     identified = _identified(board, found, image)
@@ -164,7 +163,7 @@ def _identified(board: Board, grids: list[Grid], image: NDArray[np.generic]) -> 
 
 
 def wanted_sizes(board: Board) -> list[tuple[int, int]]:
-    """Size of a board of one plane, for `find_grids`."""
+    """Size of a single-plane board, for `find_grids`; empty for several planes."""
     return [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
 
 
@@ -176,12 +175,12 @@ def _check_enough(measured: Iterable[Measured]) -> None:
 
 
 def _directions(measured: Measured) -> Array:
-    """(N, 2) unit vectors across the edges, rounded to 1e-6, far below their errors."""
+    """(N, 2) unit normals of the edges, rounded to 1e-6, which is far below their errors."""
     return np.zeros((0, 2)) if measured.across is None else np.round(measured.across, 6) + 0.0
 
 
 def _sound(measured: Measured) -> Measured:
-    """Reject points whose coordinates or covariances are not finite or not positive definite."""
+    """Reject points whose coordinates are not finite or whose covariance is not positive definite."""
     suu, suv, svv = measured.covariance.T
     with np.errstate(invalid="ignore", over="ignore"):
         good = (suu > 0) & (svv > 0) & (suu * svv > suv**2) & np.isfinite(suu * svv)
@@ -190,7 +189,7 @@ def _sound(measured: Measured) -> Measured:
 
 
 def label(located: Located, measured: Measured) -> Labels:
-    """Label the measured points of a grid with the points of its plane.
+    """Label the measured points of a grid with those of its plane.
 
     Parameters
     ----------
@@ -219,8 +218,7 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
     Raises
     ------
     InputError
-        No image, or images of different size: one camera has one size, and each camera needs a
-        calibration of its own.
+        There is no image, or image sizes differ, so the images come from more than one camera.
     """
     if not detections:
         raise InputError("there are no images with points; give at least one")
@@ -246,7 +244,7 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
 
 
 def _all_directions(found: list[Detection]) -> Array | None:
-    """Of the points of all images; (0, 0) for vertices."""
+    """Measured directions of the points of all images; (0, 0) for vertices."""
     if all(one.across is None for one in found):
         return None
     return np.concatenate(

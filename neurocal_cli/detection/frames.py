@@ -1,8 +1,8 @@
-"""Selection of sharp frames of a video that differ from each other.
+"""Choose frames of a video to measure: sharp ones that differ from each other.
 
-Each short stretch of the video gives its sharpest frame. Among those of about typical sharpness or better,
-the sharpest is taken first, then repeatedly the one that differs most from all taken so far, until the next
-one would hardly differ: a board that is held still gives one frame.
+Each short stretch of the video gives its sharpest frame. Frames much less sharp than the median of these are
+dropped. The sharpest frame is chosen first, then repeatedly the one that differs most from all chosen so far,
+until the next one would hardly differ. So a board that is held still gives one frame.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_STRETCH = 0.25  # seconds; a shaking hand is still for a moment in each
+_STRETCH = 0.25  # seconds; even a shaking hand is still for a moment in it
 _LONGEST = 60  # frames
-_WIDTH = 640  # px; enough to compare sharpness, at less cost
+_WIDTH = 640  # px; enough to measure sharpness, at less cost
 _THUMB = (48, 36)  # px
-_SHARP = 0.4  # of the median sharpness of the stretches
-_DIFFERENT = 6.0  # DN, rms; noise of a still camera leaves 1 after averaging
+_SHARP = 0.4  # least sharpness, relative to the median of the stretches
+_DIFFERENT = 6.0  # DN rms between thumbnails; the noise of a still camera gives 1 after averaging
 
 
 @frozen_dataclass(eq=False)
@@ -40,9 +40,9 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 
     ----------
     frames : iterable of (height, width) uint8 arrays
     most : int
-        Frames to choose at most.
+        Greatest number of frames to choose.
     rate : float
-        Frames a second; of a slow video, such as one of single photographs, each frame may be chosen.
+        Frames per second. In a slow video, such as one of single photographs, every frame is a stretch.
     """
     length = int(np.clip(round(_STRETCH * rate), 1, _LONGEST))
     stretches: list[_Best] = []

@@ -1,8 +1,8 @@
 """Results of finding and measuring: the vertices of a chessboard, and the mid-points of its edges.
 
-Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column, with the
-handedness of the image's u and v. The origin and the choice of c are arbitrary here; `identity` finds those
-of the board.
+Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column. Their handedness is
+that of the image: the turn from growing c to growing r has the sense of that from u to v. The origin and the
+direction of c are arbitrary here; `identity` finds those of the board.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ EDGE_H, EDGE_V, VERTEX = 0, 1, 2
 
 @frozen_dataclass(eq=False)
 class Grid:
-    """Vertices of one chessboard, as far as they were found.
+    """Vertices found on one chessboard.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(cols, rows), as boards are named."""
+        """(cols, rows), the order in which boards are named."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
     @property
@@ -57,7 +57,7 @@ class Grid:
         )
 
 
-_OF_POINTS = ("kind", "index", "pixels", "covariance", "across")  # of `Measured`, one value for each point
+_OF_POINTS = ("kind", "index", "pixels", "covariance", "across")  # of `Measured`, a row per point
 
 
 @frozen_dataclass(eq=False)
@@ -74,14 +74,13 @@ class Measured:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit vectors across the edges of mid-points, the directions in which they were measured; None for
-        vertices.
+        Unit normals of the edges of mid-points, the direction in which each is measured; None for vertices.
     vertices : (rows, cols, 2) array [px]
         The grid's vertices after refinement, NaN where not found or not fitted.
     rejected : int
         Number of fits that were rejected.
     polarity : float [px]
-        Displacement of the edges towards the dark side by gamma, ink and blooming, which has been removed.
+        Displacement of the edges towards the dark side by gamma, ink spread and blooming; already removed.
     """
 
     kind: NDArray[np.int64]
@@ -94,13 +93,13 @@ class Measured:
     polarity: float
 
     def only(self, good: NDArray[np.bool_]) -> Measured:
-        """The good points (N,); the others are rejected."""
+        """Keep the points of a mask (N,); the others are counted as rejected."""
         known = {name: values for name in _OF_POINTS if (values := getattr(self, name)) is not None}
         kept = {name: values[good] for name, values in known.items()}
         return replace(self, **kept, rejected=self.rejected + int((~good).sum()))
 
     def joined_with(self, other: Measured) -> Measured:
-        """Mid-points of the same grid from two sets of edges."""
+        """Join mid-points from two sets of edges of the same grid."""
         both: dict[str, Any] = {
             name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_POINTS
         }

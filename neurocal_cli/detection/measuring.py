@@ -1,10 +1,10 @@
-"""Mid-points or vertices of a grid, measured to the limit set by the pixel noise.
+"""Measure the mid-points or vertices of a grid to the limit set by the pixel noise.
 
-In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Every
-edge is fitted to all the pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
-coordinates of the mid-points along their edges, and the curvature of the edges. Across its edge, a mid-point
-is measured by that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the
-light side; this alternating shift between edges and map is estimated and removed.
+In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Each
+edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
+curvature of the edges and the position of each mid-point along its edge. The position across the edge comes
+from that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the light side: an
+alternating shift between edges and map, which is estimated and removed.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from neurocal_cli.geometry import Array
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 
 _ROUNDING = 1 / 12  # DN^2
-_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of images without noise
-_FAR, _PLACES = 3.0, 601  # sigma on both sides of an edge and samples, to find its middle level
+_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance assumed for noise-free images
+_FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides, and number of samples
 
 
 def measure(
@@ -53,10 +53,11 @@ def measure(
     grid : Grid
         Vertices known to about half a pixel.
     points : {"midpoints", "edges", "vertices"}
-        Mid-points of the edges between known vertices, those of the edges to the rim as well, or vertices.
+        Mid-points of the edges between known vertices; these and the mid-points of the edges to the rim; or
+        vertices.
     gamma : float, optional
-        The image is ``light^(1 / gamma)``, which is inverted first. Without it, the effect of the response
-        on the edges is estimated.
+        Pixels are ``light^(1 / gamma)``; they are linearised first. Without it, the effect of the response on
+        the edges is estimated.
 
     Returns
     -------
@@ -89,7 +90,10 @@ def _nothing(grid: Grid) -> Measured:
 
 
 def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
-    """Mid-points: along the edges from the map, across from the edges; unevenness in px^2."""
+    """Combine positions along the edges from the map with those across from the edge fits.
+
+    The variance across the edges includes `unevenness` [px^2].
+    """
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
     centre = edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
@@ -121,7 +125,7 @@ def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: A
 
 
 def _polarity(fitted: GridFit) -> float:
-    """Displacement [px] of the middle between the levels from the true edge, towards the dark side."""
+    """Displacement of the mid-level crossing from the true edge, towards the dark side [px]."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
     sigma = upper_median(fitted.fit.values[:, BLUR])
     shape = fitted.fit.shape
@@ -136,7 +140,7 @@ def _polarity(fitted: GridFit) -> float:
 
 def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measured:
     fit, (first, second), good = fit_grid_vertices(grid_image, fitted)
-    # Where the two lines cross: n1 . p = offset1, n2 . p = offset2.
+    # Intersection of the two lines: n1 . p = offset1, n2 . p = offset2.
     inverse = np.linalg.inv(np.stack([first.normal, second.normal], axis=1))
     offsets = fit.values[:, [FIRST, SECOND]]
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
@@ -159,7 +163,7 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
 
 
 def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
-    """The image linearised, in units of its own full scale."""
+    """Linearise the image, keeping its full scale."""
     if np.issubdtype(image.dtype, np.integer):
         full = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]
         table = full * (np.arange(full + 1) / full) ** gamma

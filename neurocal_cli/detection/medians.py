@@ -9,17 +9,17 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-MAD_TO_SIGMA = 1.4826  # standard deviation over the median absolute deviation, of normal numbers
-CHI2_MEDIAN = 0.455  # of chi-squared with one degree of freedom
+MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation for a normal distribution
+CHI2_MEDIAN = 0.455  # median of chi-squared with one degree of freedom
 
 
 def median(x: Array) -> float:
-    """The median of an array of any shape, ignoring NaNs; NaN if all are NaN."""
+    """Median of an array of any shape, ignoring NaNs; NaN if nothing is left."""
     return quantile(x, 0.5)
 
 
 def quantile(x: Array, share: float) -> float:
-    """A quantile of an array by linear interpolation, ignoring NaNs; NaN if all are NaN."""
+    """Quantile of an array by linear interpolation, ignoring NaNs; NaN if nothing is left."""
     ordered = x.flatten()
     ordered.sort()  # nan comes last
     count = len(ordered) - int(np.count_nonzero(np.isnan(ordered)))
@@ -32,7 +32,7 @@ def quantile(x: Array, share: float) -> float:
 
 
 def upper_median(x: Array) -> float:
-    """The median, of an even count the upper middle value; NaN for an empty array."""
+    """Median, or the upper of the two middle values for an even count; NaN for an empty array."""
     flat = x.flatten()
     if not len(flat):
         return float("nan")

@@ -1,4 +1,4 @@
-"""Recognition of other targets than chessboards: boards of markers and grids of circles."""
+"""Recognise other calibration targets in an image without a chessboard: markers or a grid of circles."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# tests/test_other_targets.py checks that none is found in noise, blurred boards and the sample images.
-_LONGEST = 1000  # px of the reduced image; enough for the markers and circles of a target
-_MARKERS = 3  # of one family; noise shows one at times
-_WINDOW = 23  # px
+# With these limits tests/test_other_targets.py recognises nothing in noise, blurred boards and sample images.
+_LONGEST = 1000  # px; larger images are reduced to this longer side, which still shows a target's marks
+_MARKERS = 3  # different ones of one family; noise sometimes gives one
+_WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers
 _FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
 _CIRCLES = 16
-_OUTLINE = 16  # px around
-_ELLIPTIC = 0.05  # deviation from an ellipse over its radius; a square's is 0.1
-_EVEN = 0.5  # spread of the distances of neighbours over their median
-_ALIKE = 1.0  # logarithm of the ratio of areas
-_SHARP = 1.25  # times the area at half brightness within a quarter: else a blurred square may be a circle
-_WANTED = "neurocal takes a chessboard; `neurocal detect --help` says which"
+_OUTLINE = 16  # px, least length of an outline
+_ELLIPTIC = 0.05  # deviation from an ellipse over its radius; that of a square is 0.1
+_EVEN = 0.5  # greatest spread of the distances between neighbours over their median
+_ALIKE = 1.0  # greatest logarithm of an area over the median area
+_SHARP = 1.25  # greatest ratio of areas at two brightness levels; a blurred square may look like a circle
+_WANTED = "neurocal takes a chessboard; `neurocal detect --help` describes it"
 
 
 def other_target(grey: NDArray[np.generic]) -> str:
-    """Recognise another target in an image.
+    """Name the other target that an image shows.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def other_target(grey: NDArray[np.generic]) -> str:
     Returns
     -------
     str
-        A message, empty if nothing is recognised.
+        A message; empty if nothing is recognised.
     """
     small = _small(grey)
     if _shows_markers(small):
@@ -56,12 +56,10 @@ def _shows_markers(grey: NDArray[np.uint8]) -> bool:
     aruco = getattr(cv2, "aruco", None)  # missing in older builds of OpenCV
     if aruco is None or not hasattr(aruco, "ArucoDetector"):
         return False
-    how = aruco.DetectorParameters()
-    how.adaptiveThreshWinSizeMin = how.adaptiveThreshWinSizeMax = (
-        _WINDOW  # one is quick, and enough for a few
-    )
+    parameters = aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW
     for family in _FAMILIES:
-        detector = aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, family)), how)
+        detector = aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, family)), parameters)
         _, ids, _ = detector.detectMarkers(grey)
         if ids is not None and len(np.unique(ids)) >= _MARKERS:
             return True
@@ -75,7 +73,7 @@ def _shows_circles(grey: NDArray[np.uint8]) -> bool:
 
 
 def _is_grid(image: NDArray[np.uint8]) -> bool:
-    """Whether dark ellipses are alike, evenly spaced and sharp."""
+    """Whether there are enough dark ellipses of similar size, evenly spaced and sharp."""
     level, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     darkest, brightest = np.quantile(image, [0.02, 0.98])
     found = _ellipses(image, level)
@@ -96,7 +94,7 @@ def _is_grid(image: NDArray[np.uint8]) -> bool:
 
 
 def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: float) -> NDArray[np.float64]:
-    """(n,) area of the other ellipse at the same place as each; NaN if there is none."""
+    """(n,) area of the other ellipse at the same place as each ellipse; nan if there is none."""
     if not len(others):
         return np.full(len(found), np.nan)
     apart = np.hypot(*(found[:, None, :2] - others[None, :, :2]).T).T
@@ -104,7 +102,7 @@ def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: floa
 
 
 def _ellipses(image: NDArray[np.uint8], level: float) -> NDArray[np.float64]:
-    """(n, 3) centres and areas of the dark ellipses, those of the usual size."""
+    """(n, 3) centres and areas of the dark ellipses of about the median size."""
     outlines, _ = cv2.findContours((image < level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     found = []
     for outline in outlines:

@@ -1,4 +1,4 @@
-"""Pictures of detections: points, labels and residuals, drawn over the dimmed image."""
+"""Draw detections: points, labels and residuals over the dimmed image."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from neurocal_cli.geometry import Array
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-_WIDTH = 1500  # px of a picture, as near as whole factors allow
+_WIDTH = 1500  # px of a picture; smaller images are enlarged by a whole factor
 _LINE = 26  # px, height of a line of text
-_CHARACTER = 10  # px, width of a character, nearly
-_SHIFT = 4  # binary digits of drawn coordinates behind the point
-_ARROW = 0.25  # of a square, for a typical residual
+_CHARACTER = 10  # px, approximate width of a character
+_SHIFT = 4  # fractional bits of drawn coordinates
+_ARROW = 0.25  # squares; greatest drawn length of a median residual
 _SCALES = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
 
 _KINDS: dict[int, tuple[str, Colour]] = {
@@ -39,9 +39,9 @@ _GRIDS: tuple[Colour, ...] = ((255, 170, 0), (0, 220, 255), (120, 255, 120), (25
 def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     """Draw the points of a detection.
 
-    Crosses are the measured points, coloured by kind. The red lines are residuals from a smooth map
-    of the plane (a homography, and a polynomial for the lens), enlarged as the title says. The circle is
-    vertex (0, 0) with the axes of the plane; ids stand at the corners.
+    Crosses are the measured points, coloured by kind. Red lines are the residuals from a smooth map of the
+    plane (`plane_residuals`), enlarged by the factor in the title. A circle marks vertex (0, 0), from which
+    the axes of the plane start; the outermost vertices carry their ids.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
 
 
 def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str) -> Picture:
-    """Draw the grids found in an image without the board, with the reason.
+    """Draw the grids found in an image in which the board was not detected, with the reason.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _draw_points(canvas: _Canvas, measured: Measured, kinds: NDArray[np.int64], 
 
 
 def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
-    """Origin, axes and the ids of the outermost vertices found."""
+    """Draw the origin, the axes and the ids of the outermost vertices found."""
     pixels = np.where(np.isfinite(measured.vertices), measured.vertices, located.grid.pixels)
     rows, columns = np.nonzero(np.isfinite(pixels[..., 0]))
     places = np.rint(located.placement.apply(np.stack([columns, rows], axis=-1))).astype(int)
@@ -126,7 +126,7 @@ def _enlargement(lengths: Array, square: float) -> int:
 
 
 class _Canvas:
-    """A dimmed image under lines of text, drawn on in the image's own coordinates."""
+    """A dimmed image below lines of text; drawing uses the coordinates of the image."""
 
     def __init__(self, grey: NDArray[np.generic], lines: Sequence[str]) -> None:
         height, width = grey.shape
@@ -162,15 +162,15 @@ class _Canvas:
         _put(self.picture, text, ((u >> _SHIFT) + 7, (v >> _SHIFT) - 7), colour, 0.5)
 
     def _at(self, pixel: ArrayLike) -> tuple[int, int]:
-        """Place in the picture, in units of 1/16 px; the middle of a pixel stays the middle."""
+        """Position in the picture, in units of 1/16 px; pixel centres are mapped to pixel centres."""
         u, v = (np.asarray(pixel) + 0.5) * self.scale - 0.5
-        limit = 1 << 24  # prevents overflow by outliers
+        limit = 1 << 24  # keeps outliers from overflowing
         u, v = np.clip([u, v + self.top], -limit >> _SHIFT, limit >> _SHIFT)
         return round(float(u) * (1 << _SHIFT)), round(float(v) * (1 << _SHIFT))
 
 
 def _dimmed(grey: NDArray[np.generic]) -> Picture:
-    """Grey values between 20 and 130, in steps of 5: a smaller file, darker than the crosses."""
+    """Map grey values to 20 to 130 in steps of 5: darker than the crosses, and a smaller file."""
     step = max(1, max(grey.shape) // 500)
     low, high = np.percentile(grey[::step, ::step].astype(float), [1, 99])
     share = np.clip((grey.astype(np.float32) - low) / max(float(high - low), 1.0), 0, 1)
@@ -178,6 +178,6 @@ def _dimmed(grey: NDArray[np.generic]) -> Picture:
 
 
 def _put(picture: Picture, text: str, place: tuple[int, int], colour: Colour, size: float) -> None:
-    plain = text.encode("ascii", "replace").decode()  # the font knows no other characters
+    plain = text.encode("ascii", "replace").decode()  # the font has no other characters
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Residuals of measured points from a smooth map of their plane, which show the noise without a camera."""
+"""Residuals of measured points from a smooth map of their plane, to show the noise without a camera."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.geometry import Array
 
-_FEWEST_WIDE = 12  # points for the equidistant lens
-_POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
+_FEWEST_WIDE = 12  # points needed for the equidistant lens
+_POINTS_A_TERM = 6  # least number of points per coefficient of the polynomial; for pictures only
 
 
 def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
-    """Measured pixels minus those of a plane and a polynomial fitted to them.
+    """Residuals of the measured pixels from a plane and a polynomial fitted to them.
 
-    The plane is seen through a pinhole or an equidistant lens, whichever fits better. The polynomial models
-    the real lens's deviations from it; its degree is five, or less for few points.
+    The plane is projected by a pinhole or an equidistant lens, whichever fits better. The polynomial models
+    the deviations of the real lens; its degree is five, or less for few points.
 
     Parameters
     ----------
     measured : Measured
     size : (width, height), optional [px]
-        Of the image; without it, only a pinhole.
+        Of the image; without it, only the pinhole is fitted.
 
     Returns
     -------
     residuals : (N, 2) array [px]
-        Zero for fewer than five points, which any homography fits.
+        Zero for fewer than five points, because a homography fits four exactly.
     """
     grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
     if len(grid) < 5:

@@ -1,9 +1,9 @@
-"""The equidistant lens, and its fit to a flat lattice.
+"""An equidistant lens, and its fit to the vertices of a flat lattice.
 
-A pixel at distance r from the centre sees at the angle r / focal from the axis: roughly what fisheyes do,
-also beyond 90 degrees. A plane is then a homography from grid coordinates to directions. The single focal
-length distinguishes a lens that bends straight lines from a crooked board; the real lens's deviations from it
-are smooth and small. In: vertices with their places in a grid. Out: `WideFit`.
+A ray at the angle t from the axis is imaged at the distance focal * t from the centre. This approximates
+fisheye lenses, also beyond 90 degrees. A plane is then a homography from grid coordinates to directions. The
+single focal length distinguishes a wide lens from a crooked board; the deviations of real lenses are smooth
+and small. In: vertices with their grid coordinates. Out: `WideFit`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Angle of the outermost vertex from the axis, where the search for a focal length begins [rad].
+# Initial focal lengths put the outermost vertex at these angles from the axis [rad].
 _ANGLES = np.geomspace(0.12, 2.1, 16)
-_STEPS = 15  # Levenberg-Marquardt steps from there, at most
-_SMALL = 1e-4  # relative change for derivatives, and at which steps end
+_STEPS = 15  # Levenberg-Marquardt steps from the best of them, at most
+_SMALL = 1e-4  # relative change for numerical derivatives, and of the step at which the iteration ends
 _CENTRE = 0.1  # half diagonals; prior standard deviation of the centre ...
-_SQUARE = 0.05  # ... at which deviations of so many squares are believed
-_FARTHEST = 3.0  # rad; no lens sees farther
+_SQUARE = 0.05  # squares; ... relative to this standard deviation of a vertex
+_FARTHEST = 3.0  # rad; no lens covers more
 
 
 @frozen_dataclass(eq=False)
@@ -36,7 +36,7 @@ class WideLens:
     centre: Array
 
     def angles(self, pixels: Array) -> Array:
-        """Angles (...) from the axis of the rays of pixels (..., 2) [rad]."""
+        """Angles (...) between the axis and the rays of pixels (..., 2) [rad]."""
         away = pixels - self.centre
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
 
@@ -56,7 +56,7 @@ class WideFit:
     ----------
     lens : WideLens
     matrix : (3, 3) array
-        From grid coordinates (c, r, 1) to directions.
+        Homography from grid coordinates (c, r, 1) to directions.
     residual : (N, 2) array [px]
         Of the vertices.
     """
@@ -71,7 +71,7 @@ class WideFit:
 
     @property
     def rms(self) -> float:
-        """Root mean square distance of the vertices from the fit [px]."""
+        """Rms distance of the vertices from the fit [px]."""
         return float(np.sqrt((self.residual**2).sum(axis=1).mean()))
 
 
@@ -84,7 +84,7 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
         Coordinates (c, r) of at least 3 x 3 vertices.
     pixels : (N, 2) array [px]
     size : (width, height) [px]
-        Of the image, whose middle is near the lens's centre.
+        Of the image; its middle is the prior mean of the lens's centre.
     """
     middle, half = 0.5 * (np.array(size, dtype=float) - 1), 0.5 * float(np.hypot(*size))
     farthest = max(float(np.hypot(*(pixels - middle).T).max()), 1.0)
@@ -94,7 +94,7 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
     lenses = np.column_stack([farthest / _ANGLES, np.tile(middle, (len(_ANGLES), 1))])
     errors = _errors(lenses, scaled, pixels)[1]
     best = lenses[np.nanargmin((errors**2).sum(axis=1))]
-    # In units of the vertices' errors, and of the centre's.
+    # Standard deviation of a vertex [px], and its ratio to that of the centre.
     square = _SQUARE * float(np.sqrt(np.ptp(pixels, axis=0).prod() / np.maximum(high - low, 1.0).prod()))
     prior = square / (_CENTRE * half)
     change = np.array([best[0], half, half]) * _SMALL
@@ -127,9 +127,9 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
 
 
 def _errors(lenses: Array, grid: Array, pixels: Array) -> tuple[Array, Array]:
-    """The best-fitting planes (K, 3, 3) for lenses (K, 3), and the errors of the vertices (K, 2 N) [px].
+    """Homographies (K, 3, 3) that fit best for lenses (K, 3), and the errors of the vertices (K, 2 N) [px].
 
-    The errors are those along the radius, then those around the centre; infinite behind the camera.
+    The radial errors come first, then the tangential ones; infinite if a vertex is behind the camera.
     """
     focal = lenses[:, :1]
     u, v = (pixels[:, k] - lenses[:, 1 + k, None] for k in (0, 1))

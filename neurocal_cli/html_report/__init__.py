@@ -1,1 +1,1 @@
-"""Reports as self-contained HTML pages, which also print well."""
+"""Reports as single HTML pages, which need no internet access and print well."""

@@ -1,6 +1,6 @@
-"""Drawings for a page, as SVG: residuals in the image, their scatter, and errors by view.
+"""SVG drawings for a page: residuals in the image, their scatter, and errors by view.
 
-Colours are those of the page, so that they suit its light and its dark theme.
+Colours come from the style of the page, so they suit its light and dark modes.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-_MOST = 4000  # vectors of one drawing
-_LONG = 0.04  # of the image's width, for a residual of three times the rms
+_MOST = 4000  # greatest number of vectors in a drawing
+_LONG = 0.04  # length of a residual of three times the rms, as a share of the image's width
 
 
 def residual_map(
@@ -27,20 +27,20 @@ def residual_map(
     left_out: Array | None = None,
     photograph: bytes | None = None,
 ) -> str:
-    """Residuals as lines from their points, enlarged, in the frame of the image or over its photograph.
+    """Draw residuals as enlarged lines from their points, in an empty frame or over the photograph.
 
     Parameters
     ----------
     pixels, residuals : (N, 2) arrays [px]
     size : (width, height) [px]
     scale : float, optional
-        How many times residuals are enlarged; `enlargement` of these by default.
+        Enlargement of the residuals; by default their `enlargement`.
     bold : float
-        Factor on the thickness of lines, for a small drawing.
+        Factor on the thickness of lines, for small drawings.
     left_out : (M, 2) array, optional [px]
-        Rejected points, drawn as crosses.
+        Points to draw as crosses.
     photograph : bytes, optional
-        A JPEG file that shows the image.
+        The image as a JPEG file.
     """
     width, height = size
     scale = enlargement(residuals, size) if scale is None else scale
@@ -60,7 +60,7 @@ def residual_map(
 
 
 def _photograph(jpeg: bytes | None, size: tuple[int, int]) -> str:
-    """The image, whose pixel centres are whole numbers."""
+    """Embed the image, with pixel centres at whole numbers."""
     if jpeg is None:
         return ""
     data = b64encode(jpeg).decode()
@@ -82,7 +82,7 @@ def _crosses(pixels: Array | None, width: int) -> str:
 
 
 def enlargement(residuals: Array, size: tuple[int, int]) -> float:
-    """A round factor by which residuals (N, 2) can be seen in an image of this size; all in px."""
+    """Round factor that makes residuals (N, 2) [px] visible in an image of a size [px]."""
     rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else 0.0
     if not rms > 0:
         return 1.0
@@ -92,7 +92,7 @@ def enlargement(residuals: Array, size: tuple[int, int]) -> float:
 
 
 def scatter(residuals: Array) -> str:
-    """The residuals (N, 2) [px] as points, with a circle of three times the rms of a coordinate."""
+    """Draw residuals (N, 2) [px] as points, with a circle of three times the rms per coordinate."""
     sigma = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0
     if not sigma > 0:
         return ""
@@ -110,7 +110,7 @@ def scatter(residuals: Array) -> str:
 
 
 def error_bars(names: Sequence[str], errors: Sequence[float], overall: float) -> str:
-    """The rms error of each view as a bar, with a line at that of all."""
+    """Draw the rms error of each view as a bar, with a line at that of all points."""
     count = len(names)
     if not count or not max(errors, default=0) > 0:
         return ""

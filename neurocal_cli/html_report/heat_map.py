@@ -1,7 +1,7 @@
-"""A heat map of an uncertainty for a page, as SVG.
+"""SVG map of an uncertainty for a page; larger values have a stronger colour.
 
-Levels are logarithmic, because the corners of an image can be a hundred times as uncertain as its middle. A
-level is one path of rectangles, so that a map takes some kilobytes.
+Levels differ by equal factors, because the corners of an image can be a hundred times as uncertain as its
+middle. Each level is one path of rectangles, so a map takes only some kilobytes.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 
 _LEVELS = 8
-_CELLS = 120  # across, about
+_CELLS = 120  # approximate number across
 _MOST_DOTS = 1500
 _FAINTEST, _STRONGEST = 0.06, 0.92  # opacity
 
 
 def heat_map(values: Array, size: tuple[float, float], dots: Array, unit: str, label: str) -> str:
-    """Draw values on a grid from edge to edge, interpolated in between.
+    """Draw values given on a grid that reaches from edge to edge, with interpolation.
 
     Parameters
     ----------
     values : (R, C) array
-        Positive; nan where there is none. R and C are two at least.
+        Positive; nan if unknown. R and C are at least 2.
     size : (width, height)
-        Of the area, in the units of the dots.
+        Of the area, in the unit of the dots.
     dots : (N, 2) array
-        Places that are marked.
+        Places to mark.
     unit : str
         Of the values, for the scale below the map.
     label : str
@@ -69,7 +69,7 @@ def heat_map(values: Array, size: tuple[float, float], dots: Array, unit: str, l
 
 
 def _between(values: Array, times: int) -> Array:
-    """Values at the centres of the cells of a finer grid, by linear interpolation."""
+    """Interpolate values linearly at the centres of the cells of a finer grid."""
     rows, columns = ((np.arange((count - 1) * times) + 0.5) / times for count in values.shape)
     r, c = rows.astype(int), columns.astype(int)
     down, across = (rows - r)[:, None], columns - c
@@ -79,7 +79,7 @@ def _between(values: Array, times: int) -> Array:
 
 
 def _rectangles(mask: NDArray[np.bool_]) -> str:
-    """The cells of a mask, with adjacent cells of a row joined to one rectangle."""
+    """Path of the cells of a mask; adjacent cells of a row form one rectangle."""
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(int), axis=1)
     starts, ends = np.argwhere(edges == 1), np.argwhere(edges == -1)
     lengths = ends[:, 1] - starts[:, 1]
@@ -94,7 +94,7 @@ def _opacity(level: int) -> str:
 
 
 def _scale(texts: list[str], unit: str, width: float, height: float, margin: float) -> str:
-    """The colour scale below the map, with the lower bound of each level at its left end."""
+    """Draw the scale of levels below the map, with their bounds."""
     each, font = width / (_LEVELS + 1.5), 0.28 * margin
     parts = ""
     for k, text in enumerate(texts):

@@ -1,4 +1,4 @@
-"""The origin of a result, shown on its page so that it can be reproduced."""
+"""Origin of a result, shown on its page so that it can be reproduced."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Origin:
     Attributes
     ----------
     files : dict of str by name
-        SHA-256 of the input files; of the result's own file if the run is not known.
+        SHA-256 of the input files; of the result's own file if the run is unknown.
     command : str, optional
         The command line.
     versions : dict of str by name
-        Versions of the programs that computed it.
+        Of the programs that computed the result.
     """
 
     files: Mapping[str, str]
@@ -31,7 +31,7 @@ class Origin:
 
 
 def versions() -> dict[str, str]:
-    """The versions of the running programs."""
+    """Versions of the running programs."""
     found = {"neurocal": __version__, "Python": platform.python_version()}
     for name in ("numpy", "scipy"):
         try:

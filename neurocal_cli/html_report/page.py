@@ -1,4 +1,4 @@
-"""The frame of a page: style, sortable tables, enlargeable drawings, and how to reproduce the result."""
+"""Elements of a page: style and script, sortable tables, drawings that can be enlarged, the verdict."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from neurocal_cli import __version__
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.verdict.report import facts
 
-_LONG = 40  # characters of a cell, beyond which it is a text
+_LONG = 40  # characters; longer cells are texts
 
 _STYLE = """
 :root{color-scheme:light dark;--ink:#1c2330;--soft:#5b6472;--paper:#fff;--card:#f4f6f9;
@@ -70,13 +70,13 @@ large.onclick=()=>large.close();
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """A whole page.
+    """Make a whole page.
 
     Parameters
     ----------
     title : str
     parts : iterable of str
-        HTML, one after the other.
+        HTML in order.
     """
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
@@ -91,13 +91,13 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """A section with a heading; nothing if it has no content."""
+    """Make a section with a heading; empty if it has no content."""
     content = "\n".join(part for part in parts if part)
     return f"<h2>{escape(title)}</h2>\n{content}" if content else ""
 
 
 def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
-    """Rows as a table, the first one its headings."""
+    """Make a table of rows, the first of which are the headings."""
     head, *body = rows
     sort = ' class="sort"' if sortable else ""
     texts = [any(len(row[k]) > _LONG for row in body) for k in range(len(head))]
@@ -110,28 +110,28 @@ def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
 
 
 def _cell(content: str) -> str:
-    """A cell; long texts may run over several lines."""
+    """Make a cell; long texts may wrap."""
     return f"<td{' class=text' if len(content) > _LONG else ''}>{escape(content)}</td>"
 
 
 def figure(drawing: str, caption: str) -> str:
-    """A drawing with its caption; nothing without a drawing."""
+    """Make a figure with a caption; empty without a drawing."""
     return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>" if drawing else ""
 
 
 def verdict_block(verdict: Verdict | None) -> str:
-    """The verdict's word, its basis, the reasons and the advice."""
+    """Show the word of the verdict, its measures, reasons and advice."""
     if verdict is None:
-        return '<div class="verdict">no verdict: the file has no points to be judged by. </div>'
+        return '<div class="verdict">no verdict, because the file has no points</div>'
     lists = ""
     for title, entries in (("Reasons", verdict.reasons), ("Advice", verdict.advice)):
         if entries:
             lists += f"<p>{title}</p><ul>{''.join(f'<li>{escape(entry)}</li>' for entry in entries)}</ul>"
-    word = escape(verdict.word)  # read from a file that may be malicious
+    word = escape(verdict.word)  # files may come from untrusted sources
     return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts(verdict))}</span>{lists}</div>'
 
 
 def definitions(entries: Mapping[str, str]) -> str:
-    """A list of names with their values."""
+    """Make a list of names and descriptions."""
     lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in entries.items())
     return f"<dl>{lines}</dl>"

@@ -1,4 +1,4 @@
-"""The pages of a calibration, of a rig and of a zoom lens."""
+"""Pages of a calibration, a rig and a zoom lens."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from neurocal_cli.zoom_lens.report import lens_report
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 _MOST_REJECTED = 200  # rows
-_SETTINGS = 25  # along a control
+_SETTINGS = 25  # samples along a control
 
 
 def calibration_page(
     calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
 ) -> str:
-    """The page of one camera.
+    """Make the page of a camera.
 
     Parameters
     ----------
     calibration : Calibration
     origin : Origin
     photographs : dict of bytes by view, optional
-        JPEG files that show the images.
+        The images as JPEG files.
     """
     size = _size(calibration)
     head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
@@ -54,7 +54,7 @@ def rig_page(
     origin: Origin,
     photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None,
 ) -> str:
-    """The page of two cameras; see `calibration_page`."""
+    """Make the page of a rig; see `calibration_page`."""
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
     pairs = [["pair", "left rms [px]", "right rms [px]"]]
     for a, b in rig.pairs:
@@ -81,7 +81,7 @@ def rig_page(
 
 
 def lens_page(lens: ZoomLens, origin: Origin) -> str:
-    """The page of a zoom lens; see `calibration_page`."""
+    """Make the page of a zoom lens; see `calibration_page`."""
     verdict = judge_lens(lens)
     parts = [
         verdict_block(verdict),
@@ -96,14 +96,14 @@ def lens_page(lens: ZoomLens, origin: Origin) -> str:
 
 
 def _over_settings(lens: ZoomLens) -> str:
-    """A map of the focal length's relative standard deviation over the range of zoom and focus."""
+    """Draw a map of the focal length's relative standard deviation over the range of zoom and focus."""
     low, span = lens.low, np.maximum(lens.high - lens.low, 1e-300)
     share = np.linspace(0, 1, _SETTINGS)
     grid = np.stack(np.meshgrid(share, share if len(low) > 1 else [0.0, 1.0]), axis=-1)
     settings = low + span * grid.reshape(-1, 2)[:, : len(low)]
     try:
         prediction = lens.predict(settings)
-    except InputError:  # the networks give no camera there
+    except InputError:  # the networks give no valid camera there
         return ""
     percent = 100 * prediction.std[:, 0] / prediction.local[:, 0]
     height = 0.75 if len(low) > 1 else 0.15
@@ -126,7 +126,7 @@ def _over_settings(lens: ZoomLens) -> str:
 def _camera_parts(
     calibration: Calibration, photographs: Mapping[str, bytes], parameters: bool = True
 ) -> list[str]:
-    """Sections on one camera: parameters, pictures, views, rejected points, warnings."""
+    """Sections on a camera: parameters, drawings, views, rejected points and views, warnings."""
     parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
     residuals = _residuals(calibration)
     pixels = calibration.points.pixels
@@ -155,7 +155,7 @@ def _camera_parts(
 
 
 def _uncertainty(calibration: Calibration) -> str:
-    """A map of the standard deviation of projected pixels at the points' median distance."""
+    """Draw a map of the standard deviation of projected pixels at the points' median distance."""
     found = uncertainty_over_image(calibration)
     if found is None or calibration.image_size is None:
         return ""
@@ -175,7 +175,7 @@ def _uncertainty(calibration: Calibration) -> str:
 
 
 def _residuals(calibration: Calibration) -> Array:
-    """(N, 2) projected minus observed pixels; nothing for points without a pose."""
+    """(N, 2) projected minus observed pixels; 0 for points that cannot be projected."""
     points = calibration.points
     if not len(points):
         return np.zeros((0, 2))
@@ -224,7 +224,7 @@ def _view_parts(
 
 
 def _left_out(calibration: Calibration, view: str) -> Array:
-    """(M, 2) pixels of a view's rejected points."""
+    """(M, 2) pixels of the rejected points of a view."""
     points = calibration.rejected.points
     if points is None or view not in points.view_names:
         return np.zeros((0, 2))
@@ -284,8 +284,8 @@ def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
 
 
 def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
-    """The run; if it is not known, a command that would give a similar result."""
-    entries = {"command" if origin.command else "a command that gives the like": origin.command or likely}
+    """Describe the run, or a command with a similar result if the run is unknown."""
+    entries = {"command" if origin.command else "a command with a similar result": origin.command or likely}
     entries |= facts
     if origin.versions:
         entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())

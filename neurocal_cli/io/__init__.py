@@ -1,1 +1,1 @@
-"""Reading and writing files: the only part of the package that handles file formats and paths."""
+"""Read and write files: the only part of the package that knows text formats and paths."""

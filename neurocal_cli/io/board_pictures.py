@@ -1,7 +1,7 @@
-"""A sheet with a board as SVG, PDF or PNG, all at their exact size.
+"""Write a sheet with a board as SVG, PDF or PNG, at its exact size.
 
-SVG and PDF hold the squares as polygons in millimetres and points, PNG their exact coverage of each pixel and
-the resolution.
+SVG and PDF contain the squares as polygons, in millimetres and points. PNG contains their exact coverage of
+each pixel, and the resolution.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MOST_PIXELS = 200_000_000
 
 
 def board_svg(sheet: Sheet) -> str:
-    """The sheet as SVG in millimetres."""
+    """Write the sheet as SVG in millimetres."""
     squares = "\n".join(
         f'<path d="M{" L".join(f"{x:.6f} {y:.6f}" for x, y in square)} Z"/>' for square in sheet.squares
     )
@@ -52,7 +52,7 @@ def board_svg(sheet: Sheet) -> str:
 
 
 def board_pdf(sheet: Sheet) -> bytes:
-    """The sheet as a PDF of one page of its size."""
+    """Write the sheet as a PDF of one page of its size."""
 
     def place(point: tuple[float, float] | Array) -> str:
         return f"{point[0] * _POINT:.5f} {(sheet.height - point[1]) * _POINT:.5f}"
@@ -66,7 +66,7 @@ def board_pdf(sheet: Sheet) -> bytes:
     content += [_pdf_text(text, sheet.height) for text in sheet.texts]
     stream = "\n".join(content).encode("ascii")
     box = f"[0 0 {sheet.width * _POINT:.5f} {sheet.height * _POINT:.5f}]"
-    # Viewers that print are asked not to fit the page to the paper.
+    # Ask viewers not to scale the page to the paper when they print it.
     return _pdf(
         [
             b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
@@ -82,7 +82,7 @@ def board_pdf(sheet: Sheet) -> bytes:
 def _pdf_text(text: Text, height: float) -> str:
     shown = text.content.encode("ascii", "replace").decode("ascii")
     shown = shown.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-    # Digits of Helvetica are 0.556 of its size wide, and texts in the middle are numbers.
+    # Centred texts are numbers, and the width of Helvetica's digits is 0.556 of the font size.
     left = text.place[0] - (0.5 * 0.556 * text.size * len(text.content) if text.middle else 0.0)
     x, y = left * _POINT, (height - text.place[1]) * _POINT
     return f"BT /F {text.size * _POINT:.4f} Tf {x:.4f} {y:.4f} Td ({shown}) Tj ET"
@@ -99,12 +99,12 @@ def _pdf(objects: list[bytes]) -> bytes:
 
 
 def board_png(sheet: Sheet, dpi: float) -> bytes:
-    """The sheet as a grey PNG that states its resolution.
+    """Write the sheet as a grey PNG with its resolution.
 
     Raises
     ------
     InputError
-        More than 200 million pixels.
+        The picture has more than 200 million pixels.
     """
     pixels = dpi / 25.4  # per millimetre
     width, height = round(sheet.width * pixels), round(sheet.height * pixels)
@@ -137,7 +137,7 @@ def _dashes(line: Line) -> list[tuple[Array, Array]]:
 
 
 def _cover(ink: NDArray[np.float32], low: Array, high: Array) -> None:
-    """Add an axis-aligned rectangle, each pixel by its covered fraction; [px] from the edge."""
+    """Add an axis-aligned rectangle with corners `low` and `high` [px], by the covered part of each pixel."""
     parts = []
     for axis, count in ((1, ink.shape[0]), (0, ink.shape[1])):
         first, last = max(int(low[axis]), 0), min(int(np.ceil(high[axis])), count)
@@ -163,7 +163,7 @@ def _write_texts(ink: NDArray[np.float32], texts: tuple[Text, ...], pixels: floa
 
 
 def _png(grey: NDArray[np.uint8], dpi: float) -> bytes:
-    """A PNG with the resolution in its chunk pHYs, in whole pixels a metre."""
+    """Encode a PNG with the resolution in its chunk pHYs, in whole pixels per metre."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         check = zlib.crc32(kind + content)
@@ -171,7 +171,7 @@ def _png(grey: NDArray[np.uint8], dpi: float) -> bytes:
 
     height, width = grey.shape
     metre = round(dpi / 0.0254)
-    rows = np.zeros((height, width + 1), dtype=np.uint8)  # each row begins with its filter, none
+    rows = np.zeros((height, width + 1), dtype=np.uint8)  # the first byte of a row is its filter, 0 for none
     rows[:, 1:] = grey
     return b"".join(
         [

@@ -1,4 +1,4 @@
-"""Board YAML: a chessboard target, of one plane or several, as a file that people write."""
+"""Board YAML: a chessboard target of one or several planes, as a file that users write."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_board(path: str | Path) -> Board:
     Raises
     ------
     FormatError
-        The file cannot be read or is no board; the message names the file and the key.
+        The file cannot be read or is not a board; the message names the file and the key.
     """
     return _board(Field(*read_yaml(path)))
 
@@ -50,7 +50,7 @@ def write_board(board: Board, path: str | Path) -> None:
 
 
 def format_board(board: Board) -> str:
-    """Board as the text of a YAML file."""
+    """Text of a board file."""
     lines = [f"unit: {text(board.unit)}", "planes:"]
     for plane in board.planes:
         entries = {"name": text(plane.name)} if plane.name else {}
@@ -97,7 +97,7 @@ def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
 
 
 def _plane(field: Field, *, alone: bool) -> Plane:
-    """One plane; the only plane of a board may omit its name and position."""
+    """Read a plane; a single plane needs no name, origin and axes."""
     _only(field, _PLANE_KEYS)
     cols, rows = (field[key].integer(2) for key in _COUNTS)
     square = field["square"].number()
@@ -112,7 +112,7 @@ def _plane(field: Field, *, alone: bool) -> Plane:
 
 
 def _only(field: Field, known: tuple[str, ...]) -> None:
-    """Refuse unknown keys: a misspelt axis would silently become the default."""
+    """Refuse unknown keys; otherwise a misspelt axis would silently become the default axis."""
     for key in field.entries():
         if key not in known:
             where = f"{field.path}: " if field.path else ""

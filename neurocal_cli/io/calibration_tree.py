@@ -1,4 +1,4 @@
-"""A calibration from the tree of a YAML file, every key of it checked."""
+"""Read a calibration from the tree of a YAML file, checking every key."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neurocal_cli.io.verdict_yaml import read_verdict
 from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
-# camera_matrix repeats the parameters for ROS; a difference beyond rounding means an edit of one.
+# camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
 _SAME = 1e-6
 
 
@@ -37,7 +37,7 @@ def calibration_from_field(root: Field) -> Calibration:
     Raises
     ------
     FormatError
-        A key that is missing or wrong.
+        A key is missing or wrong.
     """
     block = neurocal_block(root)
     views = read_views(block["views"])
@@ -88,7 +88,7 @@ def calibration_from_field(root: Field) -> Calibration:
 
 
 def neurocal_block(root: Field) -> Field:
-    """Find the ``neurocal`` block, after checking the kind of file."""
+    """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
         raise FormatError("is not a calibration; give a file that calibrate wrote", root.source)
     if "neurocal" not in root:
@@ -112,7 +112,7 @@ def neurocal_block(root: Field) -> Field:
 
 
 def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], frozenset[str]]:
-    """Read the intrinsic parameters of a neurocal file, standard deviations and names of given ones."""
+    """Read the intrinsic parameters of a neurocal file, their standard deviations, and the fixed names."""
     parameters = neurocal_block(root)["parameters"]
     values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
     std = {}
@@ -186,7 +186,7 @@ def _network(field: Field) -> NetworkRecord:
 
 
 def _matrices(field: Field, *shape: int) -> dict[str, Array]:
-    """Read a matrix for each view; in a long file the names, and all numbers as texts."""
+    """Read a matrix for each view; a long file has the names, and the numbers of all matrices as texts."""
     if "data" in field and "views" in field and all(isinstance(e.value, str) for e in field["data"].items()):
         names, data = field["views"].texts(), field["data"]
         numbers = Field(read_numbers(list(data.items())), data.source, data.path)

@@ -1,11 +1,11 @@
-"""Calibration files: a camera, its uncertainty and its points, in one YAML file.
+"""Calibration files: a camera, its uncertainty and the data behind it, in one YAML file.
 
-The file is a ROS camera_info file with a block ``neurocal``; numbers are restored to the last bit. Mappings
-are written as blocks with flow collections inside, one entry a line of any length, so that the lines can be
-indented to become part of another file, such as a rig's.
+The file is a ROS camera_info file with a block ``neurocal``; numbers read back to the last bit. Mappings are
+written as blocks with flow collections inside, one entry per line of any length, so the lines can be indented
+to become a part of another file, such as that of a rig.
 
-A long file, with more views or points than PyYAML reads within seconds, stores its tables as texts of
-numbers; see `text_columns`.
+A long file, with more views or points than PyYAML reads within seconds, has its tables as texts of numbers;
+see `text_columns`.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.text_columns import column_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
-from neurocal_cli.io.views_yaml import same_std_keys, view_lines
+from neurocal_cli.io.views_yaml import have_same_std, view_lines
 from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-FORMATS = (1, 2)  # of the neurocal block: tables by rows, and of long files by columns
+FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
 
-# Without these two lines OpenCV 4 opens no YAML; 1.1 is the version that PyYAML and ROS read.
+# OpenCV 4 opens no YAML file without these two lines; 1.1 is the version that PyYAML and ROS read.
 HEADER = ("%YAML 1.1", "---")
 
 _MOST_VIEWS = 100
@@ -45,7 +45,7 @@ _MOST_POINTS = 5000
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
     """Text of a calibration file.
 
-    The same calibration gives the same text; it holds no dates and no paths.
+    The same calibration gives the same text, without dates and paths.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
     Raises
     ------
     InputError
-        A name that UTF-8 cannot hold.
+        A name cannot be encoded as UTF-8.
     """
     return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
 
@@ -64,7 +64,7 @@ def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
 def write_calibration(cal: Calibration, path: str | Path) -> None:
     """Write a calibration file, whole or not at all; ``-`` is stdout.
 
-    A name that ends in ``.json`` or ``.xml`` gets JSON or OpenCV's XML, see `result_files`.
+    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `result_files`.
     """
     from neurocal_cli.io.result_files import write_result
 
@@ -77,9 +77,9 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises
     ------
     FormatError
-        The file cannot be read, is no YAML, or a key is missing or wrong.
+        The file cannot be read, is not YAML, or a key is missing or wrong.
     """
-    # Loading the YAML parser takes 20 ms, which a command that only writes can save.
+    # Importing the parser takes 20 ms, which commands that only write save.
     from neurocal_cli.io.calibration_tree import calibration_from_field
     from neurocal_cli.io.file_storage import read_tree
 
@@ -95,12 +95,12 @@ def calibration_lines(
     ----------
     cal : Calibration
     rectified : (3, 3) and (3, 4) arrays, optional
-        Rectification and projection matrix of a camera on a rig, in ROS's meaning.
+        Rectification and projection matrix of a camera on a rig, as ROS defines them.
     by_rows : bool
         See `format_calibration`.
     """
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and same_std_keys(cal.views)
+    long = large and not by_rows and have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
     yield "neurocal:"
     for lines in (
@@ -139,7 +139,7 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
 
 def _parameter_lines(cal: Calibration) -> Iterator[str]:
     values: dict[str, float] = dict(zip(INTRINSIC_NAMES, cal.intrinsics.values().tolist(), strict=True))
-    # Distortion is not one of the paper's parameters, but it is listed here too if its accuracy is known.
+    # The paper has no distortion parameters, but those with known accuracy are listed here, too.
     lens = dict(zip(coefficient_names(cal.distortion_model), cal.distortion.tolist(), strict=False))
     values.update({name: value for name, value in lens.items() if name in cal.std})
     yield "parameters:"

@@ -1,4 +1,4 @@
-"""Known cameras and poses from files: neurocal's own and those of other programs."""
+"""Read known cameras and poses from files of neurocal and other programs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_intrinsics(path: str | Path) -> Camera:
     Raises
     ------
     FormatError
-        No camera matrix, or an invalid one; several cameras.
+        There is no valid camera matrix, or more than one camera.
     """
     found = read_cameras([path], whole=False)
     if len(found.cameras) > 1:
@@ -39,6 +39,6 @@ def read_extrinsics(path: str | Path) -> dict[str, Pose]:
     Raises
     ------
     FormatError
-        The file cannot be read or holds no poses.
+        The file cannot be read or has no poses.
     """
     return poses_from_field(read_tree(path))

@@ -1,4 +1,4 @@
-"""A camera without poses as a ROS camera_info file, which every calibration file begins with."""
+"""A camera without poses as a ROS camera_info file, the beginning of every calibration file."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = No
     ----------
     camera : Camera
     rectified : (3, 3) and (3, 4) arrays, optional
-        Rectification and projection matrix of a camera on a rig; default: of a camera alone.
+        Rectification and projection matrix of a camera on a rig; by default those of a single camera.
     """
     R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
-    width, height = camera.image_size or (0, 0)  # ROS's readers want numbers
+    width, height = camera.image_size or (0, 0)  # ROS's readers require numbers
     model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)
     yield f"camera_name: {text(camera.name)}"
     yield f"image_width: {width}"
@@ -49,7 +49,7 @@ def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = N
 
 
 def format_panorama(panorama: Panorama) -> str:
-    """Text of the file for a cylindrical or spherical picture, which has no camera matrix."""
+    """Text of the file of a panorama on a cylinder or a sphere, which has no camera matrix."""
     width, height = panorama.image_size
     lines = [
         f"# A point (X, Y, Z) is seen at {_FORMULAS[panorama.shape]}.",

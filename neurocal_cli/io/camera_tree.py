@@ -1,8 +1,8 @@
-"""A camera from the tree of a file, by the key names in common use.
+"""Read a camera from the tree of a file, by the names of keys that are in use.
 
-The keys are those of ROS, of OpenCV's samples and of the many programs that store what ``calibrateCamera``
-returned. An unknown key that may be the distortion is refused: a camera without its distortion looks right
-but is wrong.
+These are the keys of ROS, of OpenCV's samples, and of the many programs that store the results of
+``calibrateCamera``. An unknown key that may be the distortion is refused, because a camera without its
+distortion looks right but is wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.distortion_names import from_ros
 from neurocal_cli.io.tree_fields import Field
 
-# Ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
+# The keys of neurocal and ROS come first; in stereo files of OpenCV's sample the left camera has M1, D1.
 _MATRIX_KEYS = (
     "camera_matrix", "cameraMatrix", "camera_Matrix", "CameraMatrix", "K", "k", "mtx", "M", "M1",
     "intrinsic_matrix", "intrinsics_matrix",
@@ -30,7 +30,7 @@ _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
 _BOOFCV = ("pinhole", "pinhole_radial_tangential", "omnidirectional_universal")
-# Keys that mention distortion but do not hold its coefficients.
+# Keys about distortion that are not its coefficients.
 _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 
 
@@ -44,12 +44,12 @@ def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
     side : str
         Suffix of the keys of one camera of several, such as ``1`` of M1 and D1.
     whole : bool
-        Whether the file is of this camera alone, so that all its keys are examined.
+        Whether the file has only this camera, so that all its keys are checked.
 
     Raises
     ------
     InputError, FormatError
-        No camera matrix, or an invalid one; a distortion that cannot be read.
+        There is no valid camera matrix, or the distortion cannot be read.
     """
     if "projection" in root and "f" in root:
         raise InputError("is the file of an undistorted panorama; give the camera of the original images")
@@ -70,7 +70,7 @@ def boofcv_camera(root: Field) -> Camera:
     Raises
     ------
     InputError, FormatError
-        A lens model that is not known.
+        The lens model is unknown.
     """
     pinhole = root["pinhole"]
     model = root.get("model", "").text()
@@ -106,7 +106,7 @@ def matrix_data(field: Field, length: int) -> Array:
     ----------
     field : Field
     length : int
-        How many numbers there must be, 9 for a 3 x 3 matrix; -1 allows any.
+        Required number of entries, 9 for a 3 x 3 matrix; -1 allows any.
     """
     if isinstance(field.value, dict):
         data = field["data"].array(-1)
@@ -127,16 +127,16 @@ def matrix_data(field: Field, length: int) -> Array:
 
 
 def _channels(field: Field) -> int:
-    """Channels of an OpenCV matrix, ``dt: "2f"`` has two."""
+    """Number of channels of an OpenCV matrix; ``dt: "2f"`` has two."""
     head = str(field["dt"].value)[:-1] if "dt" in field else ""
     return int(head) if head.isdigit() else 1
 
 
 def _ended(keys: tuple[str, ...], side: str) -> tuple[str, ...]:
-    """The keys of one camera of several, with the suffix appended directly or after an underscore."""
+    """Keys of one camera of several, with the suffix, with or without an underscore."""
     if not side:
         return keys
-    # One letter is a coefficient's name, k1, in another file.
+    # The key k is left out, because k1 is a distortion coefficient in other files.
     return tuple(form for key in keys if key != "k" for form in (f"{key}{side}", f"{key}_{side}"))
 
 
@@ -183,7 +183,7 @@ def _distortion(root: Field, side: str, whole: bool) -> tuple[str, Array]:
 
 
 def _omnidirectional(xi: Field, coefficients: Array, model: str) -> tuple[str, Array]:
-    """OpenCV's omnidirectional camera, whose xi stands beside its coefficients."""
+    """Distortion of OpenCV's omnidirectional camera, whose xi is a separate key."""
     value = xi.number() if isinstance(xi.value, (int, float)) else float(matrix_data(xi, 1)[0])
     if model != "omnidir" or len(coefficients) != 4:
         raise InputError(
@@ -194,7 +194,7 @@ def _omnidirectional(xi: Field, coefficients: Array, model: str) -> tuple[str, A
 
 
 def _refuse_unread(root: Field) -> None:
-    """Refuse a key that may be the distortion under a name that is not known."""
+    """Refuse unknown keys that may be the distortion."""
     for key in root.entries():
         if ("dist" in key.lower() and key not in _OTHERS) or key.lower() in ("k1", "k2", "coeffs"):
             raise InputError(
@@ -204,7 +204,7 @@ def _refuse_unread(root: Field) -> None:
 
 
 def image_size(root: Field, side: str = "") -> tuple[int, int] | None:
-    """Width and height [px] under one of their usual names, None if they are unknown."""
+    """Width and height [px] under one of their usual names; None if they are unknown."""
     width, height = (
         _first(root, (*(_ended(keys, side) if side else ()), *keys)) for keys in (_WIDTH_KEYS, _HEIGHT_KEYS)
     )

@@ -1,7 +1,6 @@
-"""Names of distortion models: ours, and ROS's with the number of coefficients it expects.
+"""Convert distortion models between the names and numbers of coefficients of neurocal and ROS.
 
-ROS has no name for wide lenses other than the fisheye, nor for a thin prism and a tilted sensor; these have
-their own.
+ROS has no names for wide lenses other than the fisheye, nor for thin prism and tilted sensor; ours are kept.
 """
 
 from __future__ import annotations
@@ -13,18 +12,18 @@ from neurocal_cli.camera.distortion import WITH_PRISM, coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-# ROS's names of our models: a plumb_bob has 5 coefficients, of which the simpler models use the first.
+# ROS's names of our models. Others are a plumb_bob with 5 coefficients; simpler models use the first of them.
 _ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}
 _LENGTHS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 
 
 def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
-    """Find ROS's name of one of our models and its coefficients, zeros added.
+    """Find ROS's name of one of our models, and pad its coefficients with zeros.
 
     Raises
     ------
     InputError
-        An unknown model, or coefficients that it doesn't have.
+        The model is unknown, or does not have these coefficients.
     """
     own = own_length(model)
     name = _ROS.get(model, model if model in (*WIDE, *WITH_PRISM) else "plumb_bob")
@@ -42,12 +41,12 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
 def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
     """Find our name of a ROS (or OpenCV) model and its coefficients.
 
-    All zeros mean no distortion, except for a fisheye, where they give the equidistant projection.
+    All zeros mean no distortion, except for a fisheye, for which they mean an equidistant projection.
 
     Raises
     ------
     InputError
-        An unknown model or wrong coefficients; the message lists the known ones.
+        The model or its number of coefficients is unknown; the message lists the known ones.
     """
     values = np.asarray(coefficients, dtype=float).ravel()
     if name in ("equidistant", "fisheye") and values.size:

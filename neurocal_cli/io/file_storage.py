@@ -1,4 +1,4 @@
-"""Trees from YAML, JSON or XML text, the three formats of OpenCV's FileStorage."""
+"""Read trees from YAML, JSON or XML text, the three formats of OpenCV's FileStorage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEEPEST = 40
 
 
 def read_tree(path: str | Path) -> Field:
-    """Read a YAML, JSON or XML file; the format is detected from the content.
+    """Read a YAML, JSON or XML file; the format is recognised by the content.
 
     Raises
     ------
@@ -54,17 +54,17 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")
 
 
 def _parse_xml(text: str, source: str) -> Any:
-    if "<!" in text.replace("<!--", ""):  # entities can ask for gigabytes; cameras need none
+    if "<!" in text.replace("<!--", ""):  # entities can expand to gigabytes; cameras need none
         raise FormatError("has a DOCTYPE, ENTITY or CDATA section, which is not read; remove it", source)
     try:
         root = ElementTree.fromstring(text.encode("utf-8"))
     except ElementTree.ParseError as error:
         raise FormatError(f"is not valid XML ({error.msg}); correct it", source, error.position[0]) from error
-    except (ValueError, LookupError) as error:  # an encoding that is unknown or another than UTF-8
+    except (ValueError, LookupError) as error:  # the stated encoding is unknown or not UTF-8
         raise FormatError("is not XML in UTF-8; save it as UTF-8", source) from error
     if root.tag != "opencv_storage":
         raise FormatError(
@@ -79,7 +79,7 @@ def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any
     if len(element) == 0:
         text = (element.text or "").strip()
         if len(text) > 1 and text[0] == text[-1] == '"' and '"' not in text[1:-1]:
-            return text[1:-1]  # so that a number is a name
+            return text[1:-1]  # quoted, so it stays text even if it looks like a number
         words = text.split()
         if element.tag == "data" or len(words) > 1:
             return [plain_value(word) for word in words]

@@ -1,4 +1,4 @@
-"""Text that OpenCV's ``cv2.FileStorage`` reads: YAML, XML or JSON, as the file's name ends."""
+"""Write text for OpenCV's ``cv2.FileStorage``: YAML, XML or JSON, depending on the file's extension."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.yaml_text import number, quoted
 
-_PER_LINE = 4  # numbers; OpenCV's reader limits a line to some thousand characters
+_PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousand characters
 
 
 def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
@@ -21,7 +21,7 @@ def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
     Parameters
     ----------
     entries : dict
-        Texts, numbers, lists of texts, and matrices: (rows, cols) or (rows, cols, channels) arrays.
+        Strings, numbers, lists of strings, and matrices: (rows, cols) or (rows, cols, channels) arrays.
     ending : str
         ``.xml`` or ``.json``; YAML otherwise.
     """
@@ -45,7 +45,7 @@ def _lines(words: list[str], indent: str, separator: str) -> str:
 
 
 def _type(matrix: Array) -> str:
-    """Doubles, of one channel or more; in quotes, because 2d begins as a number does."""
+    """Type of a matrix of doubles; with several channels in quotes, because 2d begins like a number."""
     return "d" if matrix.ndim == 2 else f'"{matrix.shape[2]}d"'
 
 
@@ -82,5 +82,5 @@ def _xml(key: str, value: Any) -> str:
 
 
 def _xml_text(text: str) -> str:
-    """A text in quotes, so that it is read neither as a number nor as several words."""
+    """Quote a string, so that it is not read as a number or as several words."""
     return '"' + escape(text, {'"': "&quot;"}) + '"'

@@ -1,4 +1,4 @@
-"""Reading files as bytes or text, with one-line errors. ``-`` is stdin."""
+"""Read files as bytes or text, with one-line error messages. ``-`` is stdin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _WIDE_MARKS = (
-    (b"\xff\xfe\x00\x00", "UTF-32"),  # begins like UTF-16's mark, so it is tried first
+    (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
     (b"\x00\x00\xfe\xff", "UTF-32"),
     (b"\xff\xfe", "UTF-16"),
     (b"\xfe\xff", "UTF-16"),
@@ -33,12 +33,12 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     -------
     data : bytes
     source : str
-        The name to show in messages, ``<stdin>`` for stdin.
+        Name for messages; ``<stdin>`` for stdin.
 
     Raises
     ------
     FormatError
-        The file cannot be read: missing, a folder, not permitted.
+        The file is missing, is a folder, or may not be read.
     """
     if str(path) == "-":
         _protect_stdin()
@@ -53,7 +53,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
     """Read a file, or stdin for ``-``, in blocks of whole lines of about `size` bytes; see `read_bytes`.
 
-    A file without line ends comes as one block.
+    A file without line ends is one block.
     """
     if str(path) == "-":
         _protect_stdin()
@@ -61,7 +61,7 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
             yield from _whole_lines(sys.stdin.buffer, size)
         return
     with reading_failures(one_line(path)):
-        file = open(path, "rb")  # noqa: SIM115 - the caller's own errors are not the file's
+        file = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
     _protect(file)
     with file:
         blocks = _whole_lines(file, size)
@@ -74,7 +74,7 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
 
 
 def _protect(file: IO[bytes]) -> None:
-    """Prevent the running command from writing over its inputs."""
+    """Prevent the current command from overwriting a file that it reads."""
     outputs = held_back()
     if outputs is not None:
         outputs.protect_status(os.fstat(file.fileno()))
@@ -100,7 +100,7 @@ def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 @contextmanager
 def reading_failures(source: str) -> Iterator[None]:
-    """Turn failures to read a file into one-line errors."""
+    """Turn errors of reading a file into one-line messages."""
     try:
         yield
     except FileNotFoundError as error:
@@ -115,7 +115,7 @@ def reading_failures(source: str) -> Iterator[None]:
 
 @contextmanager
 def value_failures(source: str, where: str = "") -> Iterator[None]:
-    """Turn an invalid value into a one-line error with its file and the location in it."""
+    """Turn errors about values into messages that name the file and the place in it."""
     try:
         yield
     except InputError as error:
@@ -137,14 +137,14 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
     source : str
         Name for messages.
     kind : str
-        What the file should be, for the message about a binary file.
+        Expected kind of file, for the message about a binary file.
     instead : str
         Appended to that message.
 
     Raises
     ------
     FormatError
-        UTF-16 or UTF-32 text, a binary file, bytes that are not UTF-8.
+        The data are UTF-16 or UTF-32 text, binary, or not UTF-8.
     """
     if data.isascii() and b"\0" not in data:
         return data.decode("ascii")
@@ -168,25 +168,25 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
 def _stdin_failures() -> Iterator[None]:
     try:
         yield
-    except NeurocalError:  # the caller's own
+    except NeurocalError:  # raised by the caller
         raise
-    except (AttributeError, ValueError, OSError) as error:  # absent or closed
+    except (AttributeError, ValueError, OSError) as error:  # stdin is absent or closed
         raise FormatError("stdin cannot be read; give a file", "<stdin>") from error
 
 
 def reason(error: BaseException) -> str:
-    """The system's reason for a failure."""
+    """The system's text about a failure."""
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
 def one_line(path: str | Path) -> str:
-    """Put a path, or any text, on one printable line."""
+    """Make a path, or any text, printable on one line."""
     text = str(path)
     return text if text.isprintable() else repr(text)[1:-1]
 
 
 def _alternates_with_nul(data: bytes) -> bool:
-    """Whether ASCII text was written two bytes a character, without a mark."""
+    """Whether the data are ASCII text with two bytes per character and no byte order mark."""
     head = data[:1000]
     even, odd = head[::2].count(0), head[1::2].count(0)
     return max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0

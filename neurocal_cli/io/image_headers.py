@@ -1,9 +1,9 @@
-"""Headers of image files, mainly their size, read without decoding.
+"""Read the metadata of an image file, above all its size, without decoding it.
 
-A file of a kilobyte can state a terabyte of pixels, and decoders treat truncated files differently; both are
-checked here, before decoding. No library that neurocal needs anyway does this: OpenCV gives only the size of
-decoded pixels (0.4 s for 12 megapixels; this takes 0.03 s, mostly for checksums), and its versions from 4.8
-to 5.0 fill, cut or refuse truncated files without a reason.
+A file of a kilobyte can state a terabyte of pixels, and decoders treat truncated files differently. Both are
+checked here before decoding. No library that neurocal needs anyway does this: OpenCV gives a size only after
+decoding (0.4 s for 12 megapixels, where this takes 0.03 s, nearly all of it for checksums), and its versions
+from 4.8 to 5.0 fill, cut or refuse truncated files without a reason.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 _EXIF_MARK = b"Exif\0\0"
 _ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
-_STRIPS = ((273, 279), (324, 325))  # offsets and lengths of strips, of batches
+_STRIPS = ((273, 279), (324, 325))  # tags of offsets and byte counts of strips, and of tiles
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
@@ -49,7 +49,7 @@ class Header:
     width, height : int [px]
         As stored, before the orientation is applied.
     orientation : int
-        EXIF's tag: 1 upright, 2-8 mirrored or turned.
+        EXIF orientation: 1 upright, 2-8 mirrored or rotated.
     """
 
     kind: str
@@ -59,11 +59,11 @@ class Header:
 
 
 class _TruncatedError(Exception):
-    """The file ends before its header says so."""
+    """The file is shorter than its header states."""
 
 
 def read_header(data: bytes, source: str) -> Header:
-    """Read the header of an image file and check that the file is complete.
+    """Read the header of an image file, and check that the file is complete.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def read_header(data: bytes, source: str) -> Header:
     Raises
     ------
     FormatError
-        Empty, no image of a known kind, truncated, damaged, or without pixels.
+        The file is empty, not a known kind of image, truncated, damaged, or without pixels.
     """
     if not data:
         raise FormatError("is empty; give an image", source)
@@ -103,10 +103,10 @@ def read_header(data: bytes, source: str) -> Header:
 
 
 def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
-    """Larger and smaller side [px] of PNG and JPEG files from their headers, for a quick check in advance.
+    """Larger and smaller side [px] of PNG and JPEG files, read from their headers.
 
-    Sorted, so that images turned by their EXIF orientation have one size. None for standard input, other
-    kinds of files and unreadable ones: this only finds different cameras; decoding reports the rest.
+    The sides are sorted, so the EXIF orientation does not matter. None for stdin, other kinds of files and
+    unreadable files: this is only an early check for different cameras, and decoding reports other problems.
     """
     for path in paths:
         size = None if path == "-" else _stated_size(path)
@@ -141,7 +141,7 @@ def is_video_header(head: bytes) -> bool:
 
 
 def _other(data: bytes) -> str | None:
-    """The kind of a file that is not a supported image."""
+    """Kind of a file that is not a supported image; None if unknown."""
     return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
 
 
@@ -157,7 +157,7 @@ def _png(data: bytes) -> Header:
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Chunks up to the end mark, each with its checksum verified."""
+    """Iterate over the chunks up to IEND, verifying their checksums."""
     at, kind = 8, b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -188,7 +188,7 @@ def _jpeg(data: bytes) -> Header:
         elif marker == 0xE1 and data.startswith(_EXIF_MARK, at + 4):
             orientation = _exif_orientation(data[at + 10 : at + 2 + length])
         at += 2 + length
-    if data.rfind(b"\xff\xd9", at) < 0:  # the end mark, which a thumbnail in front has as well
+    if data.rfind(b"\xff\xd9", at) < 0:  # end mark, searched after the header: a thumbnail there has one, too
         raise _TruncatedError
     return Header("JPEG", width, height, orientation)
 
@@ -233,7 +233,7 @@ def _tiff(data: bytes) -> Header:
 
 
 def _exif_orientation(block: bytes) -> int:
-    """Orientation in an EXIF block, which is a TIFF without an image; 1 where it cannot be read."""
+    """Orientation in an EXIF block, which is a TIFF without an image; 1 if it cannot be read."""
     try:
         return _upright(_tiff_fields(block).get(_ORIENTATION, (1,)))
     except (struct.error, ValueError, IndexError, _TruncatedError):
@@ -245,7 +245,7 @@ def _upright(values: tuple[int, ...]) -> int:
 
 
 def _tiff_fields(data: bytes) -> dict[int, tuple[int, ...]]:
-    """Whole-number fields of the first directory by their tags; TIFF and BigTIFF."""
+    """Integer fields of the first directory of a TIFF or BigTIFF, by their tags."""
     order = "<" if data[:2] == b"II" else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
     number, count, step = ("Q", "Q", 20) if big else ("I", "H", 12)
@@ -258,7 +258,7 @@ def _tiff_fields(data: bytes) -> dict[int, tuple[int, ...]]:
         tag, kind, n = struct.unpack_from(f"{order}HH{number}", data, entry)
         if kind not in _TIFF_TYPES:
             continue
-        form = f"{order}{min(n, len(data))}{_TIFF_TYPES[kind]}"  # no file holds more values than bytes
+        form = f"{order}{min(n, len(data))}{_TIFF_TYPES[kind]}"  # a file cannot have more values than bytes
         place = entry + 4 + room
         if struct.calcsize(form) > room:
             (place,) = struct.unpack_from(order + number, data, place)

@@ -1,4 +1,4 @@
-"""The image files named by the words of a command line."""
+"""Find the image files named by the arguments of a command line."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".
 
 
 def is_image(path: str) -> bool:
-    """Whether a file is an image, by the ending of its name."""
+    """Whether a file is an image, judged by its extension."""
     return path.lower().endswith(_ENDINGS)
 
 
 def find_images(words: Iterable[str]) -> tuple[str, ...]:
-    """Find the files named by files, folders and patterns.
+    """Find the files given by names, folders and patterns.
 
     Parameters
     ----------
     words : iterable of str
-        A file (or ``-``) stands for itself, whether it exists or not; a folder for the images in
-        it, by their endings; a pattern such as ``left*.png``, which no shell expanded, for the files
-        that match. These are in natural order (1, 2, 10), as are words in alphabetical order.
+        A file (or ``-``) stands for itself, whether it exists or not. A folder stands for the images in it,
+        recognised by their extensions. A pattern such as ``left*.png``, which no shell expanded, stands for
+        the matching files. Files of folders and patterns are in natural order (1, 2, 10). So are all files if
+        the arguments are in alphabetical order.
 
     Raises
     ------
     FormatError
-        A folder that cannot be read or without images, or a pattern that nothing matches.
+        A folder cannot be read or has no images, or nothing matches a pattern.
     """
     paths: list[str] = []
     for word in words:
@@ -43,12 +44,12 @@ def find_images(words: Iterable[str]) -> tuple[str, ...]:
             paths += _matching(word)
         else:
             paths.append(word)
-    # A shell expands a pattern in alphabetical order, in which 10 comes before 2.
+    # A shell expands a pattern in alphabetical order, with 10 before 2.
     return tuple(sorted(paths, key=natural_order) if paths == sorted(paths) else paths)
 
 
 def natural_order(name: str) -> list[tuple[int, str, int]]:
-    """Key for sorting names as people count: left1, left2, left10."""
+    """Key for sorting names in natural order: left1, left2, left10."""
     parts = re.split(r"([0-9]+)", name)
     return [
         (1, "", int(part)) if part.isdecimal() and part.isascii() else (0, part, 0) for part in parts if part
@@ -56,7 +57,7 @@ def natural_order(name: str) -> list[tuple[int, str, int]]:
 
 
 def view_names(paths: Iterable[str]) -> tuple[str, ...]:
-    """Name a view after each file, without folder and ending; ``stdin`` for ``-``.
+    """Name a view after each file, without folder and extension; ``stdin`` for ``-``.
 
     Raises
     ------
@@ -81,7 +82,7 @@ def _in_folder(folder: str) -> list[str]:
         names = sorted(os.listdir(folder), key=natural_order)
     except OSError as error:
         raise FormatError("may not be read; change its permissions", one_line(folder)) from error
-    # Hidden files belong to other programs: previews, unfinished copies.
+    # Hidden files belong to other programs, such as previews and unfinished copies.
     names = [name for name in names if is_image(name) and not name.startswith(".")]
     paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
     if not paths:

@@ -1,4 +1,4 @@
-"""Images as arrays of grey values."""
+"""Read and write images as arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from neurocal_cli.io.image_headers import Header, read_header
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
-MOST_PIXELS = 200_000_000  # larger than any camera's; a file that states more is refused
+MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
 
 _TURNS = {
     2: "mirrored left to right",
@@ -35,21 +35,21 @@ _SIXTEEN_BITS = (".png", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 _JPEG = (".jpg", ".jpeg", ".jpe")
 _QUALITY = 95
 _STDERR = 2
-_ONE_AT_A_TIME = threading.Lock()  # the program's stderr is one
+_ONE_AT_A_TIME = threading.Lock()  # a process has only one stderr
 
 
 @frozen_dataclass(eq=False)
 class Image:
-    """A picture.
+    """A grey image.
 
     Attributes
     ----------
     grey : (height, width) uint8 or uint16 array [DN]
-        Colours are weighed as OpenCV does: 0.299 R + 0.587 G + 0.114 B.
+        From colours as in OpenCV: 0.299 R + 0.587 G + 0.114 B.
     source : str
         Name for messages.
     notes : tuple of str
-        What was done to the pixels that a user may not expect.
+        Changes of the pixels that a user may not expect.
     """
 
     grey: Pixels
@@ -65,35 +65,35 @@ class Image:
 def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     """Read an image: PNG, JPEG, TIFF, BMP, PGM or PPM, grey or colour, of 8 or 16 bits.
 
-    As in OpenCV's ``imread``, an image is turned upright by its EXIF orientation, and pixel
-    coordinates are those of the turned image; a note says so.
+    As in OpenCV's ``imread``, an image is turned upright according to its EXIF orientation; pixel coordinates
+    are those of the turned image. A note reports this.
 
     Parameters
     ----------
     path : str or Path
         ``-`` is stdin.
     most_pixels : int
-        Larger images are refused, before they take any memory.
+        Larger images are refused before they take memory.
 
     Raises
     ------
     FormatError
-        The file cannot be read, is no image, is damaged, or too large.
+        The file cannot be read, is not an image, is damaged, or too large.
     """
     return parse_image(*read_bytes(path), most_pixels)
 
 
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
-    """Read an image with its colours; else as `read_image` does.
+    """Read an image with its colours; otherwise like `read_image`.
 
     Returns
     -------
     pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
-        Colours in the order red, green, blue; transparency is left out.
+        Colours in the order red, green, blue; transparency is dropped.
     source : str
         Name for messages.
     notes : tuple of str
-        What was done to the pixels that a user may not expect.
+        Changes of the pixels that a user may not expect.
     """
     data, source = read_bytes(path)
     pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
@@ -107,7 +107,7 @@ def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXE
 
 
 def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, tuple[str, ...]]:
-    """Pixels of a file with its EXIF orientation applied, and the note on it."""
+    """Pixels of a file with its EXIF orientation applied, and a note if that changed them."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
         raise FormatError(
@@ -126,7 +126,7 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Picture as the bytes of a PNG file.
+    """Encode a picture as PNG.
 
     Parameters
     ----------
@@ -152,12 +152,12 @@ def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> by
 
 
 def _reversed(picture: Pixels) -> Pixels:
-    """Colours in the order of OpenCV from ours, or back."""
+    """Swap the order of the colours between ours and OpenCV's."""
     return picture[..., ::-1] if picture.ndim == 3 else picture
 
 
 def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
-    """The (H, W) image with 8 bits, and no wider than so many pixels."""
+    """Convert an (H, W) image to 8 bits, and reduce it to at most `width` pixels."""
     eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
     if eight.shape[1] <= width:
         return eight
@@ -166,21 +166,21 @@ def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
 
 
 def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Picture as the bytes of an image file.
+    """Encode a picture as an image file.
 
     Parameters
     ----------
     pixels : (height, width) or (height, width, 3) uint8 or uint16 array
         Colours in the order red, green, blue.
     ending : str
-        Of the file's name: .png, .tif and so on.
+        Extension of the file: .png, .tif and so on.
     quality : int
         Of a JPEG file, up to 100.
 
     Raises
     ------
     InputError
-        The kind of file does not hold such a picture.
+        This kind of file cannot hold such a picture.
     """
     if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
         raise InputError(
@@ -194,7 +194,7 @@ def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
 
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
-    """Pixels of a file whose header is intact; the decoder's messages are kept off the user's screen."""
+    """Decode a file with a valid header; the decoder's output to stderr is not shown."""
     with captured_stderr() as complaints:
         try:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
@@ -206,7 +206,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
             "save it as PNG of 8 or 16 bits",
             source,
         )
-    # The JPEG decoder fills damaged parts with grey, and reports it on stderr only.
+    # The JPEG decoder fills undecodable parts with grey, and reports this only on stderr.
     if any(mark in text for text in complaints for mark in ("Corrupt JPEG", "Premature end")):
         raise FormatError("is damaged; copy the image again", source)
     turned = header.orientation >= 5
@@ -224,12 +224,12 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
 
 @contextmanager
 def captured_stderr() -> Iterator[list[str]]:
-    """Capture what the C libraries below OpenCV write directly to stderr; yields its lines."""
+    """Capture what the C libraries below OpenCV write to stderr; yields a list that receives the lines."""
     lines: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
         try:
             former = os.dup(_STDERR)
-        except OSError:  # closed: there is nothing to keep clean
+        except OSError:  # stderr is closed, so there is nothing to capture
             yield lines
             return
         try:

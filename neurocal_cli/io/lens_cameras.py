@@ -1,4 +1,4 @@
-"""Known cameras at many settings of a zoom lens: a CSV of parameters, or one that names calibration files."""
+"""Known cameras at many settings of a zoom lens: a CSV of parameters or of names of calibration files."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ _PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"
 _TABLE = Schema(kind="cameras", required=_PARAMETERS, optional=("t_z", *CONTROLS))
 _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
-_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each extends the one before
+# The coefficients of each of these models begin with those of the previous one.
+_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
 
 
-# Of one file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; each camera's lens; image sizes.
+# Contents of a file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; lenses; image sizes.
 _Rows = tuple[dict[str, Array], list[Distortion], set[tuple[int, int]]]
 
 
 def names_cameras(data: bytes) -> bool:
-    """Whether a file's header has alpha_u, or a column `camera` and no points."""
+    """Whether a file's header has the column alpha_u, or a column `camera` and no points."""
     names = _header(data)
     return "alpha_u" in names or (_FILES in names and "X" not in names)
 
@@ -42,12 +43,12 @@ def _header(data: bytes) -> set[str]:
 
 
 def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> LensCameras:
-    """Read known cameras from the contents of files and their names.
+    """Read known cameras from pairs of file content and name.
 
     Raises
     ------
     FormatError, InputError
-        An unreadable file, a missing setting, or cameras that are not of one lens.
+        A file cannot be read, a setting is missing, or the cameras are not of one lens.
     """
     tables = [
         parse_table(data, source, _TABLE if "alpha_u" in _header(data) else _LIST)
@@ -87,7 +88,7 @@ def _tabled(table: Table) -> _Rows:
 
 
 def _listed(table: Table) -> _Rows:
-    """Read the calibration files that a table names; their paths are relative to its folder."""
+    """Read the calibration files named in a table, with paths relative to its folder."""
     folder = Path(table.source).parent
     cameras = [read_intrinsics(folder / name) for name in table.labels[_FILES].tolist()]
     parameters = {
@@ -114,7 +115,7 @@ def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array
         return "fisheye", np.array(rows)
     if other := sorted(set(models) - set(_NESTED)):
         raise InputError(
-            f"{source}: cameras of the model {other[0]} are none of a zoom lens's; convert them with "
+            f"{source}: a zoom lens cannot have the distortion model {other[0]}; convert the cameras with "
             "neurocal convert --model rational, or fisheye"
         )
     padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
@@ -126,7 +127,7 @@ def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array
 
 
 def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
-    """The controls that all files have.
+    """Names of the controls, which all files must share.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Points at many settings of a zoom lens as CSV."""
+"""CSV files of points at many settings of a zoom lens."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def read_lens_points(
 
 
 def write_lens_points(lens: LensPoints, path: str | Path) -> None:
-    """Write points with the columns of their settings, which read back to the last bit."""
+    """Write points with the columns of their settings; they read back to the last bit."""
     lines = format_points(lens.points).split("\n")
     first = next(k for k, line in enumerate(lines) if not line.startswith("#"))
     settings = [",".join(map(repr, row)) for row in lens.settings.tolist()]
@@ -84,7 +84,7 @@ def _points(tables: list[Table], notes: list[str]) -> LensPoints:
 
 
 def _images(table: Table, controls: tuple[str, ...], setting: Array, several: bool) -> NDArray[Any]:
-    """View names: the file's label, with the setting added where a label occurs at several settings."""
+    """View names: the file's labels, with the settings added if a label occurs at several settings."""
     distinct, index = np.unique(setting, axis=0, return_inverse=True)
     index = index.ravel()
     texts = np.array([describe(controls, row) for row in distinct])[index]

@@ -1,4 +1,4 @@
-"""Lens files: a zoom lens as YAML, with its networks and tables. Numbers read back exactly."""
+"""Lens files: a zoom lens as YAML, with its networks and tables; numbers read back exactly."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def format_lens(lens: ZoomLens) -> str:
     Raises
     ------
     InputError
-        A unit or reason that is not valid UTF-8.
+        A unit or reason cannot be encoded as UTF-8.
     """
     lines = [f"{_BLOCK}:"]
     parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
@@ -222,7 +222,7 @@ def _positive(field: Field) -> float:
 
 
 def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
-    """Names of the local parameters, which the kind of camera and the distortion model determine."""
+    """Read and check the names of the local parameters; returns the distortion model, too."""
     model = block["distortion"].text()
     with value_failures(block.source, f"{block.path}.distortion: "):
         coefficients = coefficient_names(model)

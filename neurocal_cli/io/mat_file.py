@@ -1,7 +1,7 @@
-"""The variables of a MATLAB file of version 5 to 7: numbers, texts, cells and structs.
+"""Read the variables of a MATLAB file of version 5 to 7: numbers, texts, cells and structs.
 
-Read here and not by ``scipy.io.loadmat``, which crashes on damaged files. The format is MathWorks' "MAT-File
-Format": elements of a type, a length and as many bytes; matrices consist of further elements.
+``scipy.io.loadmat`` is not used, because damaged files crash it. The format is MathWorks' "MAT-File Format":
+each element has a type, a length and data, and matrices consist of further elements.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def read_variables(data: bytes, source: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        Arrays of numbers, texts, lists for cells, dictionaries for structs. Objects of MATLAB's classes are
-        left out: nothing but MATLAB can read them.
+        Arrays of numbers, strings, lists for cells, dictionaries for structs. Objects of MATLAB's classes are
+        left out, because only MATLAB can read them.
 
     Raises
     ------
@@ -70,11 +70,11 @@ def _variables(data: bytes, order: str) -> Iterator[tuple[str, Any]]:
 
 
 def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
-    """Types and contents of the elements; each begins at a multiple of 8 bytes unless it is compressed."""
+    """Iterate over types and contents of elements, which are padded to 8 bytes unless compressed."""
     k = 0
     while k < len(data):
         (word,) = struct.unpack_from(f"{order}I", data, k)
-        if word >> 16:  # small: both in one word, and the content in the next
+        if word >> 16:  # small element: type and length in one word, and the content in the next
             kind, count, start, step = word & 0xFFFF, word >> 16, k + 4, 8
             if count > 4:
                 raise ValueError("too long")
@@ -89,7 +89,7 @@ def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[in
 
 
 def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
-    """Name and value of a matrix, None for a class that is not read."""
+    """Name and value of a matrix; the value is None for unsupported classes."""
     if depth == 0:
         raise ValueError("nested too deeply")
     if not data:

@@ -1,4 +1,4 @@
-"""Matches CSV: pixels of the same point in the left and the right image, in any number."""
+"""Matches CSV: pixels of the same point in the left and the right image, in files of any length."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class Matches:
 
 
 def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[Matches]:
-    """Read matches, some ten thousand at a time; ``-`` is stdin.
+    """Read matches in batches of some ten thousand; ``-`` is stdin.
 
     Parameters
     ----------
     path : str or Path
     notes : list of str, optional
-        Remarks about what was left out are appended when the first rows come.
+        Remarks about ignored columns are appended with the first batch.
 
     Raises
     ------

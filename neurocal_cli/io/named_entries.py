@@ -1,7 +1,7 @@
-"""Values by the names of views, as YAML.
+"""Values by view name, as YAML.
 
-A mapping if all names are valid keys of OpenCV's FileStorage; otherwise a list of pairs, because FileStorage
-cannot open a file with a key such as ``"01"``.
+They are a mapping if all names are valid keys of OpenCV's FileStorage. Otherwise they are a list of pairs,
+because FileStorage cannot open a file with a key such as ``"01"``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def read_named(field: Field) -> dict[str, Field]:
     Raises
     ------
     FormatError
-        Neither of them, or a name twice.
+        The value has neither form, or a name appears twice.
     """
     if isinstance(field.value, dict):
         return field.entries()

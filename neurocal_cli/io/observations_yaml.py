@@ -1,7 +1,7 @@
 """The points of a calibration, as a block of its file.
 
-A short file has a row for each point. A long file has each target point once and a row for each view, whose
-numbers are texts: decimals, or packed if there are so many digits that PyYAML would be slow.
+The block has a row for each point. In a long file it has each place of the target once, and a row for each
+view, whose numbers are texts: decimals, or packed if PyYAML would take too long to parse the decimals.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.distances import Distance
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, measured
+from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.io.text_columns import (
     LONGEST,
     column_lines,
@@ -33,12 +33,12 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, number, quoted
 from neurocal_cli.points import Correspondences
 
-_MOST_CHARACTERS = 1_500_000  # of decimals: half a second of PyYAML
+_MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
 
 
 def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     """Lines of the block ``observations``."""
-    names, blocks = measured(points)
+    names, blocks = value_columns(points)
     columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
     yield "observations:"
     yield f"  columns: [{', '.join(columns)}]"
@@ -57,7 +57,7 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
 
 
 def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
-    # They are indented more than their key, as OpenCV's FileStorage requires.
+    # OpenCV's FileStorage requires rows to be indented more than their key.
     heads = [f"    - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
     if points.point is not None:
@@ -94,7 +94,7 @@ def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
 
 
 def _places(points: Correspondences) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Index of each row's target point among the distinct ones, and the first row of each."""
+    """Index of each row's place among the distinct places, and the first row of each place."""
     bits = np.ascontiguousarray(points.world).view(np.dtype((np.void, 24))).ravel().tolist()
     keys = bits if points.point is None else list(zip(bits, np.asarray(points.point).tolist(), strict=True))
     number: dict[Any, int] = {}
@@ -109,7 +109,7 @@ def read_observations(
     image_center: tuple[float, float] | None,
     none: bool,
 ) -> Correspondences:
-    """Read the block ``observations``, in either form.
+    """Read the block ``observations`` in either form.
 
     Parameters
     ----------
@@ -118,18 +118,18 @@ def read_observations(
     image_size : (width, height) or None [px]
     image_center : (u0, v0) or None [px]
     none : bool
-        Whether there may be none at all.
+        Whether the block may be empty.
 
     Raises
     ------
     FormatError
-        A table that is not as it was written.
+        The table does not have the written form.
     """
     if "places" in observations:
         columns, stands = _long_columns(observations), f"{observations.path}.views"
     else:
         columns, stands = _row_columns(observations), f"{observations.path}.rows"
-    if none and not columns:  # a camera that a lens gave
+    if none and not columns:  # a camera from a zoom lens
         return Correspondences.none(image_size, unit)
     if not columns:
         observations["rows"].fail("at least one row")

@@ -1,7 +1,7 @@
-"""The outputs of a command: all or none are written, and never over a file that the command reads.
+"""Write either all outputs of a command or none, and never overwrite a file that it reads.
 
-Within `all_or_none` every file is written under a temporary name, and all are renamed together at the end.
-Files are compared by device and inode, not by name, because links lead to the same file.
+Within `all_or_none` every file is written to a temporary file in its folder, and all are moved to their
+places at the end. Files are identified by device and inode, not by name, because links lead to the same file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _Identity = tuple[int, int]  # device and inode
 
 
 class Outputs:
-    """The files that one command reads and writes."""
+    """Inputs and pending outputs of a command."""
 
     def __init__(self) -> None:
         self._inputs: set[_Identity] = set()
@@ -26,39 +26,37 @@ class Outputs:
         self._stdout: list[bytes] = []
 
     def protect(self, *paths: str | None) -> None:
-        """Never write over these files; their readers report those that do not exist.
-
-        ``-`` is standard input, which the shell may have opened from a file: ``< FILE``.
-        """
+        """Protect input files from being overwritten; missing files are ignored here."""
         for path in paths:
             if path is not None:
                 with suppress(AttributeError, OSError, ValueError):  # stdin may be closed or no file
                     self.protect_status(os.stat(sys.stdin.fileno() if path == "-" else path))
 
     def protect_status(self, status: os.stat_result) -> None:
-        """Never write over the file of this status."""
+        """Protect the file with this status from being overwritten."""
         self._inputs.add((status.st_dev, status.st_ino))
 
     def check(self, shown: str, former: os.stat_result | None) -> None:
-        """Refuse to write over an input.
+        """Refuse to overwrite an input.
 
         Raises
         ------
         UsageError
+            The output is an input.
         """
         if former is not None and (former.st_dev, former.st_ino) in self._inputs:
             raise UsageError(f"{shown} is an input and would be overwritten; give another output")
 
     def stage(self, temporary: str, target: str) -> None:
-        """Register a temporary file, to be renamed at the end."""
+        """Move a temporary file to its target at the end."""
         self._staged.append((temporary, target))
 
     def hold(self, data: bytes) -> None:
-        """Keep this for stdout until the end."""
+        """Write data to stdout at the end."""
         self._stdout.append(data)
 
     def commit(self) -> list[bytes]:
-        """Rename all files to their final names; return what is for stdout."""
+        """Move all files to their targets, and return the data for stdout."""
         while self._staged:
             temporary, target = self._staged[0]
             os.replace(temporary, target)
@@ -67,7 +65,7 @@ class Outputs:
         return held
 
     def discard(self) -> None:
-        """Leave everything as it was."""
+        """Remove the temporary files, and leave the targets unchanged."""
         for temporary, _ in self._staged:
             with suppress(OSError):
                 os.unlink(temporary)
@@ -78,15 +76,15 @@ _CURRENT: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 
 
 def held_back() -> Outputs | None:
-    """The outputs of the running command; None outside `all_or_none`, where files are written at once."""
+    """Outputs of the current command; None outside of `all_or_none`, where files are written at once."""
     return _CURRENT.get()
 
 
 @contextmanager
 def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outputs]:
-    """Hold back all outputs until the end of the block; write none of them if it fails.
+    """Hold back all outputs until the end of the block, and discard them if it fails.
 
-    A nested block is part of the outer one.
+    A nested block is a part of the outer one.
 
     Parameters
     ----------

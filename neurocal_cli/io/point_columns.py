@@ -8,11 +8,11 @@ from neurocal_cli.points import Correspondences
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
 OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ"), "across": ("nu", "nv")}
-"""Columns of what `Correspondences` has for some points only, by its name there."""
+"""Names of the optional columns, by their attribute of `Correspondences`."""
 
 
-def measured(points: Correspondences) -> tuple[list[str], list[Array]]:
-    """Names and values of the columns after X, Y, Z: pixels, and the other known values of the points."""
+def value_columns(points: Correspondences) -> tuple[list[str], list[Array]]:
+    """Names and values of the columns after the world coordinates: pixels and the optional columns."""
     names, blocks = list(PIXEL), [points.pixels]
     for attribute, columns in OPTIONAL.items():
         values = getattr(points, attribute)

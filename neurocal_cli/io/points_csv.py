@@ -1,4 +1,4 @@
-"""Points CSV: known points and their pixels as a table that people and programs can edit."""
+"""Points CSV: known points and their pixels as a table that users and programs can edit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, measured
+from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.io.points_join import SETTINGS, correspondences
 from neurocal_cli.io.table import read_table
 from neurocal_cli.io.table_header import Schema, quoted_field
@@ -40,10 +40,10 @@ def read_points(
     Parameters
     ----------
     paths : str, Path or a sequence of them
-        ``-`` is stdin. Several files are read as one: view names must then differ between files,
-        and a file without a column ``view`` is one view with the file's name.
+        ``-`` is stdin. Several files are read as one: view names must then differ between files, and a file
+        without a column ``view`` is one view with the file's name.
     notes : list of str, optional
-        Remarks about what was left out are appended.
+        Remarks about ignored columns are appended.
 
     Returns
     -------
@@ -53,9 +53,9 @@ def read_points(
     Raises
     ------
     FormatError
-        A file that cannot be read; the message begins with ``FILE:LINE:``.
+        A file cannot be read; the message begins with ``FILE:LINE:``.
     InputError
-        Rows that are well formed but inconsistent.
+        Rows are well formed but contradict each other.
     """
     several = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not several:
@@ -75,7 +75,7 @@ def format_points(points: Correspondences) -> str:
     Raises
     ------
     InputError
-        A label that no CSV file can hold: empty or with a line break.
+        A label is empty or has a line break, so it cannot be written to CSV.
     """
     labels = {}
     if points.view is not None:
@@ -83,7 +83,7 @@ def format_points(points: Correspondences) -> str:
         labels["view"] = [quoted[k] for k in points.view_index.tolist()]
     if points.point is not None:
         labels["point"] = [_quoted(str(label), "point") for label in np.asarray(points.point).tolist()]
-    names, blocks = measured(points)
+    names, blocks = value_columns(points)
     numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
     rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
     return "\n".join([*_metadata_lines(points), ",".join([*labels, *PLACE, *names]), *rows, ""])

@@ -1,4 +1,4 @@
-"""XYZ CSV: triangulated points with their covariance, written as they come."""
+"""XYZ CSV: triangulated points with their covariance, written batch by batch."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from neurocal_cli.stereo.triangulation import Triangulated
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
 FLAGS = np.array(["ok", "off", "behind"])
 
-# Ten digits for coordinates, more than pixels can determine; six for the other columns.
+# Ten digits of the coordinates, more than their accuracy; six digits of covariance and epipolar error.
 _ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%s"])
 
 
 def format_space_points(
     batches: Iterable[tuple[Triangulated, NDArray[Any] | None]], *, unit: str, sigma: float, limit: float
 ) -> Iterator[str]:
-    """Text of a file, a part for each batch; the header comes with the first.
+    """Text of a file, one part per batch; the first part includes the header.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def format_space_points(
     unit : str
         Of the points.
     sigma : float [px]
-        Standard deviation of the pixels, by which the covariances are scaled.
+        Standard deviation of the pixels; scales the covariances.
     limit : float [px]
         Epipolar error beyond which a point is flagged.
     """
@@ -50,7 +50,7 @@ def format_space_points(
 def _rows(found: Triangulated, labels: NDArray[Any] | None, sigma: float, limit: float) -> str:
     assert found.covariance is not None
     numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
-    numbers[~np.isfinite(numbers)] = np.nan  # one word for values that do not exist
+    numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
     flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
     columns: list[list[Any]] = [*numbers.T.tolist(), flags]
     row = _ROW

@@ -1,4 +1,4 @@
-"""Points from the tables of one or several files, joined into one data set."""
+"""Join the tables of one or several files of points to one data set."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ SETTINGS = ("zoom", "focus")
 
 
 def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
-    """Make one set of points out of tables, one of each file.
+    """Join the tables of several files.
 
     Parameters
     ----------
     tables : list of Table
         At least one.
     notes : list of str
-        Remarks about what was left out are appended.
+        Remarks about ignored columns are appended.
 
     Raises
     ------
     FormatError, InputError
-        Tables that are inconsistent with each other or in themselves.
+        The tables contradict each other or themselves.
     """
     for table in tables:
         table.note_unknown(notes)
@@ -58,12 +58,12 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
 
 
 def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:
-    """Concatenate arrays; a single one is not copied, as it may have a million rows."""
+    """Concatenate blocks; a single one is not copied, because it may have a million rows."""
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
 
 def _points(tables: list[Table], notes: list[str]) -> NDArray[Any] | None:
-    """The ids of the points, None where a table has none."""
+    """Ids of the points; None if a table has none."""
     without = [table.source for table in tables if "point" not in table.labels]
     if not without:
         return _joined([_distinct(table) for table in tables])
@@ -80,7 +80,7 @@ def _views_of_file(table: Table) -> NDArray[Any]:
 
 
 def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
-    """The file of each view."""
+    """Find the file of each view."""
     owners: dict[str, str] = {}
     for table, labels in zip(tables, views, strict=True):
         first_of_run = np.concatenate([[True], labels[1:] != labels[:-1]])
@@ -98,7 +98,7 @@ def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
 
 
 def _agreed(key: str, tables: list[Table]) -> Any:
-    """The value of a metadata key, on which all files that state it must agree."""
+    """Value of a metadata key, on which all files that give it must agree."""
     given = [(getattr(table.metadata, key), table.source) for table in tables]
     given = [(value, source) for value, source in given if value is not None]
     for value, source in given:
@@ -117,7 +117,7 @@ def _plain(value: Any) -> str:
 
 
 def _check_settings(tables: list[Table], notes: list[str]) -> None:
-    """Refuse points at several zoom or focus settings: one camera has one."""
+    """Refuse points at several zoom or focus settings, because a calibration has one setting."""
     for name in SETTINGS:
         setting: float | None = None
         for table in tables:
@@ -138,7 +138,7 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
 
 
 def _covariance(tables: list[Table]) -> Array | None:
-    """(N, 3) covariance from the columns sigma or suu, suv, svv, which all files have or none."""
+    """(N, 3) covariance from the columns sigma or suu, suv, svv, which all files or none must have."""
     blocks = [_covariance_of(table) for table in tables]
     present = [block for block in blocks if block is not None]
     if present and len(present) < len(blocks):
@@ -159,12 +159,12 @@ def _covariance_of(table: Table) -> Array | None:
             f"{table.source}:{table.lines[row]}: sigma is {sigma[row]:g}, but must be positive; "
             "correct or remove the row"
         )
-    with np.errstate(over="ignore", under="ignore"):  # Correspondences refuses what comes out
+    with np.errstate(over="ignore", under="ignore"):  # Correspondences refuses the resulting inf or 0
         return np.column_stack([sigma * sigma, np.zeros_like(sigma), sigma * sigma])
 
 
 def _together(table: Table, names: tuple[str, ...]) -> Array | None:
-    """Columns that each file must have all of or none."""
+    """Stack columns of which a file must have all or none."""
     given = [name for name in names if name in table.numbers]
     if given and len(given) < len(names):
         raise FormatError(
@@ -175,7 +175,7 @@ def _together(table: Table, names: tuple[str, ...]) -> Array | None:
 
 
 def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
-    """Columns of several files, zero for files without them."""
+    """Columns of several files, zero for files without them; None if no file has them."""
     blocks = [_together(table, names) for table in tables]
     if all(block is None for block in blocks):
         return None
@@ -184,14 +184,14 @@ def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
 
 
 def _distinct(table: Table) -> NDArray[Any]:
-    """Check that no view has a point id twice and return the ids."""
+    """Check that no view has a point id twice, and return the ids."""
     points = table.labels["point"]
     views = table.labels.get("view")
     labels = [points] if views is None else [points, views]
     hashes = _hashes(labels)
     ordered = np.sort(hashes)
     repeated = ordered[1:][ordered[1:] == ordered[:-1]]
-    if len(repeated) == 0:  # nearly always: comparing a million labels themselves takes seconds
+    if len(repeated) == 0:  # nearly always; comparing a million labels directly would take seconds
         return points
     seen: dict[tuple[str, ...], int] = {}
     for row in np.flatnonzero(np.isin(hashes, repeated)):
@@ -207,7 +207,7 @@ def _distinct(table: Table) -> NDArray[Any]:
 
 
 def _hashes(columns: list[NDArray[Any]]) -> NDArray[np.uint64]:
-    """Hash each row of labels to 64 bits, FNV-1a over their characters."""
+    """Hash each row of labels to 64 bits, with FNV-1a over the characters."""
     hashes = np.full(len(columns[0]), 0xCBF29CE484222325, dtype=np.uint64)
     for column in columns:
         characters = np.ascontiguousarray(column).view(np.uint32).reshape(len(column), -1)

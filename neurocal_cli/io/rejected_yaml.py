@@ -1,4 +1,4 @@
-"""The points that a calibration left out, as a block of its file."""
+"""The points that a calibration rejected, as a block of its file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NUMBERS = ("X", "Y", "Z", "u", "v", "error_px")
 
 
 def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
-    """Lines of the block ``rejected``; none if no point was."""
+    """Lines of the block ``rejected``; none if nothing was rejected."""
     if not len(rejected) and not rejected.views:
         return
     yield "rejected:"
@@ -49,7 +49,7 @@ def read_rejected(field: Field, unit: str) -> Rejected:
     Raises
     ------
     FormatError
-        A table that is not as it was written.
+        The table does not have the written form.
     """
     if field.value is None:
         return Rejected()

@@ -1,7 +1,8 @@
-"""A calibration or a rig as YAML, JSON or OpenCV's XML, by the ending of the file's name.
+"""Write a calibration or a rig as YAML, JSON or OpenCV's XML, depending on the file's extension.
 
-JSON holds the same tree as YAML. XML is that of `cv2.FileStorage`, which holds only the cameras and the poses
-of views. A lean file holds only the camera and the verdict: no points, no poses, no record of the network.
+JSON contains the same tree as YAML. XML is the format of `cv2.FileStorage`, with only the cameras and the
+poses of views. A lean file contains only the camera and the verdict, without points, poses and the record of
+the network.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def write_result(
     ----------
     result : Calibration or Rig
     path : str or Path
-        ``.json`` gives JSON and ``.xml`` XML; all other names give YAML.
+        ``.json`` gives JSON, ``.xml`` gives XML; all other extensions give YAML.
     lean : bool
         Whether points, poses and the record of the network are left out.
     alpha : float, optional
@@ -40,26 +41,26 @@ def write_result(
     Returns
     -------
     losses : tuple of str
-        What the file cannot hold exactly: an XML file has no skew.
+        What the file cannot represent exactly, such as skew in XML.
 
     Raises
     ------
     InputError
-        An XML file of a camera whose distortion model OpenCV lacks.
+        An XML file is wanted, but OpenCV does not have the camera's distortion model.
     """
     if lean:
         result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
     ending = os.path.splitext(str(path))[1].lower()
-    # Formats that are not needed are not loaded.
+    # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
+        from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
         from neurocal_cli.io.exchange.dictionary import OPENCV
-        from neurocal_cli.io.exchange.fitting_in import fitted_in
         from neurocal_cli.io.exchange.neurocal import camera_set
 
-        fitted = fitted_in(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
-        write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
-        return (*fitted.losses, *fitted.remarks)
-    by_rows = ending == ".json"  # which loads at once however long it is
+        adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
+        write_whole(path, OPENCV.text(adapted.cameras, ending)[""])
+        return (*adapted.losses, *adapted.remarks)
+    by_rows = ending == ".json"  # JSON loads fast at any length
     if not isinstance(result, Calibration):
         from neurocal_cli.io.rig_yaml import format_rig
 
@@ -71,7 +72,7 @@ def write_result(
 
 
 def lean_calibration(calibration: Calibration) -> Calibration:
-    """The camera with its accuracy and its verdict, without points and poses."""
+    """The camera with its uncertainty and verdict, without the data behind it."""
     return replace(
         calibration,
         points=Correspondences.none(calibration.image_size, calibration.unit),
@@ -84,7 +85,7 @@ def lean_calibration(calibration: Calibration) -> Calibration:
 
 
 def lean_rig(rig: Rig) -> Rig:
-    """Both cameras and their relative pose, without points and poses of views."""
+    """Both cameras and their relative pose, without the data behind them."""
     return replace(
         rig,
         left=lean_calibration(rig.left),
@@ -96,7 +97,7 @@ def lean_rig(rig: Rig) -> Rig:
 
 
 def _as_json(text: str) -> str:
-    """The tree of a YAML text as JSON, one entry of the upper levels a line."""
+    """Convert YAML text to JSON, with one entry of the upper levels per line."""
     from neurocal_cli.io.yaml_tree import parse_yaml
 
     return _lines(parse_yaml(text, "the calibration"), 3) + "\n"

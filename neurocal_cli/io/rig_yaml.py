@@ -1,7 +1,7 @@
-"""Rig files: two calibrations and the relative pose of the right camera, in one YAML file.
+"""Rig files: two calibrations and the pose of the right camera relative to the left, in one YAML file.
 
-``left`` and ``right`` are each a calibration file's content, whose rectification and projection matrices
-are those of the rectified pair; ``stereo`` is the rest.
+``left`` and ``right`` have the content of a calibration file, with the rectification and projection matrices
+of the rectified pair. ``stereo`` has the rest.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted,
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
-FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
+FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
 _GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
-_SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
+# E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
+_SAME = 1e-6
 
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
@@ -46,7 +47,7 @@ def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> s
 def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
     """Write a rig file, whole or not at all; ``-`` is stdout.
 
-    A name that ends in ``.json`` or ``.xml`` gets JSON or OpenCV's XML, see `result_files`.
+    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `result_files`.
     """
     from neurocal_cli.io.result_files import write_result
 
@@ -54,12 +55,12 @@ def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
 
 
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
-    """Texts of two calibration files as ROS's stereo nodes read them, lengths in metres.
+    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres.
 
     Raises
     ------
     InputError
-        A unit that is no length, or images without one known size.
+        The unit is not a known length, or the images have no common known size.
     """
     if rig.unit not in METRES:
         raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
@@ -122,7 +123,7 @@ def read_rig(path: str | Path) -> Rig:
     Raises
     ------
     FormatError
-        The file cannot be read, is no YAML, or a key is missing or wrong.
+        The file cannot be read, is not YAML, or a key is missing or wrong.
     """
     return rig_from_field(read_tree(path))
 
@@ -181,7 +182,7 @@ def _names(entry: Field, count: int) -> tuple[str, ...]:
 
 
 def _check_consistent(rig: Rig, block: Field) -> None:
-    """Refuse a file in which one of several redundant values was edited."""
+    """Refuse a file with contradicting values, of which one was edited."""
     values = [block[g][n]["value"].number() for g, names in _GROUPS for n in names]
     stated = (
         ("E", block["E"].array(3, 3), rig.E),

@@ -1,9 +1,9 @@
-"""Text tables of numbers and labels, with columns found by name, as all our CSV files are.
+"""Read tables of numbers and labels with named columns, the common part of all our CSV files.
 
-NumPy's C reader parses the rows in bulk, a million per second. It is laxer than the format, so text that the
-two could read differently (quotes, comments among the rows, blank lines, other alphabets, ...) is read line
-by line, as is text that NumPy refuses, to find the faulty line. Both ways give the same table. With
-`str.split` or the `csv` module and `float` instead of NumPy's reader, a million rows take 4 s.
+NumPy's C reader reads the rows in bulk, a million per second. It is less strict than the format, so text in
+which the two could differ (quotes, comments among the rows, blank lines, other alphabets, ...) is read line
+by line. So is text that NumPy refuses, to find the line for the message. Both ways give the same table.
+Without NumPy's reader, by `str.split` or the `csv` module and `float`, a million rows take 4 s.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from neurocal_cli.io.table_header import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-_BLOCK = 1 << 22  # bytes of a stream at a time: some ten thousand rows
-# Printable ASCII without quotes, tabs and line ends: both readers agree on which of these are blanks.
+_BLOCK = 1 << 22  # bytes of a stream read at a time, some ten thousand rows
+# Printable ASCII without quotes, with tabs and line ends: characters that both readers treat alike.
 _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
 
 
@@ -47,15 +47,15 @@ class Table:
     Attributes
     ----------
     source : str
-        The file's name for messages.
+        Name of the file for messages.
     numbers : dict of (N,) arrays by column name
     labels : dict of (N,) str arrays by column name
     lines : (N,) int array
-        Line of each row.
+        Line number of each row.
     metadata : Metadata
         From the lines that begin with ``#``.
     unknown : tuple of str
-        Names of columns that were ignored.
+        Names of ignored columns.
     """
 
     source: str
@@ -91,7 +91,7 @@ def read_table(path: str | Path, schema: Schema) -> Table:
     path : str or Path
         ``-`` is stdin.
     schema : Schema
-        The columns to look for.
+        Known columns.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Itera
     Raises
     ------
     FormatError
-        The file cannot be read, or a line of it is wrong; the rows before it have been yielded by then.
+        The file cannot be read, or a line of it is wrong; earlier blocks have been yielded by then.
     """
     source = "<stdin>" if str(path) == "-" else one_line(path)
     layout, rows = None, False
@@ -137,10 +137,10 @@ def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Itera
         if table is not None and len(table):
             rows = True
             yield table
-        # The next block's line numbers continue after this one's.
+        # The first line of the next block follows the last line of this one.
         layout = replace(layout, offset=0, line=layout.line + data.count(b"\n", layout.offset))
     if layout is None:
-        find_layout(b"", source, schema)  # says that the file is empty
+        find_layout(b"", source, schema)  # raises the error about an empty file
     elif not rows:
         raise _no_rows(source, schema, layout)
 
@@ -150,7 +150,7 @@ def _no_rows(source: str, schema: Schema, layout: Layout) -> FormatError:
 
 
 def _plain_lines(data: bytes, source: str, schema: Schema) -> bytes:
-    r"""UTF-8 without a mark and with ``\n`` line ends; refuses bytes that are not UTF-8."""
+    r"""Remove the byte order mark and convert line ends to ``\n``; refuse bytes that are not UTF-8."""
     if not data.isascii() or b"\0" in data:
         decode(data, source, f"a CSV file of {schema.kind}", schema.instead)
     data = data.removeprefix(b"\xef\xbb\xbf")
@@ -162,7 +162,7 @@ def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Tabl
 
 
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:
-    r"""Read the rows below a header by NumPy, or return None if it might read them wrongly.
+    r"""Read the rows below a header by NumPy; None if NumPy may read them wrongly.
 
     Parameters
     ----------
@@ -205,9 +205,9 @@ def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Ta
 
 
 def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
-    """Whether NumPy and `read_line_by_line` split every line of the rows alike."""
+    """Whether NumPy and `read_line_by_line` split all rows alike."""
     separator = layout.separator
-    before = max(layout.offset - 1, 0)  # so that the first line has a line end in front, too
+    before = max(layout.offset - 1, 0)  # includes the line end before the first row
     if layout.offset >= len(data) or data.translate(None, _PLAIN):
         return False
     if data.find(b"#", layout.offset) >= 0 and data.find(b"\n#", before) >= 0:
@@ -226,12 +226,12 @@ def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
 
 
 def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) -> Table:
-    """Read the rows below a header, whatever the format allows; see `read_in_bulk`.
+    """Read the rows below a header, in any form that the format allows; see `read_in_bulk`.
 
     Raises
     ------
     FormatError
-        The first line that is wrong.
+        A line is wrong; the message names the first one.
     """
     places = [(name, k) for k, name in enumerate(layout.names) if name in schema.known]
     columns: dict[str, list[Any]] = {name: [] for name, _ in places}
@@ -248,7 +248,7 @@ def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) 
 
 
 def _rows(data: bytes, source: str, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of each row; metadata among the rows is stored."""
+    """Iterate over line number and fields of each row; metadata lines among them are read."""
     expected = len(layout.names)
     text = data[layout.offset :].decode("utf-8")
     for number, line in enumerate(text.split("\n"), start=layout.line + 1):

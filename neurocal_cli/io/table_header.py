@@ -1,4 +1,4 @@
-"""The head of a table: its metadata, its separator and the names of its columns."""
+"""Read the top of a table: its metadata, its separator and the names of its columns."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import one_line
 
-# Numbers as our files may contain them; Python's float() would also accept 1_0 and other alphabets.
+# Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
-# 1,5 for 1.5, as spreadsheets of half of Europe write it.
+# 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
 _METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", re.DOTALL)
@@ -27,19 +27,19 @@ _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 @frozen_dataclass
 class Schema:
-    """The columns of a kind of table.
+    """Columns of a kind of table.
 
     Attributes
     ----------
     kind : str
-        Plural noun for the rows, such as "points".
+        Name of the rows, in the plural.
     required, optional : tuple of str
     labels : frozenset of str
-        The columns that hold text; all others hold numbers.
+        The columns that contain text; all others contain numbers.
     instead : str
-        Advice for a file that is no such table, for messages.
+        Advice for files of another kind, for messages.
     headerless : tuple of str
-        Columns of a file without a header; empty: the header is required.
+        Columns of a file without a header; if empty, the header is required.
     """
 
     kind: str
@@ -73,7 +73,7 @@ class Metadata:
     distances: tuple[Distance, ...] | None = None
 
     def take(self, line: str, source: str, number: int) -> None:
-        """Store a ``# key: value`` line; other comments are ignored."""
+        """Read a ``# key: value`` line; other comments are ignored."""
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
             return
@@ -118,16 +118,16 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
 
 @frozen_dataclass
 class Layout:
-    """The start of a table's rows and how to split them.
+    """Position of a table's rows, and how to split them.
 
     Attributes
     ----------
     separator : str or None
-        None: blanks.
+        None for blanks.
     names : tuple of str
-        Of the columns, in the file's order.
+        Names of the columns, in the file's order.
     offset : int
-        Of the first byte below the header.
+        Offset of the first byte below the header.
     line : int
         Number of the last line above that byte.
     metadata : Metadata
@@ -141,7 +141,7 @@ class Layout:
     metadata: Metadata = field(default_factory=Metadata)
 
     def unknown(self, schema: Schema) -> tuple[str, ...]:
-        """Names of columns that the schema doesn't know."""
+        """Names of columns that are not in the schema."""
         return tuple(name for name in self.names if name not in schema.known)
 
 
@@ -156,7 +156,7 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
     Raises
     ------
     FormatError
-        No content, columns missing or twice, malformed metadata.
+        The file is empty, a column is missing or appears twice, or metadata are malformed.
     """
     metadata = Metadata()
     comments: list[str] = []
@@ -184,13 +184,14 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
 def split_fields(line: str, separator: str | None, source: str, number: int) -> list[str]:
     """Split a line at its separators, outside quotes.
 
-    Blanks around a field are dropped, unless they are inside quotes; ``""`` in quotes is a quote. The
-    csv module would continue an unclosed quote on the next line, and keep blanks after a quote.
+    Blanks around a field are dropped unless they are inside quotes; ``""`` in quotes is a quote. The csv
+    module is not used, because it would continue an unclosed quote in the next line, and keep blanks after a
+    quote.
 
     Raises
     ------
     FormatError
-        A quote that is not closed.
+        A quote is not closed.
     """
     line = line.strip(" \t") if separator != "\t" else line.strip(" ")
     if '"' not in line:
@@ -213,12 +214,12 @@ def split_fields(line: str, separator: str | None, source: str, number: int) -> 
 
 
 def quoted_field(text: str) -> str:
-    """A field as `split_fields` reads it back, in quotes where it needs them."""
+    """Write a field for `split_fields`, in quotes if it needs them."""
     return '"' + text.replace('"', '""') + '"' if re.search(r'[",;\t]|^[ #]|[ ]$', text) else text
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, int, int, str]]:
-    """Go through the lines: number, first byte, byte after the end and stripped text."""
+    """Iterate over the lines: number, first byte, byte after the end, and stripped text."""
     start, number = 0, 1
     while start < len(data):
         end = data.find(b"\n", start) + 1 or len(data)
@@ -227,9 +228,9 @@ def _lines(data: bytes) -> Iterator[tuple[int, int, int, str]]:
 
 
 def _find_separator(line: str) -> str | None:
-    """Find the separator of the fields in the first line; None: blanks."""
+    """Find the separator of the fields of the first line; None for blanks."""
     line = _QUOTED.sub("q", line)
-    # In 1,5;2,5;... the commas are decimal, so semicolons take precedence if there are enough.
+    # In 1,5;2,5;... the commas are decimal commas, so semicolons take precedence if there are enough.
     semicolons = line.count(";") >= min(line.count(","), 4)
     separators = ";\t," if semicolons else ",\t;"
     for separator in separators:
@@ -251,7 +252,7 @@ def _headerless_names(
             source,
             number,
         )
-    for comment in comments:  # numpy.savetxt puts its header into a comment
+    for comment in comments:  # numpy.savetxt writes its header as a comment
         words = re.split(r"[\s,;]+", comment.strip("# \t"))
         if sorted(words) == sorted(expected) and words != list(expected):
             raise FormatError(f"the header {','.join(words)} is a comment; remove its #", source, number)

@@ -1,4 +1,4 @@
-"""The target estimated by a calibration, as a block of its file."""
+"""The target shape that a calibration estimated, as a block of its file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SHAPES = ("bowl", "saddle", "twist")
 
 
 def target_lines(target: Target | None, long: bool) -> Iterator[str]:
-    """Lines of the block ``target``; none if the target was taken as given."""
+    """Lines of the block ``target``; none if the target was used as given."""
     if target is None:
         return
     yield "target:"
@@ -53,7 +53,7 @@ def read_target(field: Field) -> Target:
     Raises
     ------
     FormatError
-        A table that is not as it was written.
+        The table does not have the written form.
     """
     columns = read_table(field, frozenset(("point",)))
     stated = _STATED if set(_STATED) <= set(columns) else ()

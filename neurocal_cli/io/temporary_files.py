@@ -1,7 +1,7 @@
-"""Names of temporary files, and the removal of those that a killed process left behind.
+"""Name temporary files, and remove those that a killed process left behind.
 
-A name contains the computer and the process. Files of an ended process of this computer are removed by the
-next process that writes into the same folder; all others are kept.
+A name contains the computer and the process that created the file. If that process of this computer has
+ended, the next process that writes to the same folder removes the file. Other files are left alone.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ _seen: set[str] = set()  # folders that this process has cleared
 
 
 def temporary_name() -> str:
-    """A name unique to this process."""
+    """Make a name that no other process chooses."""
     return f".neurocal-{_computer()}-{os.getpid()}-{os.urandom(8).hex()}.tmp"
 
 
 def remove_stale(folder: str) -> None:
-    """Remove what killed processes left in a folder; once for each folder."""
-    # On Windows no question to a process is harmless.
+    """Remove the files that killed processes left in a folder, once per folder and process."""
+    # On Windows, os.kill is no harmless test of a process.
     if folder in _seen or os.name != "posix":
         return
     _seen.add(folder)
@@ -42,9 +42,9 @@ def _computer() -> str:
 
 def _runs(pid: int) -> bool:
     try:
-        os.kill(pid, 0)  # asks, and sends nothing
+        os.kill(pid, 0)  # only tests whether the process exists
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # of another user
+    except (OSError, OverflowError):  # a process of another user
         return True
     return True

@@ -1,9 +1,9 @@
 """Long columns as texts of comma-separated numbers, ``X: ['0.0,20.0,40.0']``, or packed.
 
-PyYAML's own parser takes 50 us for a number, but 0.3 us for a character of a text, whichever character it is.
-A number of 17 digits takes 20 characters as a decimal, 11 in base64, and 4 packed: each of these is a
-character of Unicode's private use that encodes two bytes of a float64. A text has at most 160 numbers,
-because OpenCV's FileStorage limits a text to 4095 bytes.
+PyYAML's pure-Python parser takes 50 us per number, but only 0.3 us per character of a text. A number of 17
+digits has 20 characters as a decimal, 11 in base64, and 4 packed: each of these is a character of Unicode's
+private use area that encodes two bytes of a float64. A text has at most 160 numbers, because OpenCV's
+FileStorage refuses texts of more than 4095 bytes.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, quoted
 
-LONGEST = 160  # numbers in a text, each of 24 characters at most
+LONGEST = 160  # numbers in a text, each with at most 24 characters
 
-_PRIVATE = 0xF0000  # the first of 65536 private-use characters
+_PRIVATE = 0xF0000  # the first of 65536 characters of a private use area
 
 _NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
 _RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
 
 
 def number_words(values: NDArray[Any]) -> list[str]:
-    """Write each number as text; ``null`` for values that are not finite."""
+    """Write each number as text; ``null`` if it is not finite."""
     flat = np.ravel(values)
     return list(map(str, flat.tolist())) if flat.dtype.kind in "iu" else flows(flat)
 
 
 def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterator[str]:
-    """Lines of a table, one for each column: arrays as texts of numbers, labels one by one."""
+    """Lines of a table, one per column: arrays as texts of numbers, labels as single texts."""
     for name, values in columns.items():
         if isinstance(values, np.ndarray):
             words = number_words(values)
@@ -48,7 +48,7 @@ def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterato
 def table_lines(
     columns: Mapping[str, NDArray[Any] | Sequence[str]], long: bool, indent: int = 4
 ) -> Iterator[str]:
-    """Lines of ``columns`` and ``rows``, or of a long table of ``columns`` alone."""
+    """Lines of a table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
     if long:
         yield "columns:"
         yield from (f"  {line}" for line in column_lines(columns))
@@ -63,12 +63,12 @@ def table_lines(
 
 
 def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
-    """Read either form of a table: its columns, each as a list of values.
+    """Read either form of a table as columns, each a list of values.
 
     Raises
     ------
     FormatError
-        Rows or columns of different lengths.
+        Rows or columns have different lengths.
     """
     if isinstance(field["columns"].value, dict):
         table = read_columns(field["columns"], labels)
@@ -89,7 +89,7 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
     Raises
     ------
     FormatError
-        Not a column, or columns of different lengths.
+        A value is not a column, or columns have different lengths.
     """
     columns: dict[str, list[Any]] = {
         name: column.texts() if name in labels else read_numbers(list(column.items()))
@@ -101,22 +101,22 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
 
 
 def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field]:
-    """Columns of a table by their names."""
+    """Make a field of each column of a table."""
     return {name: Field(values, table.source, f"{table.path}.{name}") for name, values in columns.items()}
 
 
 def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
-    """(k, N) numbers of some columns; NaN for null if that is allowed."""
+    """(k, N) numbers of some columns; NaN for null, which must be allowed by `unknown`."""
     return np.array([columns[name].array(-1, unknown=unknown) for name in names])
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:
-    """Read the numbers of some texts, None for null; they may still be infinite.
+    """Read the numbers of texts, None for null; they may be infinite.
 
     Raises
     ------
     FormatError
-        Anything but numbers.
+        A text contains anything but numbers.
     """
     for entry in texts:
         if not _NUMBERS(entry.text()):
@@ -128,18 +128,18 @@ def read_numbers(texts: Sequence[Field]) -> list[Any]:
 
 
 def packed_text(values: NDArray[Any]) -> str:
-    """Write numbers as float64 in quotes, four characters for each."""
+    """Write numbers as packed float64 in quotes, with four characters per number."""
     words = np.ascontiguousarray(values, dtype="<f8").view("<u2").astype("<u4") + _PRIVATE
     return f"'{words.tobytes().decode('utf-32-le')}'"
 
 
 def read_packed(entry: Field) -> list[float]:
-    """Read the numbers of `packed_text`; they may still be infinite.
+    """Read the numbers of `packed_text`; they may be infinite.
 
     Raises
     ------
     FormatError
-        Other characters, or too few.
+        The text has other characters, or too few.
     """
     codes = np.frombuffer(entry.text().encode("utf-32-le", "surrogatepass"), dtype="<u4")
     if len(codes) % 4 or np.any(codes >> 16 != _PRIVATE >> 16):
@@ -161,7 +161,7 @@ def read_ranges(field: Field, below: int) -> list[int]:
     Raises
     ------
     FormatError
-        Text that is not a list of ranges, or numbers that are not below the limit.
+        The text has another form, or a number is not below the limit.
     """
     text = field.text()
     if not _RANGES(text):

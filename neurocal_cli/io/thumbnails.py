@@ -1,4 +1,4 @@
-"""Small pictures of photographs, for a page that holds many of them."""
+"""Thumbnails of photographs, for a page with many of them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.image_paths import find_images, view_names
 from neurocal_cli.io.images import encode_image, read_image, shrink
 
-_WIDEST = 960  # px; a page shows none wider
+_WIDEST = 960  # px; the page shows a photograph no wider
 _NARROWEST = 120
 
 
 def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
-    """Find the image of each view: the file that has its name, without folder and ending.
+    """Find the image of each view: the file with its name, without folder and extension.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
     InputError
         No view has an image there.
     FormatError
-        A folder that cannot be read or is empty.
+        The folder cannot be read or is empty.
     """
     paths = find_images([word])
     found = dict(zip(view_names(paths), paths, strict=True))
@@ -43,19 +43,20 @@ def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
 
 
 def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
-    """Images as small JPEG files, with a limit on their total size.
+    """Encode images as small JPEG files with a limit on their total size.
 
     Parameters
     ----------
     images : dict of paths by name
     size : (width, height) or None [px]
-        That all images must have.
+        Required size of all images.
     most_bytes : int
+        Exceeded only if images of the least width take more.
 
     Raises
     ------
     FormatError
-        An image that cannot be read, or of another size.
+        An image cannot be read, or has another size.
     """
     small: dict[str, NDArray[np.uint8]] = {}
     for name, path in images.items():
@@ -73,5 +74,5 @@ def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_byt
         total = sum(map(len, files.values()))
         if total <= most_bytes or width == _NARROWEST:
             return files
-        # A picture of half the width takes a little more than a quarter of the bytes.
+        # A thumbnail of half the width takes a little more than a quarter of the bytes.
         width = max(_NARROWEST, int(width * min(0.9, (most_bytes / total) ** 0.6)))

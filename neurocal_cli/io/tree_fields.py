@@ -1,4 +1,4 @@
-"""Checked access to the values of a file's tree: each error names the file, the key and the remedy."""
+"""Checked access to the values of a file's tree; each error names the file, the key and the remedy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array
 
 T = TypeVar("T")
 
-# YAML 1.1 takes 1e-05 for text, as it has no point; other programs write it for a number.
+# YAML 1.1 reads 1e-05 as text, because it has no decimal point, but other programs write numbers so.
 _NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 
@@ -26,9 +26,9 @@ class Field:
     value : object
         As returned by `yaml_tree.parse_yaml` or a JSON parser.
     source : str
-        The file's name.
+        Name of the file.
     path : str
-        Keys from the root, with dots between them.
+        Keys from the root, separated by dots.
     """
 
     __slots__ = ("path", "source", "value")
@@ -39,7 +39,7 @@ class Field:
         self.path = path
 
     def fail(self, expected: str) -> NoReturn:
-        """Raise the FormatError for a value that is not what was expected."""
+        """Raise a FormatError about an unexpected value."""
         found = _described(self.value)
         raise FormatError(
             f"{self.path or 'the file'} must be {expected}, found {found}; correct it", self.source
@@ -49,7 +49,7 @@ class Field:
         return isinstance(self.value, dict) and self.value.get(key) is not None
 
     def __getitem__(self, key: str) -> Field:
-        """The value of a required key."""
+        """Value of a required key."""
         if not isinstance(self.value, dict):
             self.fail("a mapping (key: value)")
         if key not in self.value:
@@ -58,14 +58,14 @@ class Field:
         return Field(self.value[key], self.source, self._below(key))
 
     def get(self, key: str, default: Any = None) -> Field:
-        """The value of a key, or a default if the key or its value is missing."""
+        """Value of a key, or a default if the key is missing or null."""
         if not isinstance(self.value, dict):
             self.fail("a mapping (key: value)")
         found = self.value.get(key)
         return Field(default if found is None else found, self.source, self._below(key))
 
     def read(self, key: str, reader: Callable[[Field], T]) -> T | None:
-        """The value of a key, read by a function; None if the value is missing."""
+        """Apply a function to the value of a key; None if the key is missing or null."""
         field = self.get(key)
         return None if field.value is None else reader(field)
 
@@ -83,29 +83,29 @@ class Field:
             yield Field(value, self.source, f"{self.path}[{k}]")
 
     def texts(self) -> list[str]:
-        """The value as a list of texts."""
+        """Value as a list of texts."""
         return [entry.text() for entry in self.items()]
 
     def names(self, count: int) -> list[str]:
-        """The value as a list of a given number of distinct texts."""
+        """Value as a list of `count` different texts."""
         texts = self.texts()
         if len(texts) != count or len(set(texts)) < count:
             self.fail(f"{count} different names")
         return texts
 
     def number(self) -> float:
-        """The value as a finite number."""
+        """Value as a finite number."""
         number = _as_float(self.value)
         if not math.isfinite(number):
             self.fail("a finite number")
         return number
 
     def number_or_nan(self) -> float:
-        """The value as a finite number; NaN for null, which means unknown."""
+        """Value as a finite number; NaN for null, which means unknown."""
         return math.nan if self.value is None else self.number()
 
     def integer(self, least: int = 0) -> int:
-        """The value as a whole number, not below `least`."""
+        """Value as a whole number, not below `least`."""
         number = self.value
         if isinstance(number, float) and number.is_integer():
             number = int(number)
@@ -114,13 +114,13 @@ class Field:
         return int(number)
 
     def boolean(self) -> bool:
-        """The value as true or false."""
+        """Value as true or false."""
         if not isinstance(self.value, bool):
             self.fail("true or false")
         return self.value
 
     def text(self) -> str:
-        """The value as text; a whole number counts as the text that it was written as."""
+        """Value as text; a whole number is converted back to text."""
         if isinstance(self.value, int) and not isinstance(self.value, bool):
             return str(self.value)
         if not isinstance(self.value, str):
@@ -128,13 +128,13 @@ class Field:
         return self.value
 
     def array(self, *shape: int, unknown: bool = False) -> Array:
-        """The value as an array, from nested lists of finite numbers; -1 in the shape allows any length.
+        """Value as an array, from nested lists of finite numbers; -1 in the shape allows any length.
 
         Parameters
         ----------
         *shape : int
         unknown : bool
-            Whether null is allowed for a number; it becomes NaN.
+            Whether null is allowed for unknown numbers; it becomes NaN.
         """
         words = " x ".join("n" if s < 0 else str(s) for s in shape)
         expected = f"{words} finite numbers{' or null' * unknown}"
@@ -142,7 +142,7 @@ class Field:
             array = np.array(self.value)
         except (ValueError, OverflowError, RecursionError):  # ragged
             self.fail(expected)
-        if array.dtype.kind not in "iuf":  # text that looks like numbers, null or other values
+        if array.dtype.kind not in "iuf":  # numbers as text, null, or other values
             array = self._converted(array, expected, unknown)
         array = array.astype(float)
         if array.size == 0 and any(s < 0 for s in shape):
@@ -168,7 +168,7 @@ class Field:
 
 
 def _as_float(value: Any) -> float:
-    """The number that a scalar represents; NaN if it represents none."""
+    """Convert a scalar to a number; NaN if it is none."""
     if isinstance(value, bool):
         return math.nan
     if isinstance(value, (int, float)):

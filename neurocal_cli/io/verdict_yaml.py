@@ -26,7 +26,7 @@ def read_verdict(field: Field) -> Verdict:
     Raises
     ------
     FormatError
-        A key that is missing or wrong.
+        A key is missing or wrong.
     """
     return Verdict(
         field["word"].text(),

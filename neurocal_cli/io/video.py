@@ -17,11 +17,11 @@ from neurocal_cli.io.images import captured_stderr, encode_png
 from neurocal_cli.io.writing import write_whole
 
 _HEAD = 16  # bytes that identify the kind of file
-_USUAL, _FASTEST = 30.0, 1e4  # frames a second
+_USUAL, _FASTEST = 30.0, 1e4  # frames per second
 
 
 def is_video(path: str) -> bool:
-    """Whether a file begins like a video; if it cannot be read, its reader reports that."""
+    """Whether a file begins like a video; False for stdin and for what is not a file."""
     if path == "-" or not os.path.isfile(path):
         return False
     with reading_failures(one_line(path)), open(path, "rb") as file:
@@ -29,12 +29,12 @@ def is_video(path: str) -> bool:
 
 
 def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
-    """All frames of a video in their order, grey.
+    """Iterate over the frames of a video as grey images.
 
     Raises
     ------
     FormatError
-        OpenCV cannot decode it here.
+        OpenCV cannot decode the video.
     """
     with captured_stderr():
         capture = cv2.VideoCapture(path)
@@ -59,7 +59,7 @@ def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
 
 
 def frame_rate(path: str) -> float:
-    """Frames per second as the video states; 30 if it states no plausible rate."""
+    """Frames per second according to the video's header; 30 if that is missing or absurd."""
     with captured_stderr():
         capture = cv2.VideoCapture(path)
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -68,5 +68,5 @@ def frame_rate(path: str) -> float:
 
 
 def save_frame(grey: NDArray[np.uint8], path: str) -> None:
-    """Write a frame as PNG at once, not held back until the end of the command."""
+    """Write a frame as PNG at once, not with the outputs that a command holds back until its end."""
     Context().run(write_whole, path, encode_png(grey))

@@ -1,4 +1,4 @@
-"""The poses of views, as a block of a calibration file: an entry for each, or columns in a long file."""
+"""The poses of views, as a block of a calibration file: an entry per view, or columns in a long file."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from neurocal_cli.io.yaml_text import flows, text
 
 _NAME = "name"
 
-# Angles give R back but for the last bits; more means an edit of one.
+# The angles reproduce R except for the last bits; a larger difference means that one was edited.
 _SAME = 1e-6
 
 
-def same_std_keys(views: Mapping[str, ViewResult]) -> bool:
-    """Whether all views have the same standard deviations known, so that they fit into columns."""
+def have_same_std(views: Mapping[str, ViewResult]) -> bool:
+    """Whether all views have standard deviations of the same parameters, so that they fit into columns."""
     return len({frozenset(view.std) for view in views.values()}) <= 1
 
 
@@ -49,7 +49,7 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
         yield f"    projection_matrix: {matrix}"
         yield f"    rmse_px: {rmse}"
         yield f"    n_points: {view.n_points}"
-        yield f"    R: {rotation}"  # the angles give it back but for the last bit
+        yield f"    R: {rotation}"  # the angles do not reproduce the last bits
         if view.fixed:
             yield "    fixed: true"
 
@@ -83,12 +83,12 @@ def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[l
 
 
 def read_views(field: Field) -> dict[str, ViewResult]:
-    """Read the block ``views``, in either form.
+    """Read the block ``views`` in either form.
 
     Raises
     ------
     FormatError
-        A key that is missing or wrong.
+        A key is missing or wrong.
     """
     if isinstance(field.value, dict):
         return _from_columns(field)
@@ -108,7 +108,7 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
     wanted = [_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed"]
     wanted += [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
     for name in wanted:
-        field[name]  # which says what is missing
+        field[name]  # raises an error that names the missing column
     if len(set(table[_NAME])) < len(table[_NAME]):
         field[_NAME].fail("names that differ")
     pose = np.column_stack(list(numbers_of(columns, POSE_NAMES)))

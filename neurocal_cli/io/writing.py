@@ -1,4 +1,4 @@
-"""Atomic writing of files: a reader never sees half a file, and a failure leaves the old content.
+"""Write files completely or not at all: no reader sees a partial file, and a failure keeps the old content.
 
 ``-`` is stdout.
 """
@@ -21,17 +21,17 @@ from neurocal_cli.io.temporary_files import remove_stale, temporary_name
 if TYPE_CHECKING:
     from pathlib import Path
 
-# Opening these anew would truncate what the shell appends to, so they are written as stdout is.
+# Opening these would truncate a file that the shell appends to, so they are written like stdout.
 _STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
     """Write a whole file or, on any failure, nothing.
 
-    The content goes to a temporary file in the same folder, which then takes the file's place. An
-    existing file keeps its permissions; a symbolic link stays and its target is replaced; what is
-    not a regular file (a pipe, a device) is written directly; ``-`` is stdout. While a command holds
-    its outputs back (`outputs.all_or_none`), the file takes its place at the command's end.
+    The content is written to a temporary file in the same folder, which then replaces the file. An existing
+    file keeps its permissions. A symbolic link is kept, and its target is replaced. Pipes and devices are
+    written directly; ``-`` is stdout. While a command holds its outputs back (`outputs.all_or_none`), the
+    file is replaced at the end of the command.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     Raises
     ------
     NeurocalError
-        The file cannot be written. A reader that closed its pipe stays a BrokenPipeError, which
-        command lines end quietly on.
+        The file cannot be written. If the reader closes a pipe, the BrokenPipeError is passed on, because
+        commands then end quietly.
     """
     data, outputs = _encode(content), held_back()
     if outputs is not None and str(path) in _STDOUT_NAMES:
@@ -53,9 +53,9 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
 
 
 def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
-    """Write a file from parts as they are produced, or nothing if one of them fails; see `write_whole`.
+    """Write a file part by part, or nothing if a part fails; see `write_whole`.
 
-    Parts already sent to stdout or a pipe stay there.
+    Data already written to stdout or a pipe cannot be taken back.
     """
     if str(path) in _STDOUT_NAMES:
         for chunk in chunks:
@@ -80,19 +80,19 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
 
 
 def check_places(*paths: str | None) -> None:
-    """Refuse places that a file cannot be written to, before any work is done.
+    """Refuse outputs that cannot be written, before any work is done.
 
     Parameters
     ----------
     paths : str or None
-        None and ``-`` need no place.
+        None and ``-`` are not checked.
 
     Raises
     ------
     UsageError
-        A file that the command reads (`Outputs.protect`), two outputs in one place.
+        An output is an input of the command (`Outputs.protect`), or two outputs are the same file.
     NeurocalError
-        A folder that does not exist or may not be written to.
+        A folder does not exist or may not be written to.
     """
     outputs, taken = held_back(), set[str]()
     for path in paths:
@@ -122,7 +122,7 @@ def _check_place(path: str | Path, former: os.stat_result | None) -> None:
 
 @contextmanager
 def _writing_failures(path: str | Path) -> Iterator[None]:
-    """Turn failures to write a file into one-line errors."""
+    """Turn errors of writing a file into one-line messages."""
     try:
         yield
     except (BrokenPipeError, NeurocalError):
@@ -132,7 +132,7 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
 
 
 def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
-    """Open a pipe or a device; a named pipe that nobody reads would block for ever."""
+    """Open a pipe or a device; refuse a named pipe without a reader, which would block forever."""
     if not stat.S_ISFIFO(status.st_mode):
         return open(path, "wb")
     try:
@@ -148,15 +148,13 @@ def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
 
 
 def write_stdout(data: bytes) -> None:
-    """Write to stdout, after what was printed before."""
-    if sys.stdout is None:  # the shell closed it: >&-
-        raise NeurocalError("stdout is closed; give a file")
+    """Write to stdout, after flushing earlier output."""
     try:
         buffer = getattr(sys.stdout, "buffer", None)
-        if buffer is None:  # replaced by something that takes text alone
+        if buffer is None:  # stdout was replaced by a text-only stream
             sys.stdout.write(data.decode("utf-8"))
         else:
-            sys.stdout.flush()  # what was printed before comes first
+            sys.stdout.flush()
             buffer.write(data)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -183,12 +181,12 @@ def _status(path: str | Path) -> os.stat_result | None:
 
 
 def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_result | None) -> str:
-    """Write the content to a temporary file in the target's folder, with the permissions of the old file."""
+    """Write a temporary file next to the target, with owner and permissions of the file it replaces."""
     folder = os.path.dirname(target)
     remove_stale(folder)
     temporary = os.path.join(folder, temporary_name())
     try:
-        # os.open applies the umask to 0o666, as for any new file.
+        # os.open applies the umask to 0o666, as usual for a new file.
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(temporary, flags, 0o666), "wb") as file:
             for chunk in chunks:
@@ -197,7 +195,7 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
             os.fsync(file.fileno())
         if former is not None:
             _take_over(temporary, former)
-    except BaseException:  # an interrupt leaves nothing behind either
+    except BaseException:  # includes interrupts
         with suppress(OSError):
             os.unlink(temporary)
         raise
@@ -205,7 +203,7 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
 
 
 def _take_over(temporary: str, former: os.stat_result) -> None:
-    """Give the new file the permissions and, if allowed, the owner of the file that it replaces."""
+    """Copy permissions and, if allowed, owner of the file that is to be replaced."""
     if hasattr(os, "chown"):
         with suppress(OSError):
             os.chown(temporary, former.st_uid, former.st_gid)

@@ -1,12 +1,13 @@
-"""YAML text to plain dicts, lists, strings and numbers, safely for any text.
+"""Parse YAML text to plain dicts, lists, strings and numbers, also for untrusted text.
 
-The tree is assembled from the events of PyYAML (of libyaml if installed) instead of by its loaders: that is
-9 times faster on calibration files (100 views: 37 ms, by ``CSafeLoader`` 345 ms), and allows refusing aliases
-(a few lines of them can demand gigabytes), duplicate keys and absurd nesting. Tags are ignored, so OpenCV's
-``!!opencv-matrix`` reads like any mapping. Mapping keys stay text: a view called ``1e5`` or ``null`` keeps
-its name.
+The tree is built here from the events of PyYAML (libyaml if it is available), not by its loaders. That is 9
+times faster on calibration files (100 views: 37 ms, by ``CSafeLoader`` 345 ms), and aliases can be refused (a
+few lines of them can expand to gigabytes), as can duplicate keys and absurd nesting. Tags are ignored, so
+OpenCV's ``!!opencv-matrix`` is read like any mapping. Keys of mappings stay text: a view called ``1e5`` or
+``null`` keeps its name.
 
-A long table of JSON-compatible rows, as observations are written, is parsed as JSON, 50 times faster.
+A long table of JSON-compatible rows, the form in which observations are written, is parsed as JSON, 50 times
+faster.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
 
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
-# PyYAML's notion, so that the names which it leaves without quotes (1e5, 1.5e5, -.5) stay names.
+# PyYAML's rule, so that names which it writes without quotes (1e5, 1.5e5, -.5) stay names.
 _FLOAT = re.compile(r"(?:[-+]?[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?").fullmatch
 _WORDS: dict[str, Any] = {
     "": None,
@@ -39,23 +40,23 @@ _WORDS: dict[str, Any] = {
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
 
-# The table as `calibration_yaml` writes it, at any depth of indentation.
+# The table as written by `calibration_yaml`, at any indentation.
 _ROWS = re.compile(
     r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
     re.MULTILINE,
 )
 _LABELS = frozenset(("view", "point"))
-_CUT = "!neurocal/rows"  # the tag of a scalar that stands for rows which were cut out
+_CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
 def read_yaml(path: str | Path) -> tuple[Any, str]:
-    """Read a YAML file; see `parse_yaml`. Returns the tree and the file's name for messages."""
+    """Read a YAML file as a tree, and its name for messages; see `parse_yaml`."""
     text, source = read_text(path, "a YAML file")
     return parse_yaml(text, source), source
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Turn YAML text into dicts with text keys, lists, str, int, float, bool and None.
+    """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None.
 
     Parameters
     ----------
@@ -66,10 +67,10 @@ def parse_yaml(text: str, source: str) -> Any:
     Raises
     ------
     FormatError
-        Text that is not YAML, aliases, a key twice, more than one document.
+        The text is not YAML, or has aliases, duplicate keys or more than one document.
     """
     text = text.replace("\r\n", "\n")
-    text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which no YAML parser takes
+    text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which YAML parsers refuse
     text, tables = _cut_rows(text)
     try:
         return _assemble(text, tables, source)
@@ -80,12 +81,12 @@ def parse_yaml(text: str, source: str) -> Any:
 
 
 def _cut_rows(text: str) -> tuple[str, list[Any]]:
-    """Take tables of rows out of the text, leaving as many lines as there were."""
+    """Cut tables of rows out of the text, keeping the number of lines."""
     tables: list[Any] = []
 
     def cut(match: re.Match[str]) -> str:
         rows = match["rows"]
-        separator = "\n" + rows[: rows.index("[")]  # files of older versions are less indented
+        separator = "\n" + rows[: rows.index("[")]  # older versions wrote less indentation
         try:
             table = json.loads(
                 "[" + rows[len(separator) - 1 : -1].replace(separator, ",\n") + "]", parse_constant=_refuse
@@ -94,9 +95,9 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
             return match[0]
         labels = [k for k, name in enumerate(match[2].split(", ")) if name in _LABELS]
         if len(table) != rows.count("\n") or not all(type(row) is list for row in table):
-            return match[0]  # brackets that do not pair up line by line
+            return match[0]  # brackets are not balanced within each line
         if not all(len(row) > k and type(row[k]) is str for k in labels for row in table):
-            return match[0]  # a name such as 1e5 without quotes is a number to JSON alone
+            return match[0]  # an unquoted name such as 1e5 is a number in JSON, but text here
         tables.append(table)
         head = match[0][: match.start("rows") - match.start() - 1]
         return f"{head} {_CUT} {len(tables) - 1}" + "\n" * (len(table) + 1)
@@ -105,14 +106,14 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(constant)  # NaN is a number to JSON and a string to YAML
+    raise ValueError(constant)  # NaN is a number in JSON, but a string in YAML
 
 
 def _assemble(text: str, tables: list[Any], source: str) -> Any:
-    """Build the tree from the parser's events, without recursion."""
+    """Build the tree from the parser's events without recursion."""
     root: list[Any] = []
     containers: list[Any] = [root]  # innermost last
-    keys: list[str | None] = [None]  # the key that waits for its value, for each container
+    keys: list[str | None] = [None]  # for each container, the key that still needs a value
     events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
     for event in events:
         kind = type(event)
@@ -152,8 +153,8 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
 
 
 def plain_value(text: str) -> Any:
-    """Find the value of a plain scalar: as PyYAML reads it, without its dates and odd number bases."""
-    if text[:1] in "+-.0123456789":  # also true of no text at all
+    """Value of a plain scalar as in PyYAML, but without dates and number bases other than ten."""
+    if text[:1] in "+-.0123456789":  # also true for empty text
         if _FLOAT(text):
             return float(text)
         if _INTEGER(text):

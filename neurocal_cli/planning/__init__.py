@@ -1,1 +1,1 @@
-"""Which views to photograph next."""
+"""Advice on the views to photograph next."""

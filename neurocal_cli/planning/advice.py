@@ -1,4 +1,4 @@
-"""Greedy choice of the views that reduce the uncertainty of a camera most."""
+"""Choose the views that reduce the uncertainty of a camera most, one after the other."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from neurocal_cli.planning.information import pixel_changes, view_information, w
 from neurocal_cli.verdict.projection_uncertainty import image_grid
 
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
-_POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # of the image's width and height
-_WIDTHS = (0.3, 0.5, 0.75)  # of the image's width, that the target takes
+_POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # shares of the image's width and height
+_WIDTHS = (0.3, 0.5, 0.75)  # width of the target as a share of the image's width
 _TILTS = ((0.0, 0.0), *((tilt, way) for tilt in (25.0, 45.0) for way in range(0, 360, 45)))  # degrees
 _ROLLS = (0.0, 90.0)  # degrees
-_FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # times the views' distance: where the camera is to be accurate
-_FLAT = 1e-6  # of the target's size
-_LEAST_SIGMA = 1e-4  # px; a perfect fit has no noise to compare with
+_FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # distances of judged points, relative to that of the views
+_FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
+_LEAST_SIGMA = 1e-4  # px; least noise, for perfect fits
 
 
 @frozen_dataclass(eq=False)
 class Candidate:
-    """A view that could be taken.
+    """A possible view.
 
     Attributes
     ----------
     pose : Pose
     position : (2,) array
-        Where the middle of the target is, as shares of the image's width and height.
+        Position of the target's middle, as shares of the image's width and height.
     width : float
-        Share of the image's width that the target takes, seen frontally.
+        Width of the target in a frontal view, as a share of the image's width.
     tilt, way : float [degrees]
-        The target's tilt, and the side that comes nearer: 0 for the right one, 90 for the lower one.
+        Angle of the tilt, and direction of the side that comes nearer: 0 is right, 90 is down.
     roll : float [degrees]
-        The target's rotation in its plane, clockwise.
+        Clockwise rotation of the target in its plane.
     outline : (n, 2) array [px]
         Corners of the target in the image.
     """
@@ -65,9 +65,9 @@ class Advice:
     ----------
     views : tuple of Candidate
     before : float [px]
-        Largest standard deviation of a projected pixel now.
+        Largest standard deviation of a projected pixel without the views.
     after : tuple of float [px]
-        The same after each of the views.
+        The same after adding each of the views.
     image_size : (width, height) [px]
     """
 
@@ -78,26 +78,24 @@ class Advice:
 
 
 def advise(calibration: Calibration, count: int = 3) -> Advice:
-    """Choose views one by one: each reduces the worst uncertainty most, given those before it.
+    """Choose views greedily: each reduces the largest uncertainty most, given the previous ones.
 
     Parameters
     ----------
     calibration : Calibration
-        With its points, of images of known size.
+        With points and image size.
     count : int
-        How many views.
+        Number of views.
 
     Raises
     ------
     InputError
-        No points, no image size, no free parameter, or no candidate view that fits in the image.
+        The calibration has no points, no image size or no free parameter, or no view shows the whole target.
     """
     known, world = _Known.of(calibration), _target(calibration)
     options = candidates(calibration)
     if not options:
-        raise InputError(
-            "the camera can see the target whole in no view; check the image size and the target"
-        )
+        raise InputError("no view shows the whole target; check the image size and the target")
     told = [view_information(known.camera, known.free, option.pose, world) for option in options]
     before, more = known.worst(), np.zeros_like(known.information)
     chosen, after = [], []
@@ -113,19 +111,19 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
 
 @frozen_dataclass(eq=False)
 class _Known:
-    """The information on a camera from the views that were taken.
+    """Information on a camera from the views taken so far.
 
     Attributes
     ----------
     camera : Camera
-        With the coefficients that model selection left out, here 0.
+        Including open coefficients that its model lacks (`open_coefficients`), as 0.
     free : (5 + K,) bool array
     information : (f, f) array
-        Normal matrix of the free parameters, plus the prior on those coefficients.
+        Normal matrix of the free parameters, with the prior of the open coefficients.
     places : (g, 2, f) array
-        See `pixel_changes`: the pixels at which the uncertainty is evaluated.
+        Derivatives of the judged pixels, see `pixel_changes`.
     sigma : float [px]
-        Of the points.
+        Noise of the points.
     """
 
     camera: Camera
@@ -167,20 +165,18 @@ class _Known:
 
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) whether each of A's entries and of the coefficients was estimated."""
+    """(5 + K,) mask of the entries of A and the coefficients that were estimated."""
     names = (*_ORDER, *coefficient_names(calibration.distortion_model))
     free = np.array([name not in calibration.fixed and name not in NODES for name in names])
     if not calibration.camera.intrinsics.skewed:
         free[1] = False
     if not free.any():
-        raise InputError(
-            "all parameters of the camera are given; there is nothing to be learnt from more views"
-        )
+        raise InputError("all parameters of the camera are given; more views cannot improve it")
     return free
 
 
 def _target(calibration: Calibration) -> Array:
-    """(n, 3) the target's points, once each."""
+    """(n, 3) distinct points of the target."""
     points = calibration.points
     if calibration.target is not None:
         points = calibration.target.straightened(points)
@@ -188,7 +184,7 @@ def _target(calibration: Calibration) -> Array:
 
 
 def candidates(calibration: Calibration) -> list[Candidate]:
-    """Views with the whole target in the image: all positions, three sizes, tilts and two rotations."""
+    """Views with the whole target in the image, for all positions, widths, tilts and rolls."""
     camera, world = calibration.camera, _target(calibration)
     assert camera.image_size is not None
     size = np.array(camera.image_size, dtype=float)
@@ -199,7 +195,7 @@ def candidates(calibration: Calibration) -> list[Candidate]:
     turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
     rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
     R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
-    # If the corners of a flat target are in the image, all of it is.
+    # A flat target is in the image if its corners are.
     flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
     checked = corners if flat else world - middle
     found = []
@@ -224,7 +220,7 @@ def candidates(calibration: Calibration) -> list[Candidate]:
 
 
 def _frontal(calibration: Calibration, centred: Array) -> Array:
-    """The rotation in which the camera sees the target frontally, upright as in the mean of its views."""
+    """Rotation of the frontal view, upright like the mean of the views."""
     mean = nearest_rotation(np.mean([view.pose.R for view in calibration.views.values()], axis=0))
     _, spread, axes = np.linalg.svd(centred, full_matrices=False)
     if spread[2] > _FLAT * spread[0]:
@@ -238,7 +234,7 @@ def _frontal(calibration: Calibration, centred: Array) -> Array:
 
 
 def _outline(centred: Array, frontal: Array) -> Array:
-    """(n, 3) the target's points on its outline, seen frontally, in order."""
+    """(n, 3) points of the target on its convex outline in the frontal view, in order."""
     from scipy.spatial import ConvexHull
 
     flat = (centred @ frontal.T)[:, :2]
@@ -246,7 +242,7 @@ def _outline(centred: Array, frontal: Array) -> Array:
 
 
 def _tilted(tilt: float, way: float) -> Array:
-    """Rotation that brings the target's side in the given image direction nearer; degrees."""
+    """Rotation that brings the side in a direction of the image nearer; angles in degrees."""
     a, b = np.radians(tilt), np.radians(way)
     K = cross_matrix(np.array([-np.sin(b), np.cos(b), 0.0]))
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)

@@ -1,12 +1,13 @@
-"""The information that views give on a camera, and the resulting uncertainty of its pixels.
+"""Fisher information of views on a camera, and the resulting uncertainty of pixels.
 
-Each view, real or planned, adds the normal matrix of the camera's parameters with the view's pose eliminated
-(Schur complement ``A - C B^-1 C^T``). All points have the noise of the calibration.
+Each view adds the normal matrix of the camera's parameters with the view's pose eliminated, ``A - C B^-1
+C^T``. It needs no observed pixels, so views that were not taken can be compared. All points have equal
+weight, with the noise of the calibration.
 
-A change of the camera that a motion of its frame compensates does not count, as in
-`verdict.projection_uncertainty`. There the frame moves with the poses of the views; here it moves so that the
-pixels of near and far points all over the image change least, which does not depend on the views. So no view
-can make the camera less certain, and the two modules give similar but not equal numbers.
+Changes of the camera that a motion of its frame compensates do not count, as in
+`verdict.projection_uncertainty`. There the frame moves with the poses of the views. Here it moves so that the
+pixels of near and far points all over the image move least, which does not depend on the views. So no view
+can make the camera less certain, and the numbers of both modules are similar but not equal.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array, cross_matrix
 
-_SINGULAR = 1e-13  # a smaller eigenvalue of a matrix with unit diagonal is rounding
+_SINGULAR = 1e-13  # eigenvalue of a matrix with unit diagonal, below which it is rounding
 
 
 def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array) -> Array:
-    """Information on the camera from one view of these points.
+    """Information of a view of points on the camera.
 
     Parameters
     ----------
     camera : Camera
     free : (5 + K,) bool array
-        Which of A11, A12, A22, A13, A23 and the coefficients are estimated.
+        Mask of A11, A12, A22, A13, A23 and the coefficients that are estimated.
     pose : Pose
     world : (N, 3) array
 
     Returns
     -------
     normal : (f, f) array
-        Normal matrix of the free parameters, the pose eliminated; residuals of unit variance.
+        Normal matrix of the free parameters with the pose eliminated, for residuals of unit variance.
     """
     points = pose.to_camera(world)
     J, P = _derivatives(camera, free, points)
@@ -45,16 +46,16 @@ def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world:
 
 
 def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array) -> Array:
-    """Derivative of pixels by the free parameters, minus the part that a motion of the frame compensates.
+    """Derivatives of pixels by the free parameters, without the part that a motion of the frame compensates.
 
     Parameters
     ----------
     camera : Camera
     free : (5 + K,) bool array
     pixels : (G, 2) array [px]
-        All over the image; those without a ray are left out.
+        Pixels all over the image; those without a ray are left out.
     depths : (D,) array
-        Depths of the points on each pixel's ray.
+        Depths of the points; each pixel has a point at each depth.
 
     Returns
     -------
@@ -68,7 +69,7 @@ def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths
 
 
 def worst_std(normal: Array, changes: Array, sigma: float) -> float:
-    """Largest standard deviation of a projected pixel [px]; infinite where the views determine no camera.
+    """Largest standard deviation of a projected pixel [px]; infinite if the views determine no camera.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def worst_std(normal: Array, changes: Array, sigma: float) -> float:
     changes : (g, 2, f) array
         See `pixel_changes`.
     sigma : float [px]
-        Of the points, in u and in v.
+        Noise of the points, in u and in v.
     """
     scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
     S = normal / np.outer(scale, scale)
@@ -89,7 +90,7 @@ def worst_std(normal: Array, changes: Array, sigma: float) -> float:
 
 
 def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array) -> tuple[Array, Array]:
-    """Of pixels by the free parameters (N, 2, f), and by a small motion of the points' frame (N, 2, 6)."""
+    """Derivatives of pixels by the free parameters (N, 2, f) and a motion of the points' frame (N, 2, 6)."""
     by_camera, by_point = camera.project_jacobian(points)
     moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
     return by_camera[:, :, free], by_point @ moved

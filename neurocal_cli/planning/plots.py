@@ -1,4 +1,4 @@
-"""The advised views as outlines in the frame of the image, to be imitated."""
+"""Draw the advised views as outlines in the image, as a guide for taking them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COLOURS = ("#c0392b", "#1f4e79", "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
 
 
 def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> bytes:
-    """Draw the outlines of the advised views over the points of those that were taken.
+    """Draw the outlines of the advised views over the points of the views taken so far.
 
     Parameters
     ----------

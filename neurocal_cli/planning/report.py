@@ -24,7 +24,7 @@ def advice_lines(advice: Advice) -> list[str]:
 
 
 def advice_json(advice: Advice) -> dict[str, Any]:
-    """The same as values that JSON can hold."""
+    """The advice as values for JSON."""
     return {
         "worst_px": number_or_none(advice.before),
         "views": [
@@ -45,7 +45,7 @@ def advice_json(advice: Advice) -> dict[str, Any]:
 
 
 def _described(view: Candidate) -> str:
-    """Where, how large, tilted and turned; the places of the candidates are five in each direction."""
+    """Describe position, width, tilt and roll of a view; there are five positions in each direction."""
     across, down = (min(int(5 * share), 4) for share in view.position)
     if across == down == 2:
         place = "in the middle"

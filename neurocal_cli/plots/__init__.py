@@ -1,6 +1,6 @@
-"""Pictures of results, as panels on one page or each by itself."""
+"""Plots of results, as panels on one page or separately."""
 
-# What `--plot NAME=FILE` draws by itself, so that options can be checked before anything is loaded.
+# Panels that `--plot NAME=FILE` draws separately; listed here so that options are checked without imports.
 CAMERA_PANELS = ("residuals", "coverage", "uncertainty", "scatter", "poses", "learning", "views")
 RIG_PANELS = ("residuals", "coverage", "uncertainty", "scatter", "poses", "learning", "views")
 SPACE_PANELS = ("across", "depth", "depths", "views", "poses")

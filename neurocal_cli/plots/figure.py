@@ -1,4 +1,4 @@
-"""The canvas of all pictures. matplotlib is imported only when a picture is drawn."""
+"""The figure of all plots. matplotlib is imported only if a plot is drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INK, ACCENT = "#1f4e79", "#c0392b"
 
 
 def check_available() -> None:
-    """Check that pictures can be drawn.
+    """Check that plots can be drawn.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def check_available() -> None:
         matplotlib is not installed.
     """
     try:
-        import matplotlib  # noqa: F401 - only whether it is there
+        import matplotlib  # noqa: F401 - only tests whether it is installed
     except ImportError as error:
         raise NeurocalError(
             "pictures need matplotlib, which is not installed; pip install 'neurocal[plot]'"
@@ -32,32 +32,32 @@ def check_available() -> None:
 
 
 def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: float, kind: str) -> bytes:
-    """Draw a figure of a size and with panels a distance apart [inches], as the bytes of a file."""
+    """Draw a figure with a size and padding of panels [inches], and return the bytes of the file."""
     check_available()
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # A figure of its own, not pyplot's: no global state, no window, no choice of a backend.
+    # Without pyplot there is no global state, no window and no choice of a backend.
     with rc_context({"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "neurocal"}):
         figure = Figure(figsize=size)
         figure.set_layout_engine("constrained", w_pad=pad, h_pad=pad)
         FigureCanvasAgg(figure)
         draw(figure)
         buffer = BytesIO()
-        # A date would make each picture differ from the last.
+        # Without a date, the same plot gives the same file.
         undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
         figure.savefig(buffer, format=kind, dpi=120, metadata=undated[kind])
     return buffer.getvalue()
 
 
 def plain(text: str) -> str:
-    """Text escaped so that matplotlib does not read it as mathematics."""
+    """Escape text so that matplotlib does not read it as mathematics."""
     return (text if text.isprintable() else ascii(text)[1:-1]).replace("$", r"\$")
 
 
 def style(axes: Axes, title: str) -> None:
-    """Title, grid and frame of a panel."""
+    """Set title, grid and frame of a panel."""
     axes.set_title(title)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)

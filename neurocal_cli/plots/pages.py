@@ -1,4 +1,4 @@
-"""Pictures of cameras, of rigs and of triangulated points: a page of panels, or one of them."""
+"""Plots of cameras, rigs and triangulated points: a page of panels, or a single panel."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw a camera's residuals, coverage and uncertainty, and the training of its network.
+    """Draw the residuals, coverage, uncertainty, poses and learning curve of a camera.
 
     Parameters
     ----------
     subject : Subject
     kind : {"png", "pdf", "svg"}
     panel : str, optional
-        One of `plots.CAMERA_PANELS` by itself; default: all on one page.
+        One of `plots.CAMERA_PANELS`; by default all on one page.
 
     Returns
     -------
     picture : bytes
-        The same for the same subject, byte for byte.
+        The same subject gives the same bytes.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
     Parameters
     ----------
     panel : str, optional
-        One of `plots.RIG_PANELS`, of both cameras.
+        One of `plots.RIG_PANELS`, for both cameras.
     """
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
@@ -101,7 +101,7 @@ def draw_points_in_space(
     ----------
     evaluation : StereoEvaluation
     rig : Rig or None
-        Both cameras, if known, for the poses.
+        Both cameras, if known, for the panel of poses.
     panel : str, optional
         One of `plots.SPACE_PANELS`.
     """
@@ -154,7 +154,7 @@ def _page(
     size: tuple[float, float],
     kind: str,
 ) -> bytes:
-    """All panels of some rows on one page."""
+    """Draw rows of panels on one page."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplot_mosaic(
@@ -175,7 +175,7 @@ def _alone(name: str, draw: Draw, kind: str) -> bytes:
 
 
 def _draw_cloud(axes: Axes, errors: Array, names: tuple[str, str], unit: str) -> None:
-    """Errors in a plane of the left camera's frame."""
+    """Draw the errors in a plane of the left camera's frame."""
     axes.plot(*errors.T, ".", color=INK, markersize=3, alpha=0.5, rasterized=len(errors) > 2000)
     axes.plot(0, 0, "+", color=ACCENT, markersize=11)
     style(axes, f"Errors in {names[0].split()[0]} and {names[1].split()[0]}, triangulated minus true")
@@ -186,7 +186,7 @@ def _draw_cloud(axes: Axes, errors: Array, names: tuple[str, str], unit: str) ->
 
 
 def _draw_depths(axes: Axes, evaluation: StereoEvaluation, unit: str) -> None:
-    """Error by depth."""
+    """Draw the error by depth."""
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     for part in found.depths:
         axes.plot([part.nearest, part.farthest], [part.rmse] * 2, color=INK, linewidth=3)
@@ -200,7 +200,7 @@ def _draw_depths(axes: Axes, evaluation: StereoEvaluation, unit: str) -> None:
 
 
 def _draw_space_views(axes: Axes, evaluation: StereoEvaluation, unit: str) -> None:
-    """Error of each pair of views, by the poses of the view and through one rig."""
+    """Draw the error of each pair of views, with the poses of the view and with one rig."""
     ways = [("poses of each view", evaluation.by_view, "0.6")]
     if evaluation.rig is not None:
         alike = np.isclose(evaluation.rig.rmse, evaluation.by_view.rmse, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Panels of a camera's reprojection errors: in the image, scattered, by view, and during training."""
+"""Panels of reprojection errors: residuals in the image, their scatter, errors by view, learning curve."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from neurocal_cli.plots.subject import Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_ARROWS = 500  # more cannot be distinguished
-_MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
-_MOST_BARS = 40  # views that still have room for their names
-_LONGEST_ARROW = 0.04  # of the image's width, for the length of a typical arrow
-_ZERO = 1e-16  # px, what a logarithmic axis shows for an error of 0
+_MOST_ARROWS = 500  # more arrows cannot be distinguished
+_MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
+_MOST_BARS = 40  # greatest number of views with room for their names
+_LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the image width
+_ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
 
 
 def set_image(axes: Axes, subject: Subject) -> Array:
-    """The frame of the image, or of the points when its size is not known: left, right, top and bottom."""
+    """Set the axes to the image, or to the points if its size is unknown; returns the four limits."""
     left, right, top, bottom = frame = _frame(subject)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u [px]", ylabel="v [px]")
     axes.spines[["top", "right"]].set_visible(True)
@@ -38,7 +38,7 @@ def _frame(subject: Subject) -> Array:
 
 
 def _round_scale(scale: float) -> float:
-    """Round down to one of 1, 2, 5, 10, ..., so that the reader can divide by it."""
+    """Round down to one of 1, 2, 5, 10, ..."""
     if not np.isfinite(scale) or scale <= 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(scale))
@@ -46,11 +46,11 @@ def _round_scale(scale: float) -> float:
 
 
 def draw_residuals(axes: Axes, subject: Subject) -> None:
-    """Residuals of all views at their points in the image, enlarged."""
+    """Draw the residuals of all views at their points in the image, enlarged."""
     evaluation = subject.evaluation
     left, right, _, _ = _frame(subject)
     seen = np.flatnonzero(np.isfinite(evaluation.residuals[:, 0]))
-    # A random choice: every n-th point of a grid of n columns would show one column.
+    # The choice is random, because every n-th point of a grid with n columns would be one column.
     shown = np.random.default_rng(0).permutation(seen)[:_MOST_ARROWS]
     pixels, residuals = subject.points.pixels[shown], evaluation.residuals[shown]
     spacing = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels)) if len(pixels) else 0.0
@@ -67,7 +67,7 @@ def draw_residuals(axes: Axes, subject: Subject) -> None:
 
 
 def draw_scatter(axes: Axes, subject: Subject) -> None:
-    """Residuals about zero, with the circle of their rms."""
+    """Draw the scatter of the residuals, with a circle of their rms."""
     evaluation = subject.evaluation
     seen = evaluation.residuals[np.isfinite(evaluation.residuals[:, 0])]
     many = len(seen) > _MANY_DOTS
@@ -85,7 +85,7 @@ def draw_scatter(axes: Axes, subject: Subject) -> None:
 
 
 def draw_views(axes: Axes, subject: Subject) -> None:
-    """Error of each view, in the order of the data."""
+    """Draw the error of each view, in the order of the data."""
     evaluation = subject.evaluation
     errors = np.array([view.rmse_px for view in evaluation.views.values()])
     if len(errors) <= _MOST_BARS:
@@ -105,7 +105,7 @@ def draw_views(axes: Axes, subject: Subject) -> None:
 
 
 def draw_learning(axes: Axes, subject: Subject) -> None:
-    """Loss of the network during training, and the error after the last steps."""
+    """Draw the error of the network during training, and the error after bundle adjustment."""
     style(axes, "Learning curve of the best start")
     calibration = subject.calibration
     network = None if calibration is None else calibration.network

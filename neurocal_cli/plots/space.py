@@ -1,4 +1,4 @@
-"""The panel of poses: cameras and targets in space, as seen from the (left) camera."""
+"""The panel of poses: cameras and targets in space, in the frame of the (left) camera."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from neurocal_cli.plots.figure import ACCENT, INK, style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_FLAT = 0.02  # of a target's size: a board that is bent a little has an outline too
+_FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
 _MOST_NAMES = 8
-_SIZE = 0.12  # of the picture's, for a camera
+_SIZE = 0.12  # of a drawn camera, relative to the scene
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def draw_poses(
     axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
 ) -> None:
-    """Draw the camera and the targets of its views in space, coloured by their error.
+    """Draw the targets relative to the camera, coloured by their errors.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def draw_poses(
         With ``projection="3d"``.
     calibration : Calibration or None
     others : sequence of (Camera, Pose)
-        Other cameras of the rig, each with its pose from the frame of the first.
+        Other cameras on the rig, with their poses from the frame of the first camera to theirs.
     """
     space: Any = axes
     style(axes, "Poses")
@@ -80,12 +80,12 @@ _HERE = Pose(np.eye(3), np.zeros(3))
 
 
 def _turned(points: Array) -> Array:
-    """X, Z, Y: the third axis of a picture is its height."""
+    """Reorder coordinates to X, Z, Y, because the third axis of the plot is the height."""
     return points[:, [0, 2, 1]]
 
 
 def _outline(world: Array) -> Array:
-    """Corners of a flat target's hull, in order around it; all points of another target."""
+    """Corners of a flat target's convex hull, in order; all points of other targets."""
     from scipy.spatial import ConvexHull, QhullError
 
     centred = world - world.mean(axis=0)
@@ -99,7 +99,7 @@ def _outline(world: Array) -> Array:
 
 
 def _frustum(camera: Camera, size: float) -> Array:
-    """Centre and corners of a camera in its own frame."""
+    """Centre and corners of a camera's frustum in its own frame."""
     width, height = camera.image_size or (2 * camera.intrinsics.u0, 2 * camera.intrinsics.v0)
     pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])
     rays = pixels @ np.linalg.inv(camera.intrinsics.A).T

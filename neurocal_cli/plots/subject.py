@@ -1,4 +1,4 @@
-"""The subject of a camera's panels: a calibration, or a camera with the points of its evaluation."""
+"""Subject of the panels of a camera: a calibration, or a camera with points on which it is evaluated."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from neurocal_cli.verdict.evidence import Evidence
 
 @frozen_dataclass
 class Subject:
-    """A camera, the points of a picture and their errors.
+    """A camera, points and their errors.
 
     Attributes
     ----------
     camera : Camera
     points : Correspondences
     evaluation : CameraEvaluation
-        Of these points.
+        Of the camera on these points.
     calibration : Calibration or None
         The calibration of the camera, if known.
     """
@@ -39,7 +39,7 @@ class Subject:
         points: Correspondences | None = None,
         evaluation: CameraEvaluation | None = None,
     ) -> Subject:
-        """A camera with the points of its evaluation; by default those of the calibration."""
+        """Evaluate a camera on points; by default on a calibration's own points."""
         calibration = camera if isinstance(camera, Calibration) else None
         if points is None:
             points = Correspondences.none() if calibration is None else calibration.points
@@ -52,7 +52,7 @@ class Subject:
 
     @cached_property
     def evidence(self) -> Evidence | None:
-        """The evidence of the calibration for its verdict; None without a calibration."""
+        """Evidence for the quality of the calibration from its points; None without a calibration."""
         if self.calibration is None or not len(self.calibration.points):
             return None
         return gather_evidence(self.calibration)

@@ -1,4 +1,4 @@
-"""Panels of a camera's coverage, and of the uncertainty of its pixels."""
+"""Panels of a camera's reliability over the image: coverage by points, uncertainty of projected pixels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LEVELS = 12
 
 
 def draw_coverage(axes: Axes, subject: Subject) -> None:
-    """Points in each part of the image; parts without any are marked."""
+    """Draw the number of points in each part of the image; parts without points are marked."""
     left, right, top, bottom = set_image(axes, subject)
     u, v = subject.points.pixels.T
     across, down = np.linspace(left, right, _CELLS + 1), np.linspace(top, bottom, _CELLS + 1)
@@ -36,7 +36,7 @@ def draw_coverage(axes: Axes, subject: Subject) -> None:
 
 
 def draw_uncertainty(axes: Axes, subject: Subject) -> None:
-    """Standard deviation of projected pixels all over the image, at the median distance of the points."""
+    """Draw the standard deviation of projected pixels over the image, at the points' median distance."""
     projection = None if subject.evidence is None else subject.evidence.projection
     if projection is None or not np.isfinite(projection.std[1]).any():
         style(axes, "Uncertainty of projected pixels")
@@ -47,7 +47,7 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     set_image(axes, subject)
     u, v = (np.unique(axis) for axis in projection.pixels.T)
     std = np.ma.masked_invalid(projection.std[1].reshape(len(v), len(u)))
-    # Logarithmic levels: the corners of an image can be 100 times as uncertain as its middle.
+    # Levels differ by equal factors, because corners can be 100 times as uncertain as the middle.
     least = max(float(std.min()), 1e-12)
     levels = np.geomspace(least, max(float(std.max()), 1.01 * least), _LEVELS)
     drawn = axes.contourf(u, v, std, levels=levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))

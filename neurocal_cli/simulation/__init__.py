@@ -1,1 +1,1 @@
-"""Simulated data with everything known about it: rendered chessboards, a zoom lens."""
+"""Simulated data with known truth: scenes, rendered chessboards, and studies of noise, starts and rates."""

@@ -1,7 +1,7 @@
-"""Errors of calibration methods over noise, beside the Cramer-Rao bound (the paper's section 5.1 and Fig. 1).
+"""Errors of calibration methods over noise, with the Cramer-Rao bound (the paper's section 5.1 and Fig. 1).
 
-In every trial all methods get the same points. A method that takes something for given, as Tsai's does the
-image centre, is told the truth, and has a bound of its own, with fewer unknowns.
+In every trial all methods get the same points. A method that needs known parameters, such as the image centre
+for Tsai's, gets their true values, and has its own bound with fewer unknowns.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import field
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.calibrate_by import as_posed
+from neurocal_cli.baselines.calibrate_by import problem_for_method
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import parameter_covariance, pose_std
 from neurocal_cli.bundle_adjustment.problem import problem_for
@@ -27,9 +27,9 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-_BLOCK = 5  # trials of a task, of one sigma
+_BLOCK = 5  # trials per task, all with one sigma
 _HALF_TURN = np.pi
-_SINGULAR = 1e-13  # smallest eigenvalue of a normal matrix of unit diagonal that rounding leaves of 0
+_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
 
 Progress = Callable[[str, float], None]
 
@@ -43,11 +43,11 @@ class MethodErrors:
     exact : (P,) array
         Error without noise.
     rms, bias : (S, P) arrays
-        Root mean square and mean error; of poses over all views.
+        Root mean square and mean error; for poses over all views.
     bound : (P,) array
-        Cramer-Rao bound for noise of 1 px, 0 for what the method takes for given.
+        Cramer-Rao bound for noise of 1 px; 0 for given parameters.
     failed : (S,) int array
-        Trials without an answer, which are in no mean.
+        Number of trials without an answer, which are left out of the means.
     """
 
     exact: Array
@@ -59,18 +59,18 @@ class MethodErrors:
 
 @frozen_dataclass(eq=False)
 class NoiseStudy:
-    """What `study_noise` finds.
+    """Result of `study_noise`.
 
     Attributes
     ----------
     names : tuple of P str
     truth : (P,) array
-        Of the first view's pose.
+        True parameters; the pose is that of the first view.
     sigma : (S,) array [px]
     trials : int
     methods : dict of MethodErrors by method
     apart : dict of float by pair of methods
-        Largest difference of two methods' answers in any trial and parameter, over its bound.
+        Largest difference between two methods in any trial and parameter, over the bound.
     """
 
     names: tuple[str, ...]
@@ -86,7 +86,7 @@ class _Task:
     scene: SimulatedScene
     methods: tuple[str, ...]
     sigma: float
-    seeds: tuple[tuple[int, ...], ...]  # of each trial; none: without noise
+    seeds: tuple[tuple[int, ...], ...]  # of each trial; empty for one trial without noise
 
 
 def study_noise(
@@ -105,12 +105,12 @@ def study_noise(
     scene : SimulatedScene
     sigma : sequence of float [px]
     trials : int
-        At each sigma.
+        Number of trials at each sigma.
     methods : sequence of str
-        Of `comparison.by_method.METHODS`.
+        From `comparison.by_method.METHODS`.
     seed : int
     jobs : int
-        Processes; the result is the same for any number.
+        Number of processes; it does not change the result.
     progress : callable, optional
     """
     chosen = tuple(methods)
@@ -149,16 +149,16 @@ def study_noise(
 
 
 def cramer_rao(scene: SimulatedScene, method: str) -> Array:
-    """Smallest standard deviation of an unbiased estimate for noise of 1 px; from the normal matrix.
+    """Cramer-Rao bound of the parameters for noise of 1 px, from the normal matrix.
 
     Returns
     -------
     (5 + K + 6 V,) array
-        Intrinsics, coefficients, each view's pose; 0 for what the method takes for given; nan where the
-        points do not determine the rest.
+        Least standard deviations of intrinsics, coefficients and poses; 0 for parameters that are given to
+        the method; nan if the points do not determine the others.
     """
     camera, points = scene.camera, scene.points()
-    problem = as_posed(method, problem_for(points, 1, distortion=Distortion(camera.model)))
+    problem = problem_for_method(method, problem_for(points, 1, distortion=Distortion(camera.model)))
     views = problem.views
     R = np.stack([scene.poses[name].R for name in views.names])
     t = np.stack([scene.poses[name].t for name in views.names])
@@ -181,7 +181,7 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
 
 
 def _errors(task: _Task) -> Array:
-    """(T, M, 5 + K + 6 V) errors of each trial and method; nan where there is no answer."""
+    """(T, M, 5 + K + 6 V) errors of each trial and method; nan if there is no answer."""
     scene, model = task.scene, task.scene.camera.model
     truth = _truth(scene)
     seeds = task.seeds or ((0,),)
@@ -221,7 +221,7 @@ def _apart(one: Array, two: Array, sigma: Array, bound: Array) -> float:
 
 
 class _Fold:
-    """From values of all views to one for each parameter of a pose."""
+    """Reduces values for the poses of all views to one value per pose parameter."""
 
     def __init__(self, scene: SimulatedScene) -> None:
         self.n = 5 + len(coefficient_names(scene.camera.model))
@@ -230,7 +230,7 @@ class _Fold:
         return values[..., : self.n], values[..., self.n :].reshape(*values.shape[:-1], -1, 6)
 
     def worst(self, errors: Array) -> Array:
-        """The largest error of any view, with its sign."""
+        """Largest error over the views, with its sign."""
         camera, poses = self._split(errors)
         place = np.abs(poses).argmax(axis=-2)
         return np.concatenate(
@@ -238,23 +238,23 @@ class _Fold:
         )
 
     def rms(self, errors: Array) -> Array:
-        """(S, T, ...) to (S, P), over trials with an answer and views."""
+        """Rms over views and trials with an answer; (S, T, ...) to (S, P)."""
         camera, poses = self._split(errors)
         return np.sqrt(np.concatenate([_mean(camera**2, (1,)), _mean(poses**2, (1, 2))], axis=-1))
 
     def mean(self, errors: Array) -> Array:
-        """The same for the mean."""
+        """Mean over views and trials with an answer; (S, T, ...) to (S, P)."""
         camera, poses = self._split(errors)
         return np.concatenate([_mean(camera, (1,)), _mean(poses, (1, 2))], axis=-1)
 
     def bound(self, std: Array) -> Array:
-        """(5 + K + 6 V,) to (P,): rms over the views."""
+        """Rms over the views; (5 + K + 6 V,) to (P,)."""
         camera, poses = self._split(std)
         return np.concatenate([camera, np.sqrt((poses**2).mean(axis=0))])
 
 
 def _mean(values: Array, axes: tuple[int, ...]) -> Array:
-    """Mean without nan; nan where there is nothing else."""
+    """Mean ignoring nan; nan if nothing is left."""
     known = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(known, values, 0.0).sum(axis=axes) / known.sum(axis=axes))

@@ -1,4 +1,4 @@
-"""Rendered images of a simulated scene, and where its points are in them."""
+"""Render images of a simulated scene, with its visible points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-_MARGIN = 0.5  # squares of white paper around a board by itself
+_MARGIN = 0.5  # squares of white paper around a board of one plane
 
 
 @frozen_dataclass(eq=False)
@@ -24,10 +24,10 @@ class Picture:
     Attributes
     ----------
     name : str
-        Of the view.
+        Name of the view.
     image : (height, width) uint8 array
     visible : frozenset of str
-        Ids of the mid-points whose edges are in view.
+        Ids of the mid-points whose edges are visible.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Picture:
 
 
 def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
-    """Render every view of a scene, with the usual blur and noise.
+    """Render every view of a scene, with default blur and noise.
 
     Parameters
     ----------
@@ -48,12 +48,12 @@ def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
     Raises
     ------
     InputError
-        A scene whose target is no board.
+        The scene has no board.
     """
     if scene.board is None:
         raise InputError("there is no board to render: the scene's points are those of a file; give a board")
     planes = scene.board.planes
-    # The pattern of a plane among others goes as far as a fold may be; paper beyond it would cross it.
+    # With several planes, the pattern may extend to a fold, and paper beyond it would cross the fold.
     margin = Sides.all(_MARGIN if len(planes) == 1 else 0.0)
     targets = tuple(Target(plane, margin=margin) for plane in planes)
     for number, (name, pose) in enumerate(scene.poses.items()):
@@ -67,7 +67,7 @@ def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
 
 
 def visible_points(scene: SimulatedScene, rendered: list[Picture]) -> Correspondences:
-    """The exact points that the pictures show."""
+    """Exact points that are visible in the pictures."""
     shown = {one.name: one.visible for one in rendered}
     points = scene.points()
     assert scene.point is not None  # a board's points have ids

@@ -1,4 +1,4 @@
-"""Pictures of simulations: Fig. 1 of the paper with the bound, random starts, learning rates."""
+"""Plots of simulations: Fig. 1 of the paper with the Cramer-Rao bound, random starts, learning rates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Colours that people who do not see all colours tell apart (Okabe and Ito), and markers.
+# Colours that colour-blind people can distinguish (Okabe and Ito), markers and their sizes.
 _LOOK = {
     "neuro": ("#d55e00", "o", 8.0),
     "backprop": ("#cc79a7", "v", 6.5),
@@ -32,18 +32,18 @@ _STARTS = {
     "camera": "plain LM,\nrandom\ncamera",
 }
 _UNITS = {"alpha_u": "px", "alpha_v": "px"}
-_OWN = 0.9  # of the bound, from which on a method that is told more has a line of its own
+_OWN = 0.9  # a method whose bound is below this share of the largest one has its own line
 
 
 def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kind: str = "png") -> bytes:
-    """Draw the rms errors of four parameters over the noise, and where random starts end.
+    """Draw the rms errors of four parameters over the noise, and the outcomes of random starts.
 
     Parameters
     ----------
     study : NoiseStudy
     starts : StartStudy, optional
     unit : str
-        Of the world.
+        Of the world coordinates.
     kind : {"png", "pdf", "svg"}
     """
 
@@ -95,7 +95,7 @@ def _plain_ticks(axes: Axes, values: np.ndarray) -> None:
 
 
 def _draw_starts(axes: Axes, starts: StartStudy) -> None:
-    """A bar for each kind: the starts that reach the minimum, another one, and no camera."""
+    """Draw a bar for each kind: shares of starts that reach the minimum, another one, and no camera."""
     kinds = list(starts.rms)[::-1]
     total = np.array([len(starts.rms[kind]) for kind in kinds])
     best = np.array([starts.reached[kind] for kind in kinds])
@@ -117,7 +117,7 @@ def _draw_starts(axes: Axes, starts: StartStudy) -> None:
 
 
 def draw_rates(study: RateStudy, kind: str = "png") -> bytes:
-    """Draw on how many data sets a start converges with each pair of rates, and how fast."""
+    """Draw, for each pair of rates, on how many data sets a start converges, and how fast."""
 
     def draw(figure: Figure) -> None:
         left, right = figure.subplots(1, 2)

@@ -1,14 +1,15 @@
-"""How sensitive learning is to its two rates: many data sets, one random start each (paper, section 5.2).
+"""Sensitivity of learning to its two rates: many data sets, one random start each (paper, section 5.2).
 
 The paper trains on 70 data sets of an active vision system, "with great variations in the spatial positions
-of the 3D reference points and in camera parameters", all with one set of rates. Here they are simulated:
-boxes and corners of two or three boards, 1 to 1000 units large, their origin up to 100 sizes away, seen from
-any side by cameras of 320 to 1600 px with focal lengths of 0.5 to 4 image widths, with 0.3 px of noise.
+of the 3D reference points and in camera parameters", all with one set of rates. Here the data sets are
+simulated: boxes and corners of two or three boards, 1 to 1000 units large, with their origin up to 100 sizes
+away, seen from any side by cameras of 320 to 1600 px with focal lengths of 0.5 to 4 image widths, with 0.3 px
+of noise.
 
-A network that diverges is not started again with lower rates, which `train_backprop` does for users; but the
-rates are halved, as always, when the error no longer falls, to end the cycle that noise makes. A start
-has converged where training has settled, at an error (5) within 2 % of the best that Levenberg-Marquardt
-finds, with all points on one side of the camera.
+A network that diverges is not restarted with lower rates, as `train_backprop` does for users. But as always,
+the rates are halved when the error stops falling, to end the cycles caused by noise. A start has converged if
+training has settled at an error (5) within 2 % of the best error that Levenberg-Marquardt finds, with all
+points on one side of the camera.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from neurocal_cli.training.starts import learn
 RATES_WEIGHTS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 RATES_GAMMA = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6, 2.0)
 _SIGMA = 0.3  # px
-_SAME = 1.02  # times the best rms error (5), as for two starts of backprop
+_SAME = 1.02  # greatest ratio to the best rms error (5), as for two starts of backprop
 
 Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)
 class DataSet:
-    """Noisy points of one view, and the camera that saw them."""
+    """Noisy points of one view, and the true camera."""
 
     points: Correspondences
     intrinsics: Intrinsics
@@ -50,22 +51,23 @@ class DataSet:
 
 @frozen_dataclass(eq=False)
 class RateStudy:
-    """What `study_rates` finds.
+    """Result of `study_rates`.
 
     Attributes
     ----------
     rates_weights, rates_gamma : (A,), (B,) arrays
     sets : int
     converged : (A, B) int array
-        Data sets on which the one start converged.
+        Number of data sets on which the start converged.
     epochs : (A, B) array
-        Their median number of epochs; nan where none did.
+        Median number of epochs on these; nan if there are none.
     default : (float, float)
-        The rates that `calibrate` has.
+        The default rates of `calibrate`.
     calibrated : int
-        Data sets that `calibrate` with the trainer backprop and those rates takes to the minimum of (3).
+        Number of data sets on which `calibrate`, with the trainer backprop and these rates, reaches the
+        minimum of (3).
     alpha_u : (n,) array
-        Its errors of alpha_u there, in reported standard deviations.
+        Errors of alpha_u in these calibrations, in reported standard deviations.
     """
 
     rates_weights: Array
@@ -80,7 +82,7 @@ class RateStudy:
 
 @frozen_dataclass
 class _Cell:
-    """One pair of rates on all data sets; none: `calibrate` on one data set."""
+    """One pair of rates on all data sets; without rates, `calibrate` on one data set."""
 
     seed: int
     sets: range
@@ -102,10 +104,10 @@ def study_rates(
     sets : int
     seed : int
     jobs : int
-        Processes; the result is the same for any number.
+        Number of processes; it does not change the result.
     progress : callable, optional
     rates_weights, rates_gamma : sequence of float
-        The grid; the paper's alpha_1 and alpha_2.
+        Grid of the paper's alpha_1 and alpha_2.
     """
     usual = BackpropOptions()
     grid = list(product(rates_weights, rates_gamma))
@@ -133,7 +135,7 @@ def study_rates(
 
 
 def data_set(seed: int, number: int) -> DataSet:
-    """One of the data sets."""
+    """Simulate one of the data sets."""
     rng = np.random.default_rng((seed, number))
     size, n = 10 ** rng.uniform(0, 3), int(rng.integers(60, 140))
     local = rng.uniform(0, 1, (n, 3)) * rng.uniform(0.6, 1.4, 3) * size
@@ -163,7 +165,7 @@ def _train(cell: _Cell) -> Array:
 
 
 def _calibrated(data: DataSet) -> tuple[float, float]:
-    """Whether the trainer backprop reaches the minimum of (3), and its error of alpha_u [std]."""
+    """Whether the trainer backprop reaches the minimum of (3), and the error of alpha_u [std]."""
     found = calibrate(data.points, trainer="backprop", distortion="none", outliers="keep", target="given")
     best = calibrate(data.points, method="nonlinear", distortion="none")
     right = found.converged and found.rmse_px <= 1.001 * best.rmse_px
@@ -171,7 +173,7 @@ def _calibrated(data: DataSet) -> tuple[float, float]:
 
 
 def _one_start(seed: int, number: int, rates: tuple[float, float]) -> tuple[float, float]:
-    """Whether one random start converges, and its epochs."""
+    """Whether one random start converges, and its number of epochs."""
     views = arrange(data_set(seed, number).points)
     patterns = views.patterns(np.array([0]), False, int(views.counts[0]))
     rng = np.random.default_rng((seed, number, 1))

@@ -1,4 +1,4 @@
-"""What simulations found, as tables and as JSON."""
+"""Results of simulations as tables and as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neurocal_cli.simulation.starts import StartStudy
 Table = list[list[str]]
 
 FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
-# The errors of the paper's Table 1, calibrated less true.
+# The errors in the paper's Table 1, calibrated minus true.
 _PRINTED = {
     "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
     "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
@@ -29,7 +29,7 @@ _KINDS = {
 
 
 def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str] = ()) -> str:
-    """Tables with their titles as aligned text, and lines below them."""
+    """Format tables with titles as aligned text, and lines below them."""
     blocks = ["\n".join([title, *align(rows)]) for title, rows in tables]
     return "\n\n".join([*blocks, *(["\n".join(below)] if below else [])])
 
@@ -37,14 +37,14 @@ def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str] = ()) -> s
 def simulation_tables(
     study: NoiseStudy, starts: StartStudy | None, paper: bool
 ) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Tables of a study of noise, and of one of starts, and lines below them.
+    """Tables of the studies of noise and starts, and lines below them.
 
     Parameters
     ----------
     study : NoiseStudy
     starts : StartStudy, optional
     paper : bool
-        Whether the scene is the paper's, whose printed errors are shown too.
+        Whether the scene is that of the paper, so that its printed errors are shown, too.
     """
     tables = [("error without noise (Table 1)", _exact(study, paper))]
     if study.trials:
@@ -111,7 +111,7 @@ def _bias(one: MethodErrors, p: int, trials: int) -> str:
 
 
 def _whole_bound(study: NoiseStudy) -> Any:
-    """Of the method that takes the least for given."""
+    """Bound of the method with the most unknowns."""
     return max((one.bound for one in study.methods.values()), key=lambda bound: int((bound > 0).sum()))
 
 
@@ -136,7 +136,7 @@ def _findings(study: NoiseStudy) -> list[str]:
 
 
 def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Data sets on which one start converges, for each pair of rates; and lines below."""
+    """Tables of the data sets on which one start converges, for each pair of rates, and lines below them."""
     head = ["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]
     counts = [head]
     epochs = [list(head)]
@@ -155,7 +155,7 @@ def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
 
 
 def noise_json(study: NoiseStudy) -> dict[str, Any]:
-    """The whole study; a number that does not exist is None."""
+    """The whole study for JSON; missing numbers are None."""
     return {
         "trials": study.trials,
         "sigma": study.sigma.tolist(),
@@ -176,7 +176,7 @@ def noise_json(study: NoiseStudy) -> dict[str, Any]:
 
 
 def starts_json(starts: StartStudy) -> dict[str, Any]:
-    """Counts and ends of single starts."""
+    """Counts and final errors of single starts for JSON."""
     return {
         "sigma": starts.sigma,
         "best_rmse_px": starts.best,
@@ -187,7 +187,7 @@ def starts_json(starts: StartStudy) -> dict[str, Any]:
 
 
 def rates_json(study: RateStudy) -> dict[str, Any]:
-    """The grid of rates."""
+    """The study of rates for JSON."""
     return {
         "data_sets": study.sets,
         "rates_weights": study.rates_weights.tolist(),

@@ -1,4 +1,4 @@
-"""Cameras that look at targets, with everything known: the paper's (Table 1), a user's own, random ones."""
+"""Simulated cameras and targets with known truth: the paper's (Table 1), a user's, and random poses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-# Table 1. Its theta of 1.5708 is a right angle, rounded.
+# The camera of Table 1, whose theta of 1.5708 is a rounded right angle.
 PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))
 PAPER_POSE = Pose.from_euler(0.09, 0.80, -0.03, np.array([-27.0, -28.0, 701.0]))
-# 440 mid-points, as many as the paper's; it does not say where they are.
+# It has 440 mid-points, as many as the paper, which does not give their positions.
 PAPER_BOARD = Board(
     (
         Plane("wall", 11, 11, 17.0, (17, -75, 0), (1, 0, 0), (0, 1, 0)),
@@ -29,7 +29,7 @@ PAPER_BOARD = Board(
 )
 
 _TILT = 15.0, 45.0  # degrees
-_FILLED = 0.55, 0.9  # share of the image that the target spans
+_FILLED = 0.55, 0.9  # share of the image spanned by the target
 _TRIES = 1000
 
 
@@ -48,7 +48,7 @@ class SimulatedScene:
     point : (N,) array of str, or None
     unit : str
     board : Board or None
-        Whose mid-points the points are.
+        If given, the points are its mid-points.
     """
 
     camera: Camera
@@ -61,9 +61,9 @@ class SimulatedScene:
     board: Board | None = None
 
     def points(self, sigma: float = 0.0, rng: np.random.Generator | None = None) -> Correspondences:
-        """The points with Gaussian noise of a standard deviation [px] in u and in v.
+        """The points with Gaussian noise of standard deviation `sigma` [px] in u and in v.
 
-        They hold the true image centre, for the methods that have to be told.
+        They include the true image centre, for methods that need it.
         """
         noise = 0.0 if rng is None else sigma * rng.normal(size=self.pixels.shape)
         K = self.camera.intrinsics
@@ -74,17 +74,17 @@ class SimulatedScene:
 
 
 def paper_scene() -> SimulatedScene:
-    """The paper's section 5.1: Table 1's camera and 440 points of two boards at a right angle."""
+    """Scene of the paper's section 5.1: camera of Table 1, and 440 points on two boards at a right angle."""
     return scene_of(PAPER_CAMERA, PAPER_BOARD, {"view": PAPER_POSE})
 
 
 def scene_of(camera: Camera, board: Board, poses: Mapping[str, Pose]) -> SimulatedScene:
-    """All mid-points of a board, as a camera sees them in each pose.
+    """Simulate views of all mid-points of a board.
 
     Raises
     ------
     InputError
-        A pose in which the camera cannot see all of the board.
+        The camera cannot see all of the board in a pose.
     """
     ids, world = zip(*(plane.midpoints() for plane in board.planes), strict=True)
     labels, target = np.concatenate(ids), np.concatenate(world)
@@ -96,12 +96,12 @@ def scene_of(camera: Camera, board: Board, poses: Mapping[str, Pose]) -> Simulat
 
 
 def calibrated_scene(calibration: Calibration) -> SimulatedScene:
-    """What a calibrated camera would have seen without noise: its own points and poses.
+    """Simulate a calibration without noise, with its own points and poses.
 
     Raises
     ------
     InputError
-        A calibration without points.
+        The calibration has no points.
     """
     points, camera = calibration.points, calibration.camera
     if not len(points):
@@ -117,7 +117,7 @@ def calibrated_scene(calibration: Calibration) -> SimulatedScene:
 
 
 def true_calibration(scene: SimulatedScene) -> Calibration:
-    """The true camera and its poses as a calibration without any error, whose parameters are all given."""
+    """The true camera and poses as a calibration without errors, with all parameters given."""
     camera, points = scene.camera, scene.points()
     names = (*INTRINSIC_NAMES, *coefficient_names(camera.model))
     views = {
@@ -152,15 +152,15 @@ def _seen(camera: Camera, pose: Pose, world: Array, name: str) -> Array:
 
 
 def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Generator) -> dict[str, Pose]:
-    """Poses that tilt a board by 15 to 45 degrees to all sides, all of it in the image.
+    """Random poses of a board, tilted by 15 to 45 degrees to all sides, with all of it in the image.
 
     Raises
     ------
     InputError
-        A camera without an image size, or one whose image does not hold the board at any distance.
+        The camera has no image size, or no pose shows the whole board.
     """
     if camera.image_size is None:
-        raise InputError("the camera has no image size, so that nothing can be put into its image")
+        raise InputError("the camera has no image size; give a camera with one")
     corners = np.concatenate([plane.vertices().reshape(-1, 3) for plane in board.planes])
     centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     facing = sum((plane.normal for plane in board.planes), np.zeros(3))
@@ -172,7 +172,7 @@ def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Genera
 
 
 def _facing(normal: Array) -> Array:
-    """Rotation that lets a target be seen from the front: its mean normal along the camera's z axis."""
+    """Rotation that shows a target from the front, with its mean normal along the camera's z axis."""
     x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = x - (x @ normal) * normal
     x /= np.linalg.norm(x)

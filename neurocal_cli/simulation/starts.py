@@ -1,17 +1,17 @@
-"""Single random starts: how often the network reaches the minimum of (3), and how often plain descent does.
+"""Single random starts: how often the network and a plain descent reach the minimum of (3).
 
-The paper's network begins at random weights, "while the Levenberg-Marquardt algorithm would fail without a
-good starting point" (section 5.1). Four kinds of start, each alone, without a second try:
+The paper's network begins with random weights, "while the Levenberg-Marquardt algorithm would fail without a
+good starting point" (section 5.1). There are four kinds of starts, each run once:
 
-    lm, backprop      the network of each view from random weights in [-1, 1], by either trainer, then what
-                      follows from its product: the camera, and bundle adjustment
-    weights           Levenberg-Marquardt on (3) itself, from the same random weights: the twelve entries of
-                      P = W V (one solid view only)
-    camera            Levenberg-Marquardt on (3), from a random camera: a focal length of 0.5 to 20 half image
-                      widths, the centre in the middle half of the image, any rotation, the target seen
-                      anywhere in the image at a depth of 2 to 50 of its radii
+    lm, backprop      the network of each view from random weights in [-1, 1], with either trainer, then the
+                      camera from the products of the networks, and bundle adjustment
+    weights           Levenberg-Marquardt on (3) from the same random weights: the twelve entries of P = W V
+                      (one solid view only)
+    camera            Levenberg-Marquardt on (3) from a random camera: a focal length of 0.5 to 20 half image
+                      widths, the centre in the middle half of the image, any rotation, the target anywhere
+                      in the image at a depth of 2 to 50 of its radii
 
-A start reaches the minimum where its rms error is within 0.1 % of the best of all that were tried.
+A start reaches the minimum if its rms error is within 0.1 % of the best of all starts.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 STARTS = ("lm", "backprop", "weights", "camera")
-_SAME = 1.001  # times the best rms error
-_FLOOR = 1e-9  # normalised pixels: without noise the best error is rounding
+_SAME = 1.001  # greatest ratio to the best rms error
+_FLOOR = 1e-9  # px, added to it; without noise the best error is rounding
 _FOCAL = 0.5, 20.0  # half image widths
 _DEPTH = 2.0, 50.0  # radii of the target
-_BLOCK = 10  # starts of a task
-_NOISE = 10**6  # of the seed; trials over noise have lower ones
+_BLOCK = 10  # starts per task
+_NOISE = 10**6  # part of the seeds; the study of noise uses lower numbers
 
 Progress = Callable[[str, float], None]
 
@@ -58,11 +58,11 @@ class StartStudy:
     Attributes
     ----------
     rms : dict of (n,) arrays by kind [px]
-        Where each start ended; infinite where that is no camera.
+        Final rms error of each start; infinite if the result is not a camera.
     best : float [px]
-        The lowest of all, and of the descent from the linear answer.
+        The lowest of these and of the descent from the linear solution.
     sigma : float [px]
-        Of the noise of the points.
+        Noise of the points.
     """
 
     rms: dict[str, Array]
@@ -71,7 +71,7 @@ class StartStudy:
 
     @property
     def reached(self) -> dict[str, int]:
-        """How many starts of each kind reached the minimum."""
+        """Number of starts of each kind that reached the minimum."""
         return {kind: int(reached(rms, self.best).sum()) for kind, rms in self.rms.items()}
 
 
@@ -97,18 +97,18 @@ def study_starts(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> StartStudy:
-    """Start the network, and plain descent, many times on one set of points.
+    """Start the network and a plain descent many times on one set of points.
 
     Parameters
     ----------
     scene : SimulatedScene
-        Its distortion is left out: the starts are those of a pinhole.
+        Its distortion is ignored; all starts use a pinhole.
     sigma : float [px]
     starts : int
-        Of each kind.
+        Number of starts of each kind.
     seed : int
     jobs : int
-        Processes; the result is the same for any number.
+        Number of processes; it does not change the result.
     progress : callable, optional
 
     Raises
@@ -162,7 +162,7 @@ def can_start(problem: Problem, kind: str) -> bool:
 
 
 def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float:
-    """Rms error [px] at which one random start ends; infinite where that is no camera.
+    """Final rms error [px] of one random start; infinite if the result is not a camera.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def _network(trainer: str) -> Callable[[Problem, np.random.Generator], float]:
 
 
 def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
-    """(3) as a function of P's entries, scale and all; from W V."""
+    """Minimise (3) over the twelve entries of P, including its scale, from W V; rms error."""
     views = problem.views
     Z = np.column_stack([views.local, np.ones(len(views.local))])
     W, V = random_weights(rng, 1, 4)
@@ -229,7 +229,7 @@ def _from_camera(problem: Problem, rng: np.random.Generator) -> float:
 
 
 def _rms(problem: Problem, state: CameraState) -> float:
-    """Of the whitened residuals; infinite where points are behind the camera."""
+    """Rms of the whitened residuals; infinite if points are behind the camera."""
     views = problem.views
     normal, sensible = normal_blocks(views.batches, state)
     if not (sensible.all() and (state.entries[0, [0, 2]] > 0).all()):

@@ -11,7 +11,7 @@ from support.real_data import RealFiles
 from support.rendered import picture
 
 from neurocal_cli.board import Board
-from neurocal_cli.detection.batch import keep_memory
+from neurocal_cli.detection.batch import retain_freed_memory
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.measuring import measure
@@ -24,7 +24,7 @@ PHOTOGRAPHS = ["right01.jpg", "left02.jpg"]
 
 def seen(condition: str) -> NDArray[np.uint8]:
     cv2.setNumThreads(1)
-    keep_memory()
+    retain_freed_memory()
     image = picture(condition, 900).image
     assert image.dtype == np.uint8
     return image
@@ -63,7 +63,7 @@ def test_opencv_sector_based(benchmark: BenchmarkFixture, condition: str) -> Non
 
 def photograph(real_files: RealFiles, name: str) -> NDArray[np.uint8]:
     cv2.setNumThreads(1)
-    keep_memory()
+    retain_freed_memory()
     (path,) = real_files(f"opencv_stereo/{name}")
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 

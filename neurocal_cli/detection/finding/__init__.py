@@ -1,7 +1,6 @@
-"""From an image to grids: every chessboard of an image, with vertices accurate to a few tenths of a pixel.
+"""Find every chessboard of an image as a grid of vertices, accurate to a few tenths of a pixel.
 
-Constants here were tuned on the conditions of tests/rendered.py, with other seeds than those that
-tests/test_finding.py repeats them with. A comment calls them *insensitive* if halving or doubling any one of
-them changed no vertex and no label in 27 images: 16 conditions, 2 of clutter, 6 random mixtures and 3
-photographs.
+The constants were tuned on the conditions of tests/rendered.py; tests/test_finding.py repeats these with
+other seeds. A comment calls a constant *insensitive* if halving or doubling it changed no vertex and no label
+in 27 images: 16 conditions, 2 of clutter, 6 random mixtures and 3 photographs.
 """

@@ -1,7 +1,7 @@
-"""The last tests of a lattice: a chessboard, or clutter.
+"""Final tests whether a lattice is a chessboard or clutter.
 
-In: a lattice that has grown. Out: whether it has a block of 3 x 3 vertices, whether its vertices lie on a
-smooth surface, and whether its edges separate dark from light. Called by `grids`.
+In: a fully grown lattice. Out: whether it has a block of 3 x 3 vertices, whether its vertices lie on a smooth
+surface, and whether its edges separate dark from light. Called by `grids`.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
-# Insensitive, apart from _EDGES, which is a share: doubled it rejects all boards.
-_ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
-_LEAST_EDGE = 0.3  # of the contrast, across an edge
-_EDGES = 0.9  # share of the edges that are seen
-# Rms limits of the vertices' deviations from their neighbours' predictions: squares, px, and px per
+# Insensitive, except _EDGES, which is a share: doubled, it rejects all boards.
+_ASIDE = 0.16  # squares; distance of the samples from the middle of an edge, on both sides
+_LEAST_EDGE = 0.3  # least step across an edge, relative to the contrast
+_EDGES = 0.9  # least share of visible edges
+# Greatest rms distance of vertices from the predictions of their neighbours: in squares, plus px, plus px per
 # ratio of the noise (of second derivatives) to the contrast.
 _OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
-_MANY, _FEW_SMOOTH = 18, 0.6  # few vertices may be in line by chance: a stricter limit
+_MANY, _FEW_SMOOTH = 18, 0.6  # factor on this limit for fewer vertices, which may be aligned by chance
 
 
 def has_block(lattice: Lattice) -> bool:
-    """Whether a block of 3 x 3 vertices is known. In smaller lattices no third vertex tests a line."""
+    """Whether a block of 3 x 3 vertices is known; otherwise no third vertex tests the lines."""
     seen = lattice.seen
     if min(seen.shape) < 3:
         return False
@@ -33,7 +33,7 @@ def has_block(lattice: Lattice) -> bool:
 
 
 def is_smooth(level: Level, lattice: Lattice) -> bool:
-    """Whether the vertices lie where their neighbours predict them, within what noise explains."""
+    """Whether the vertices lie where their neighbours predict them, within the noise."""
     row, col, predicted = lattice.predicted
     off = (
         predicted.in_squares(lattice.pixels[row, col] - predicted.points)
@@ -62,7 +62,7 @@ def edges_visible(level: Level, lattice: Lattice) -> bool:
 
 
 def _edges_with_contrast(level: Level, pixels: Array, steps: Array, contrast: Array, dark: int) -> Array:
-    """Whether each edge along a row has contrast; steps (rows, cols, 2) lead from row to row."""
+    """Whether each edge along a row has contrast, given the steps (rows, cols, 2) to the next row."""
     known = np.isfinite(pixels[..., 0])
     row, col = np.nonzero(known[:, :-1] & known[:, 1:])
     start, end = pixels[row, col], pixels[row, col + 1]

@@ -1,8 +1,8 @@
-"""Splitting a lattice that covers two planes at the fold between them.
+"""Split a lattice that covers two planes at the fold between them.
 
 In: a lattice. Out: one lattice for each plane. Along a line of vertices on one plane, second differences
-change slowly, for any tilt and any lens distortion. At a fold they jump: at one vertex if the fold goes
-through it, else at the two vertices beside it.
+change slowly, for any tilt and lens distortion. At a fold they jump: at one vertex if the fold goes through
+it, otherwise at the two vertices beside it.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-# Least second difference of a fold [squares], and its least ratio to those of distant rows; paper is not
-# flat either. Insensitive, as all constants here; FOLDED and
-# WHOLE in tests/test_finding.py repeat this.
+# Pairs of the least second difference of a fold [squares] and its least ratio to those of distant rows,
+# because paper is not flat either. Insensitive, like all constants here; FOLDED and WHOLE in
+# tests/test_finding.py repeat this.
 _FOLDS = ((0.13, 4.0), (0.06, 12.0))
-_VERTEX_ERROR = 0.2  # px, that errors of the vertices add
-_UNKNOWN = 0.03  # squares; second difference of distant rows where there are none
+_VERTEX_ERROR = 0.2  # px, added for the errors of the vertices
+_UNKNOWN = 0.03  # squares; second difference assumed if there are no distant rows
 _LEAST_ROWS = 4
 _BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
 _ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
-_ALIKE = 2.0  # independent errors, whose means are 1.4 times smaller, stay below it
+_ALIKE = 2.0  # more than 1.4, so that independent errors (means of two are 1.4 times smaller) are not limited
 
 
 def split_at_folds(lattice: Lattice) -> list[Lattice]:
     """Split a lattice into connected parts without a fold.
 
-    Vertices on a fold are dropped: they belong to both planes, and their edges change direction there.
+    Vertices on a fold are dropped: they belong to both planes, and the edges change direction there.
     """
     whole = lattice.connected_parts()
     if len(whole) != 1:
@@ -42,7 +42,7 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
     position = max(row, col, key=lambda fold: fold[1])[0]
     index = np.arange(len(pixels))
     if position in (1, len(pixels) - 2):
-        # Either a fold or a wrong outermost row: drop the outermost row only.
+        # This is either a fold or a wrong outermost row: drop only that row.
         position = 0.0 if position == 1 else len(pixels) - 1
     parts = []
     for side in (index < position - 0.25, index > position + 0.25):
@@ -60,7 +60,7 @@ def largest_second_difference(lattice: Lattice) -> float:
 
 
 def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
-    """Those along columns (rows, cols, 2) and along rows (cols, rows, 2) [squares]; NaN where unknown."""
+    """Second differences along columns (rows, cols, 2) and rows (cols, rows, 2) [squares]; NaN if unknown."""
     pixels = lattice.pixels
     row, col, at = lattice.predicted
     along = []
@@ -73,20 +73,21 @@ def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
 
 
 def _sharpest_fold(second: Array, width: float) -> tuple[float, float]:
-    """Place among the rows and size [squares] of the sharpest fold along columns; (0, 0) without one.
+    """Row index and size [squares] of the sharpest fold across the columns; (0, 0) if there is none.
 
-    Of second differences (rows, cols, 2) [squares], NaN where unknown, of squares of a width [px].
+    `second` holds the second differences (rows, cols, 2) [squares], NaN where unknown; `width` is that of a
+    square [px].
     """
     rows = len(second)
     if rows < _LEAST_ROWS:
         return 0.0, 0.0
     before, after, far = (np.full_like(second, np.nan) for _ in range(3))
     before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
-    # Against both sides, or with less weight against one where the other is unknown.
+    # Compare with both sides, or with less weight with one side if the other is unknown.
     one = _ONE_SIDED * (second - np.where(np.isnan(before), after, before))
     both = second - 0.5 * (before + after)
     at = _jump(np.where(np.isnan(both), one, both))
-    # Between row i and i + 1.
+    # A fold between row i and row i + 1.
     between = _BETWEEN * _jump(0.5 * (second + after - before - far))
     size = np.empty(2 * rows)
     size[::2], size[1::2] = at, between
@@ -101,10 +102,10 @@ def _sharpest_fold(second: Array, width: float) -> tuple[float, float]:
 
 
 def _jump(values: Array) -> Array:
-    """Size of each row's jump, at most `_ALIKE` times that of the means of neighbouring columns.
+    """Size of each row's jump, limited to `_ALIKE` times that of the means of neighbouring columns.
 
-    A fold makes all columns jump in the same way. Vertices displaced to alternate sides, as on overexposed
-    boards, jump to opposite sides in neighbouring columns, as far as at a fold.
+    At a fold all columns jump alike. Vertices displaced to alternate sides, as on overexposed boards, jump in
+    opposite directions in neighbouring columns, by as much as at a fold.
     """
     beside = np.concatenate([values[:, 1:], values[:, -2:-1]], axis=1)
     means = np.where(np.isnan(beside), values, 0.5 * (values + beside))
@@ -112,7 +113,7 @@ def _jump(values: Array) -> Array:
 
 
 def _size(values: Array) -> Array:
-    """Median length of each row's vectors; 0 where fewer than two are known."""
+    """Median length of each row's vectors; 0 if fewer than two are known."""
     ordered = np.hypot(values[..., 0], values[..., 1])
     ordered.sort(axis=1)  # unknown ones come last
     count, row = (ordered >= 0).sum(axis=1), np.arange(len(ordered))

@@ -1,7 +1,7 @@
-"""A shortcut for growth: most of a grid at once, by following links from vertex to vertex.
+"""A shortcut for growth: build most of a grid at once, by following links from vertex to vertex.
 
-In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
-where every vertex passes the tests that `grow` applies; growing layer by layer gives the same, more slowly.
+In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is accepted only if every
+vertex passes the tests of `grow`. Growing layer by layer gives the same result more slowly.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
-# (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
+# Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Insensitive: a lattice rejected here grows instead, which only costs time
+# Insensitive: a lattice rejected here is grown instead, which only costs time
 # (tests/benchmarks/test_detection_speed.py).
-_NEAR = 1.0  # px, that a saddle may move when derivatives are smoothed more
-_FEWEST = 12  # vertices; fewer are grown from the seed
+_NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
+_FEWEST = 12  # vertices; smaller lattices are grown from the seed
 _ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
 _MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
-_WHOLE = 0.5  # least share of an outer line that is linked; beyond the board, links lead astray
+_WHOLE = 0.5  # least share of linked vertices in an outer line; links beyond the board are wrong
 
 
 def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[np.bool_]) -> Lattice | None:
-    """Follow the links that start at a vertex, and test what they lead to.
+    """Follow the links that start at a vertex, and test the resulting lattice.
 
     Parameters
     ----------
     level : Level
     links : Links
     middle : int
-        The vertex; its port 0 leads along c.
+        Index of the vertex; its port 0 points along c.
     taken : (N,) bool array
         Saddles that belong to other grids.
 
     Returns
     -------
     lattice : Lattice or None
-        None where the vertices fail the tests.
+        None if the vertices fail the tests.
     """
     places = _follow(links, middle, taken.tolist())
     if len(places) < _FEWEST:
@@ -57,7 +57,7 @@ def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[n
     refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)
     stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
     lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
-    # Links cross folds.
+    # Links may cross folds.
     part = _with(split_at_folds(lattice), saddles.points[middle])
     for _ in range(_ROUNDS):
         count = 0 if part is None else np.count_nonzero(part.seen)
@@ -66,17 +66,17 @@ def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[n
         part, good = check_lattice(level, part)
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
-            # A fold may hide in a gap.
+            # A gap may hide a fold.
             return part if largest_second_difference(part) < _MOST_CURVED else None
         if wrong > _WRONG * count:
             break
-        # Vertices left out here can be found again when the grid grows.
+        # Vertices removed here can be found again when the grid grows.
         part = _with(part.subset(in_whole_square(good)).connected_parts(), saddles.points[middle])
     return None
 
 
 def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
-    """Places (N, 2) and saddles (N,) in whole squares that links lead to from a saddle."""
+    """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares."""
     places = _follow(links, middle, [False] * len(links.to))
     place, member = np.array(list(places)), np.array(list(places.values()))
     place -= place.min(axis=0)
@@ -87,13 +87,13 @@ def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
 
 
 def _with(parts: list[Lattice], point: Array) -> Lattice | None:
-    """The lattice that has a vertex at a point [px]."""
+    """The lattice with a vertex at a point [px]."""
     near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
     return next(near, None)
 
 
 def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
-    """Saddles at their places (c, r), without ragged outer lines and those outside complete squares."""
+    """Make a lattice of saddles by their places (c, r), without incomplete squares and sparse outer lines."""
     place, index = np.array(list(places)), np.array(list(places.values()))
     left, top = place.min(axis=0)
     cols, rows = place.max(axis=0) - (left, top) + 1
@@ -110,7 +110,7 @@ def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
 
 
 def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
-    """Saddles by their places (c, r) relative to the middle one, found breadth first."""
+    """Saddles by their places (c, r) relative to the middle one, by a breadth-first search."""
     to, entry = links.lists
     places, along = {(0, 0): middle}, {middle: 0}  # saddle by place, and its port along c
     waiting = deque(places)

@@ -1,8 +1,8 @@
-"""All chessboards of an image, of any size: `find_grids` runs the steps of this package.
+"""Find all chessboards of an image, of any size: `find_grids` runs the steps of this package.
 
 On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
-vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. Where more
-saddles are linked than grids hold, `straighten` searches again, in a view without the bends of a wide lens.
+vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. If linked
+saddles are left over, `straighten` searches again in a view without the distortion of a wide lens.
 
 In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
@@ -32,15 +32,16 @@ from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-# Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless
-# nothing has been found yet. Chosen for time: tests/benchmarks/test_detection_speed.py.
+# Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless nothing
+# has been found yet. Chosen for speed: tests/benchmarks/test_detection_speed.py.
 _SEARCHED = 1.4e6
-# Larger levels are never searched, for the memory and time it takes.
+# Larger levels are never searched, to save memory and time.
 _MOST_SEARCHED = 30_000_000
-# Insensitive; they bound the time: tests/benchmarks/test_detection_speed.py, "clutter only".
-_TRIES, _TRIES_2X3 = 8, 4  # seeds of a level that may fail; bounds the time where there is no board
+# Insensitive. Number of seeds of a level that may fail; limits the time if there is no board
+# (tests/benchmarks/test_detection_speed.py, "clutter only").
+_TRIES, _TRIES_2X3 = 8, 4
 _UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
-_BEHIND = 3.0  # ratio of the squares' sizes from which on a second board is not searched
+_BEHIND = 3.0  # ratio of the squares' sizes above which a second board is not searched
 
 Size = tuple[int, int]
 
@@ -53,15 +54,15 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     image : (height, width) array
         Grey, of 8 or 16 bits or real numbers of any range.
     sizes : collection of (int, int), optional
-        Columns and rows, in either order, of the only board wanted. Once it is found whole, boards far
-        behind it, with squares a third of its size or smaller, are not searched.
+        Columns and rows, in either order, of the only board wanted. Once it is found whole, boards far behind
+        it, with squares less than a third as large, are not searched.
 
     Returns
     -------
     grids : list of Grid
-        The largest in the image first. Vertices are accurate to a few tenths of a pixel. Planes that
-        meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones
-        occur in clutter and no third vertex tests their lines.
+        The largest in the image first. Vertices are accurate to a few tenths of a pixel. Planes that meet at
+        a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones occur in clutter
+        and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
@@ -70,7 +71,7 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
 
 
 def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) -> list[Lattice]:
-    """Lattices on the finest level of a pyramid; `straight` if the lens's bends are already removed."""
+    """Lattices on the finest level of a pyramid; `straight` if the view has no lens distortion."""
     lattices: list[Lattice] = []
     bent: list[Lattice] = []
     links: Links | None = None
@@ -102,9 +103,9 @@ def _find_bent(
     known: list[Lattice],
     wanted: frozenset[Size],
 ) -> tuple[list[Lattice], list[Lattice]]:
-    """Known lattices without pieces of bent ones, and the bent ones.
+    """Known lattices that are no pieces of bent ones, and the bent ones.
 
-    Linked saddles are those besides lattices of so many masked vertices.
+    The links exclude saddles in lattices that had `masked` vertices in all.
     """
     lost = masked > sum(int(x.seen.sum()) for x in known)
     least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
@@ -125,7 +126,7 @@ def _find_bent(
 
 
 def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
-    """Lattices without duplicates, each on one plane, with occluded parts joined."""
+    """Drop duplicates, split lattices at folds, and join the parts of occluded ones."""
     result = []
     several = drop_duplicates(lattices)
     if any_overlap(several):
@@ -141,7 +142,7 @@ def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
 
 
 def _fill_gaps(level: Level, lattice: Lattice) -> Lattice:
-    """Search for missing vertices, also behind a missing neighbour."""
+    """Search for missing vertices, including those behind a missing neighbour."""
     if lattice.seen.all():
         return lattice
     return remove_outliers(level, grow(level, lattice, outwards=False, reach=2))
@@ -154,13 +155,13 @@ def _area(pixels: Array) -> float:
 
 
 def _nearest_whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
-    """Largest width of the squares [px] among complete grids of a wanted size; 0 without any."""
+    """Largest width of the squares [px] among complete grids of a wanted size; 0 if there is none."""
     widths = (x.width for x in lattices if x.contrast.shape in wanted and x.seen.all())
     return max(widths, default=0.0)
 
 
 def _sides(points: Array) -> Array:
-    """(S,) longest sides of the squares between blocks of points (S, R, C, 2) [px]."""
+    """(S,) longest sides of the squares in blocks of points (S, R, C, 2) [px]."""
     along, down = points[:, :, 1:] - points[:, :, :-1], points[:, 1:] - points[:, :-1]
     return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
 
@@ -168,7 +169,7 @@ def _sides(points: Array) -> Array:
 def _find_new(
     level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size] = frozenset()
 ) -> list[Lattice]:
-    """Grids of a level's saddles besides the known ones. The first grid of an image gets more effort."""
+    """Find further grids in a level; the first grid of an image gets more effort."""
     seeds = find_seeds_3x3(links)
     dark = np.zeros(len(seeds), dtype=np.intp)
     found = _grow_from_seeds(level, links, seeds, dark, _TRIES, known, wanted)
@@ -186,7 +187,7 @@ def _grow_from_seeds(
     known: list[Lattice],
     wanted: frozenset[Size],
 ) -> list[Lattice]:
-    """Grids that grow from seeds, until a number of seeds has failed."""
+    """Grow grids from seeds, until `tries` seeds have failed."""
     found: list[Lattice] = []
     saddles = links.saddles
     free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
@@ -216,7 +217,7 @@ def _grow_from_seeds(
 
 
 def _find_slivers(level: Level, links: Links) -> list[Lattice]:
-    """Grids of squares too narrow for the directions of their edges to be measured."""
+    """Find grids whose squares are too narrow to measure the directions of their edges."""
     part = stretch(level, links.saddles.points)
     links_of_part = None if part is None else find_links(part.level)
     if part is None or links_of_part is None:
@@ -237,7 +238,7 @@ def _to_finer_level(level: Level, lattice: Lattice) -> Lattice:
 
 
 def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Lattice:
-    """The lattice with its vertices at the saddle points next to them, if these are within `most` px."""
+    """Move the vertices to the nearest saddle points, if these are within `most` px."""
     start = lattice.pixels[lattice.seen]
     refined = refine_saddles(level.image, start, sigma)
     close = np.hypot(*(refined - start).T) < most
@@ -247,7 +248,7 @@ def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Latti
 
 
 def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
-    """A mask of the squares of grids and a margin around them."""
+    """Mask of the squares of grids, with a margin around them."""
     mask = np.zeros(level.image.shape, dtype=np.uint8)
     for lattice in lattices:
         p = lattice.pixels
@@ -261,5 +262,5 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
 
 
 def _boards(lattice: Lattice) -> list[Lattice]:
-    """Connected parts of a lattice that are large enough for a board."""
+    """Connected parts of a lattice with a block of 3 x 3 vertices."""
     return [part for part in lattice.connected_parts() if has_block(part)]

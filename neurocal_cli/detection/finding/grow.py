@@ -1,8 +1,8 @@
-"""Growing a lattice layer by layer, and removing its outliers.
+"""Grow a lattice layer by layer, and remove its outliers.
 
-In: a level and a lattice of at least 2 x 3 vertices. Out: the lattice, as far as the board is visible. Every
-new vertex is predicted from its neighbours, searched near there, and accepted if it lies within a tolerance
-of the prediction and the image around it looks like a vertex.
+In: a level and a lattice of at least 2 x 3 vertices. Out: a lattice of the visible part of the board. Every
+new vertex is predicted from its neighbours, searched near the prediction, and accepted if it lies within a
+tolerance of it and the image around it looks like a vertex.
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ from neurocal_cli.detection.finding.vertex_check import check_vertices
 from neurocal_cli.geometry import Array
 
 # Insensitive, with exceptions: half of _STEPS loses 3 of 1204 vertices, half of _MOST_SPREAD loses 47, and
-# twice _WEAKEST, more than the contrast of the neighbours, stops growth. tests/test_finding.py repeats this.
+# twice _WEAKEST, which exceeds the contrast of the neighbours, stops growth. tests/test_finding.py repeats
+# this.
 _SEARCHED = 0.24  # squares; half width of the search around a prediction ...
-_STEPS = 7  # ... at so many places each way
-_MOST_SPREAD = 5.0  # of a prediction that is used
+_STEPS = 7  # ... and number of samples in each direction
+_MOST_SPREAD = 5.0  # greatest spread of a prediction that is used
 _OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_tolerance`
 _WEAKEST = 0.55  # least contrast, relative to the neighbours
-_EVEN_ALONE, _OFF_ALONE = 0.88, 0.3  # stricter limits outside complete squares; the latter per tolerance
-_LAYERS = 200  # at most
-_ROUNDS = 12  # of removing outliers, at most
+# Stricter limits outside complete squares: least evenness, and greatest distance in units of the tolerance.
+_EVEN_ALONE, _OFF_ALONE = 0.88, 0.3
+_LAYERS = 200  # greatest number
+_ROUNDS = 12  # greatest number of rounds of removing outliers
 
 
 def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
-    """Add vertices between the known ones and, if outwards, around them, until none is accepted any more.
+    """Add vertices between the known ones and, if `outwards`, around them, until no more are accepted.
 
     With a reach of 2, growth also steps over a single hidden vertex.
     """
@@ -43,7 +45,7 @@ def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) 
             lattice, shift = lattice.padded()
             top, left = top + shift[0], left + shift[1]
         row, col, support = frontier(lattice.seen, reach)
-        # A place is searched again only when it has more neighbours than before.
+        # A place is searched again only if its number of known neighbours has changed.
         keys = list(zip((row - top).tolist(), (col - left).tolist(), support.tolist(), strict=True))
         fresh = [k for k, key in enumerate(keys) if key not in tried]
         if not fresh:
@@ -56,12 +58,12 @@ def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) 
 
 
 def _around(values: NDArray[np.generic]) -> Array:
-    """Sum over the 3 x 3 places around each."""
+    """Sum over the 3 x 3 neighbourhood of each place."""
     whole = values.astype(float)
     return np.asarray(cv2.boxFilter(whole, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-# One convolution counts all neighbours (modulo 16) and those along edges (in sixteens).
+# One convolution counts all known neighbours (modulo 16) and those along edges (multiples of 16).
 _BESIDE = 16
 _COUNTS = np.array(
     [[1, _BESIDE + 1, 1], [_BESIDE + 1, 1, _BESIDE + 1], [1, _BESIDE + 1, 1]], dtype=np.float32
@@ -69,10 +71,10 @@ _COUNTS = np.array(
 
 
 def frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
-    """Rows and columns of unknown places where growth goes on, and the number of known places around each.
+    """Rows and columns of the unknown places to search next, and the number of known places around each.
 
-    Those with a known neighbour along an edge and another one nearby; with a reach of 2, all that are at most
-    two away from a known one.
+    With a reach of 1, these have a known neighbour along an edge and at least one more among the eight around
+    them. With a reach of 2, these are at most two places away from a known one.
     """
     counts = cv2.filter2D(seen.view(np.uint8), -1, _COUNTS, borderType=cv2.BORDER_CONSTANT)
     around = counts % _BESIDE
@@ -82,7 +84,7 @@ def frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray
 
 
 def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
-    """Search vertices at places of a lattice, and add those accepted."""
+    """Search vertices at places of a lattice, and add the accepted ones."""
     predicted = predict_vertices(lattice.pixels, row, col)
     worth = (
         (predicted.spread < _MOST_SPREAD * reach) & (predicted.area > 4) & _inside(level, predicted.points)
@@ -105,14 +107,14 @@ def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: f
 
 
 def _usual_contrast(lattice: Lattice) -> Array:
-    """(rows, cols) weighted mean contrast of the known vertices at most two away."""
+    """(rows, cols) weighted mean contrast of the known vertices at most two places away."""
     seen = lattice.seen
     known = np.where(seen, lattice.contrast, 0.0)
     return np.asarray(_around(_around(known)) / np.maximum(_around(_around(seen)), 1))
 
 
 def _off(predicted: PredictedVertices, points: Array) -> Array:
-    """(N,) distance of points from their predictions, the larger component [squares]."""
+    """(N,) larger component of the distance between points and their predictions [squares]."""
     away = np.abs(predicted.in_squares(points - predicted.points))
     return np.maximum(away[:, 0], away[:, 1])
 
@@ -133,7 +135,7 @@ _PRIOR = 1 - 0.4 * np.abs(_SHARES).max(axis=1) / _SEARCHED
 
 
 def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) -> Array:
-    """Places near the predictions where a saddle of the right sign is steepest; (N, 2) [px]."""
+    """Places near the predictions with the steepest saddle of the right sign; (N, 2) [px]."""
     places = predicted.around(_SHARES, predicted.points)
     maps = places.astype(np.float32)
     uu, uv, vv = (interpolate(x, maps) for x in level.curvature)
@@ -146,7 +148,7 @@ def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) ->
 
 
 def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
-    """The lattice with the contrasts of its vertices, and a mask of those that pass all tests."""
+    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
     row, col, predicted = lattice.predicted
     points = lattice.pixels[row, col]
     check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
@@ -166,7 +168,7 @@ def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.b
 
 
 def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
-    """Remove vertices that do not look like one or are far from their predictions, the worst ones first."""
+    """Remove vertices that do not look like one or are far from their predictions, the worst first."""
     for _ in range(_ROUNDS):
         row, col, predicted = lattice.predicted
         if not len(row):
@@ -176,7 +178,7 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         off = _off(predicted, points) / _tolerance(predicted)
         off = np.where((predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD), off, np.inf)
         check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
-        # There is less evidence for a vertex outside complete squares.
+        # Vertices outside complete squares have fewer neighbours to confirm them.
         closes = in_whole_square(seen)[row, col]
         accepted = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
         off = np.where(accepted, off, np.inf)
@@ -184,7 +186,7 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         if not (off > 1).any():
             lattice = lattice.with_contrast(contrast)
             break
-        # An outlier spoils the predictions of its neighbours: remove only the worst of each neighbourhood.
+        # An outlier spoils the predictions of its neighbours, so remove only the worst of a neighbourhood.
         worst = np.zeros(pixels.shape[:2])
         worst[row, col] = off
         bad = (worst > 1) & (worst >= cv2.dilate(worst, np.ones((3, 3), np.uint8)))

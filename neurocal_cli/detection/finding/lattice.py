@@ -1,4 +1,4 @@
-"""A grid of vertices on a level of the pyramid while it is being found, and operations on its array."""
+"""The grid of vertices of a board while it is being found on a level of the pyramid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neurocal_cli.geometry import Array
 
 Index = NDArray[np.intp]
 
-LEAST_SIGMA = 0.75  # px, of the smoothing of derivatives; for the narrowest squares
+LEAST_SIGMA = 0.75  # px; least smoothing of derivatives, for the narrowest squares
 
 
 @frozen_dataclass(eq=False)
@@ -28,7 +28,7 @@ class Lattice:
     pixels : (rows, cols, 2) array [px of its level]
         NaN where unknown.
     contrast : (rows, cols) array [DN]
-        Around each known vertex; NaN elsewhere.
+        Of each known vertex; NaN elsewhere.
     dark : int
         0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
     """
@@ -49,14 +49,14 @@ class Lattice:
         return row, col, predict_vertices(self.pixels, row, col)
 
     def with_contrast(self, contrast: Array) -> Lattice:
-        """The same vertices with other contrasts (rows, cols); keeps the predictions."""
+        """Replace the contrasts (rows, cols), keeping the cached predictions."""
         result = replace(self, contrast=contrast)
         vars(result).update({name: x for name, x in vars(self).items() if name == "predicted"})
         return result
 
     @property
     def width(self) -> float:
-        """Median of the squares' narrower widths [px]."""
+        """Median of the squares' widths, each the smaller distance of opposite sides [px]."""
         p = self.pixels
         c, r = p[:-1, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, :-1]
         area = np.abs(c[..., 0] * r[..., 1] - c[..., 1] * r[..., 0])
@@ -66,11 +66,11 @@ class Lattice:
 
     @property
     def derivative_sigma(self) -> float:
-        """Smoothing of derivatives for the squares' width [px], in steps of 0.25 px to reuse kernels."""
+        """Smoothing of derivatives for squares of this width [px], in steps of 0.25 px to reuse kernels."""
         return min(max(round(0.15 * self.width / 0.25) * 0.25, LEAST_SIGMA), 2.0)
 
     def padded(self) -> tuple[Lattice, tuple[int, int]]:
-        """Add an empty row or column on each side that has none; returns the shift of the indices too."""
+        """Add an empty row or column at each side without one; also returns the shift of the indices."""
         seen = self.seen
         top, bottom, left, right = (int(line.any()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
         if top + left + bottom + right == 0:
@@ -95,7 +95,7 @@ class Lattice:
         return Lattice(self.pixels[part], self.contrast[part], dark)
 
     def subset(self, kept: NDArray[np.bool_]) -> Lattice:
-        """A lattice of some of the vertices; kept is a (rows, cols) mask."""
+        """Keep the vertices of a (rows, cols) mask."""
         pixels = np.where(kept[..., None], self.pixels, np.nan)
         return replace(self, pixels=pixels, contrast=np.where(kept, self.contrast, np.nan)).cropped()
 
@@ -108,12 +108,12 @@ class Lattice:
 
 
 def signs(row: Index, col: Index, dark: int) -> Array:
-    """+1 where the square towards growing c and r is dark, else -1."""
+    """+1 if the square towards growing c and r is dark, else -1."""
     return np.where((row + col + dark) % 2 == 0, 1.0, -1.0)
 
 
 def in_whole_square(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of the vertices of squares whose four vertices are known; seen is a (rows, cols) mask."""
+    """Mask of the vertices of complete squares, given the (rows, cols) mask of known vertices."""
     corners, kernel = seen.view(np.uint8), np.ones((2, 2), np.uint8)
     whole = cv2.erode(corners, kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(cv2.dilate(whole, kernel, anchor=(0, 0)) > 0)

@@ -1,6 +1,6 @@
 """An image pyramid, with the second derivatives that `saddles` uses.
 
-Pixel (u, v) of a level is pixel (2 u, 2 v) of the level below it: `cv2.pyrDown` keeps the even ones.
+Pixel (u, v) of a level is pixel (2 u, 2 v) of the next finer one, because `cv2.pyrDown` keeps even pixels.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from neurocal_cli.geometry import Array
 Image = NDArray[np.float32]
 
 # _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.
-_SMOOTHING = 1.0  # px; against noise and aliasing
-_SMALLEST = 100  # px; the shorter side of the smallest level
-_LARGE = 30_000_000  # pixels; in larger images the noise is measured in bands only, to save memory ...
-_BANDS, _BAND = 24, 64  # ... so many, of so many rows
-_ROWS = 32000  # rows of one call to cv2.remap, which counts them in 16 bits
-_LEAST_NOISE = 0.12  # DN/px^2; rounding to 8 bits leaves this much
+_SMOOTHING = 1.0  # px; reduces noise and aliasing
+_SMALLEST = 100  # px; shorter side of the smallest level
+_LARGE = 30_000_000  # pixels; in larger images the noise is measured only in bands, to save memory ...
+_BANDS, _BAND = 24, 64  # ... number of bands, and rows of a band
+_ROWS = 32000  # rows per call of cv2.remap, which counts them in 16 bits
+_LEAST_NOISE = 0.12  # DN/px^2; caused by rounding to 8 bits
 
 
 @frozen_dataclass(eq=False)
@@ -34,7 +34,7 @@ class Level:
     image : (height, width) float32 array
         In grey levels of an 8-bit image.
     scale : int
-        Pixels of the original per pixel.
+        Size of a pixel in pixels of the original.
     """
 
     image: Image
@@ -56,7 +56,7 @@ class Level:
 
     @cached_property
     def noise(self) -> float:
-        """Standard deviation of the second derivatives by noise alone [DN/px^2], from their median."""
+        """Standard deviation of the second derivatives due to noise [DN/px^2], from their median."""
         if self.image.size <= _LARGE:
             sparse = self.curvature[1][::4, ::4]
         else:
@@ -77,13 +77,13 @@ def levels_of(image: NDArray[np.generic]) -> list[Level]:
     Returns
     -------
     levels : list of Level
-        The original first; empty when the image is too small to hold a board.
+        The original first; empty if the image is too small for a board.
     """
     return pyramid(_grey(image))
 
 
 def pyramid(image: Image) -> list[Level]:
-    """Halve an image in the grey levels of 8 bits repeatedly; see `levels_of`."""
+    """Halve an image with the grey levels of 8 bits repeatedly; see `levels_of`."""
     levels = []
     current, scale = image, 1
     while min(current.shape) >= (16 if scale == 1 else _SMALLEST):
@@ -93,7 +93,7 @@ def pyramid(image: Image) -> list[Level]:
 
 
 def _grey(image: NDArray[np.generic]) -> Image:
-    """The image as float32, scaled to the grey levels of 8 bits."""
+    """Convert the image to float32 and the grey levels of 8 bits."""
     if image.dtype == np.uint8:
         return image.astype(np.float32)
     if image.dtype == np.uint16:
@@ -111,7 +111,7 @@ def _grey(image: NDArray[np.generic]) -> Image:
 
 
 def interpolate(image: Image, points: NDArray[np.floating]) -> Array:
-    """Interpolate an image at points (..., 2) [px]; the border is repeated outside."""
+    """Interpolate an image linearly at points (..., 2) [px], repeating the border outside."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
     maps = flat.astype(np.float32, copy=False)
     parts = [

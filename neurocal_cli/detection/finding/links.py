@@ -1,8 +1,8 @@
-"""Links between neighbouring saddles, along the edges of the squares.
+"""Link neighbouring saddles along the edges of the squares.
 
-In: a level. Out: its saddles, and for every one its neighbour at each of its four ports. An edge leaves one
-vertex through a port that a dark sector follows and enters the next through a port that a dark sector
-precedes: along a line of the board, even and odd ports meet.
+In: a level. Out: its saddles, and the neighbour of each at its four ports. An edge that leaves a vertex at a
+port followed by a dark sector enters the next vertex at a port preceded by a dark sector. So along a line of
+the board, each edge connects an even with an odd port.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_FEWEST = 9  # saddles, of 3 x 3 vertices
+_FEWEST = 9  # saddles, for 3 x 3 vertices
 # Insensitive; tests/test_finding.py.
-_WIDEST = 0.26  # rad; between a port and the direction to the neighbour
-_SHARE = 0.45  # the same as a share of the vertex's narrower angle
-_ASIDE = 2.0  # px; distance from the port's line that is always allowed
+_WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
+_SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
+_ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 
 
@@ -34,9 +34,9 @@ class Links:
     ----------
     saddles : Saddles
     to : (N, 4) int array
-        The neighbour at each port; -1 where there is none.
+        The neighbour at each port; -1 if there is none.
     port : (N, 4) int array
-        The neighbour's port that the edge enters.
+        The neighbour's port at the other end of the edge.
     """
 
     saddles: Saddles
@@ -45,23 +45,23 @@ class Links:
 
     @cached_property
     def lists(self) -> tuple[list[list[int]], list[list[int]]]:
-        """Both as lists, which are faster to follow one by one."""
+        """Both arrays as lists, which are faster to index one by one."""
         return self.to.tolist(), self.port.tolist()
 
 
 def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links | None:
-    """Find saddles and link those that are each other's nearest suitable neighbour at their ports.
+    """Find saddles, and link pairs that are each other's nearest suitable neighbour at their ports.
 
     Parameters
     ----------
     level : Level
     covered : (height, width) uint8 array, optional
-        Non-zero where not to search.
+        Non-zero pixels are not searched.
 
     Returns
     -------
     links : Links or None
-        None where there are fewer saddles than the smallest board has vertices.
+        None if there are fewer saddles than vertices of the smallest board.
     """
     saddles = find_saddles(level, covered)
     count = len(saddles)
@@ -93,7 +93,7 @@ def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links 
 
 
 def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array) -> NDArray[np.int8]:
-    """(N, N) port of each saddle (row) that leads to each other one, or -1."""
+    """(N, N) port of each saddle (row) that points to each other saddle (column), or -1."""
     port = np.full(du.shape, -1, dtype=np.int8)
     opening = ports[:, 1] - ports[:, 0]
     widest = _SHARE * np.minimum(opening, np.pi - opening)
@@ -102,7 +102,7 @@ def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array
         c, s = (f(ports[:, line]).astype(np.float32)[:, None] for f in (np.cos, np.sin))
         along, across = c * du + s * dv, np.abs(c * dv - s * du)
         reach = np.abs(along)
-        # At the end of a short edge, a direction is only accurate to a pixel or two.
+        # Directions are only accurate to a pixel or two at the end of a short edge.
         close = across < np.maximum(usual * reach, np.minimum(most * reach, _ASIDE))
         port[close & (along > 0)] = line
         port[close & (along < 0)] = line + 2
@@ -110,7 +110,7 @@ def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array
 
 
 def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDArray[np.bool_]:
-    """(N, 4) whether dark and light lie on the right sides all along a link."""
+    """(N, 4) mask of links with dark and light on the right sides along their length."""
     seen = np.zeros(to.shape, dtype=bool)
     first, p = np.nonzero(to >= 0)
     if not len(first):
@@ -123,7 +123,7 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     share = np.array([0.3, 0.5, 0.7])
     middle = start[:, None] + share[:, None] * step[:, None]
     offset = (reach[:, None] * normal)[:, None]
-    # The normal lies at a growing angle from the step: on the dark side for an even port.
+    # The normal is the step turned from u towards v, so at an even port it points to the dark side.
     sides = interpolate(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
     rise = (sides[:, 0] - sides[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
     contrast = np.minimum(saddles.contrast[first], saddles.contrast[to[first, p]])

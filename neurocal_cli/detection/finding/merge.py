@@ -1,4 +1,4 @@
-"""Joining the two parts of a board that an occluder divides.
+"""Join the parts of a board that an occluder divides.
 
 In: the lattices of a level. Out: the same, with lattices joined that continue each other on one grid.
 """
@@ -11,14 +11,14 @@ from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.geometry import Array
 
 # tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
-_NEAR = 4.0  # squares; of one lattice from the other, to be compared
-_WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst
-_LEAST = 4  # vertices compared
+_NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
+_WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
+_LEAST = 4  # least number of vertices compared
 _TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 
 
 def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:
-    """Join lattices whose grid coordinates agree where each one, extrapolated, meets the other."""
+    """Join lattices whose extrapolated grid coordinates agree at the vertices of the other."""
     result = sorted(lattices, key=lambda x: -int(x.seen.sum()))
     first = 0
     while first < len(result):
@@ -54,7 +54,7 @@ def _union(large: Lattice, small: Lattice) -> Lattice | None:
 
 
 def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
-    """Rotation (2, 2) and shift (2,) from a lattice's (c, r) to those of the base; None if they disagree."""
+    """Rotation (2, 2) and shift (2,) from the other lattice's (c, r) to the base's; None if they disagree."""
     row, col = np.nonzero(other.seen)
     grid = _continued(base, other)
     rows, cols = base.seen.shape
@@ -77,11 +77,11 @@ def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
 
 
 def _continued(base: Lattice, other: Lattice) -> Array:
-    """Coordinates (N, 2) of another lattice's vertices on the base, extrapolated by a homography."""
+    """Grid coordinates (N, 2) of the other lattice's vertices on the base, extrapolated by a homography."""
     row, col = np.nonzero(base.seen)
     p, q = base.pixels[row, col], other.pixels[other.seen]
     away = np.sqrt(((p[:, None] - q[None]) ** 2).sum(axis=-1).min(axis=1))
-    # A lens distorts the plane, so that vertices near the other lattice count most.
+    # Lens distortion bends the plane, so the vertices near the other lattice have the largest weights.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
     centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)
     x, y = ((p - centre) / scale).T

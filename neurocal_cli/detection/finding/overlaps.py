@@ -1,4 +1,4 @@
-"""Vertices that belong to two lattices: copies of a lattice, and rows beyond a fold.
+"""Remove vertices that belong to two lattices: copies of a lattice, and rows beyond a fold.
 
 In: the lattices of a level. Out: lattices that share no vertices.
 """
@@ -13,16 +13,16 @@ from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
 # Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
-_SAME = 0.25  # of a square's width; between vertices that are the same
-_MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
-_MEETS_PARTLY = 0.22  # ... if few of its row are seen
-_MOSTLY = 0.6  # share of a row
-_COPY = 0.5  # share of vertices in another lattice
+_SAME = 0.25  # squares; greatest distance between vertices that are the same
+_MEETS = 0.13  # squares; greatest distance of a vertex from another lattice or its next row ...
+_MEETS_PARTLY = 0.22  # ... and the same for vertices of incomplete rows
+_MOSTLY = 0.6  # share of such vertices above which a row is removed
+_COPY = 0.5  # share of vertices in another lattice above which a lattice is its copy
 _BESIDE = 2.0  # squares; lattices farther apart share no vertices
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
-    """Drop lattices most of whose vertices belong to a larger one."""
+    """Drop lattices if most of their vertices belong to a larger one."""
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
@@ -55,7 +55,7 @@ def _longest(lattice: Lattice) -> float:
 def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
     """Remove outermost rows of a lattice that lie on another lattice or on its next row.
 
-    A lattice of one plane may have grown across a fold into the other plane.
+    Such rows occur if a lattice has grown across a fold into the other plane.
     """
     result = list(lattices)
     if len(result) < 2:
@@ -71,7 +71,7 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
 
 
 def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
-    """Vertices of a lattice and of its next rows (N, 2), and the width of its squares."""
+    """Vertices of a lattice and predicted vertices of its next rows (N, 2), and the width of its squares."""
     wider, _ = lattice.padded()
     row, col, _ = frontier(wider.seen, 1)
     predicted = predict_vertices(wider.pixels, row, col)
@@ -104,7 +104,7 @@ _OUTERMOST = (
 
 
 def _distance(points: Array, others: Array) -> Array:
-    """(N,) from each point to the nearest of the others [px]."""
+    """(N,) distance of each point from the nearest of the others [px]."""
     if not len(points) or not len(others):
         return np.full(len(points), np.inf)
     away = points[:, None] - others[None]

@@ -1,9 +1,9 @@
-"""Predicting a vertex from its neighbours, by a local regression.
+"""Predict a vertex from its neighbours by local regression.
 
-In: an array of known vertices and places in it. Out: the predicted pixel of each place, the steps to the
+In: an array of known vertices, and places in it. Out: the predicted pixel of each place, the steps to the
 next vertices, and the prediction's spread. The map is a quadratic polynomial of the grid coordinates, fitted
 to the vertices at most three squares away by weighted ridge regression. The ridge keeps second derivatives
-small, as perspective and distortion make them, so that few neighbours give a linear map.
+small, as they are under perspective and distortion, so few neighbours give a linear map.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
 _c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
 _BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
 _WEIGHT = np.exp(-0.5 * (_c**2 + _r**2) / _WIDTH**2) * (_c**2 + _r**2 > 0)
-# Weighted products of the basis with itself, one row for each neighbour, and a 1 that counts them.
+# Weighted outer products of the basis, a row for each neighbour, and a column of ones that counts neighbours.
 _PRODUCTS = (_WEIGHT[:, None, None] * _BASIS[:, :, None] * _BASIS[:, None, :]).reshape(len(_c), -1)
 _PRODUCTS = np.concatenate([_PRODUCTS, np.ones((len(_c), 1))], axis=1)
 _RIGHT = _WEIGHT[:, None] * _BASIS
@@ -39,9 +39,9 @@ class PredictedVertices:
     ----------
     points : (N, 2) array [px]
     steps : (N, 2, 2) array [px]
-        From it to the next vertex along a row, and along a column.
+        From the point to the next vertex along its row, and along its column.
     spread : (N,) array
-        Standard deviation of the point per standard deviation of a vertex.
+        Standard deviation of the point for unit standard deviation of the vertices.
     """
 
     points: Array
@@ -49,7 +49,7 @@ class PredictedVertices:
     spread: Array
 
     def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
-        """A subset of the vertices."""
+        """Select some predictions."""
         return PredictedVertices(self.points[which], self.steps[which], self.spread[which])
 
     @property
@@ -64,7 +64,7 @@ class PredictedVertices:
 
     @cached_property
     def area(self) -> Array:
-        """(N,) of a square [px^2]; negative when mirrored."""
+        """(N,) area of a square [px^2]; negative if mirrored."""
         return np.asarray(self.c[:, 0] * self.r[:, 1] - self.c[:, 1] * self.r[:, 0])
 
     @property
@@ -75,11 +75,11 @@ class PredictedVertices:
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
 
     def around(self, shares: Array, points: Array) -> Array:
-        """Places (N, K, 2) around points (N, 2), at fractions (K, 2) of `c` and `r`."""
+        """Places (N, K, 2) around points (N, 2), at offsets (K, 2) in units of `c` and `r`."""
         return np.asarray(points[:, None] + shares @ self.steps)
 
     def in_squares(self, away: Array) -> Array:
-        """Pixel offsets (N, 2) as fractions of `c` and `r`."""
+        """Convert pixel offsets (N, 2) to units of `c` and `r`."""
         area = self.area
         area = np.where(np.abs(area) > 1e-9, area, 1e-9)
         out = np.empty(away.shape)
@@ -91,13 +91,13 @@ class PredictedVertices:
 
 @lru_cache(maxsize=64)
 def _window(width: int) -> NDArray[np.intp]:
-    """From a place's first neighbour to all of them, in flat arrays of a width."""
+    """Flat index offsets from a place's first neighbour to all of them, in arrays of a width."""
     size = np.arange(2 * _REACH + 1)
     return (size[:, None] * width + size).ravel()
 
 
 def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
-    """Predict vertices from their neighbours, whether they are known or not.
+    """Predict vertices, known or unknown, from their neighbours.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]
     known = near[2]
     sums = known @ _PRODUCTS
     normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE
-    # Relative to the mean of the neighbours, against rounding errors.
+    # Subtract the mean of the neighbours, to reduce rounding errors.
     origin = near[:2] @ _ONES
     origin /= np.maximum(sums[:, -1], 1.0)
     offset = near[:2]

@@ -1,9 +1,9 @@
-"""Saddle points of the brightness, where two edges may cross: the candidates for vertices.
+"""Find saddle points of the brightness, the candidates for vertices.
 
 In: a level of the pyramid. Out: saddles with sub-pixel positions, the directions of their four edges, and
-their contrast; `links` connects them. A vertex has four *ports*, the directions in which its edges leave it,
-numbered by growing angle (from u towards v) such that a dark sector follows ports 0 and 2 and a bright one
-ports 1 and 3.
+their contrast; `links` connects them. The directions in which the edges leave a vertex are its four *ports*.
+They are numbered by growing angle (from u towards v) such that a dark sector follows ports 0 and 2 and a
+bright one ports 1 and 3.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Insensitive, apart from _RADII: doubled, the rings reach beyond squares of 6 px, whose board is not found.
-_THRESHOLD = 5.0  # standard deviations of the noise, of the steepness of a saddle
-_BORDER = 4  # px, not searched
-_AROUND = 2  # px, within which a saddle is the steepest
-_BAND = 50_000  # pixels of a band that fits the processor's cache
+# Insensitive, except _RADII: doubled, the rings reach beyond squares of 6 px, and such a board is not found.
+_THRESHOLD = 5.0  # least steepness of a saddle, in standard deviations of the noise
+_BORDER = 4  # px at the image border that are not searched
+_AROUND = 2  # px; a saddle must be the steepest within this distance
+_BAND = 50_000  # pixels of a band, which fit into the processor's cache
 _RADII = (5.0, 3.0)  # px of the rings; the larger one is more accurate
-_RAYS = 32  # of a ring
+_RAYS = 32  # samples of a ring
 _MOST_KINK = np.radians(22)  # greatest angle between the two halves of a line through the vertex
 _MOST_DIFFERENT = np.radians(14)  # greatest angle between ports from the two rings
-_LEAST_CURVATURE = 3.0  # standard deviations of the noise, of the weaker principal curvature ...
-_LEAST_RATIO = 0.02  # ... and its ratio to the stronger one, which is 0 along a stripe
-_NARROWEST = np.radians(14)  # least angle between two lines
-_PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400  # saddles examined, at least examined, and kept; for time
+_LEAST_CURVATURE = 3.0  # least weaker principal curvature, in standard deviations of the noise ...
+_LEAST_RATIO = 0.02  # ... and its least ratio to the stronger one; the ratio is 0 on a stripe
+_NARROWEST = np.radians(14)  # least angle between the two lines
+# Saddles examined per megapixel, least number examined, and greatest number kept; these limit the time.
+_PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400
 
 
 @frozen_dataclass(eq=False)
@@ -42,7 +43,7 @@ class Saddles:
     ports : (N, 4) array [rad]
         Directions of the four edges; see the module.
     contrast : (N,) array [DN]
-        Bright minus dark sectors.
+        Mean of the bright minus mean of the dark sectors.
     """
 
     points: Array
@@ -55,13 +56,13 @@ class Saddles:
 
 
 def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Saddles:
-    """Find the crossings of edges in a level.
+    """Find saddle points at the crossings of edges in a level.
 
     Parameters
     ----------
     level : Level
     covered : (height, width) uint8 array, optional
-        Non-zero where not to search.
+        Non-zero pixels are not searched.
     """
     points = _steepest_pixels(level, covered)
     points = refine_saddles(level.image, points, 1.0, rounds=2)
@@ -73,8 +74,8 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     noise = level.noise
     rings = [_ring(interpolate(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
-    # A ring larger than the squares is wrong. Use it only where the smaller ring agrees, and the
-    # curvature where neither ring is reliable.
+    # The larger ring is wrong if it exceeds the squares: use it unless a good smaller ring disagrees. If the
+    # smaller ring disagrees with the curvature, use the curvature instead.
     good &= ~(good_small & (_differ(ports, ports_small) > _MOST_DIFFERENT))
     astray = _differ(ports_small, curved) > 2 * _MOST_DIFFERENT
     ports_small = np.where(astray[:, None], curved, ports_small)
@@ -93,7 +94,7 @@ def _ports_from_curvature(level: Level, points: Array) -> tuple[Array, NDArray[n
     rising, falling = np.maximum(middle + radius, 1e-9), np.maximum(radius - middle, 1e-9)
     weaker, stronger = np.minimum(rising, falling), np.maximum(rising, falling)
     sharp = (weaker > _LEAST_CURVATURE * level.noise) & (weaker > _LEAST_RATIO * stronger)
-    # The middle of the dark sectors is the direction of the negative principal curvature.
+    # The dark sectors are centred on the direction of the negative principal curvature.
     dark = 0.5 * np.arctan2(2 * uv, uu - vv) + np.pi / 2
     half = np.arctan(np.sqrt(falling / rising))
     ports = np.stack([dark - half, dark + half, dark - half + np.pi, dark + half + np.pi], axis=-1)
@@ -112,7 +113,7 @@ _NEXT = (np.arange(_RAYS) + 1) % _RAYS
 
 
 def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
-    """The pixels with the steepest saddles; (N, 2)."""
+    """(N, 2) pixels with the steepest saddles."""
     u, v, steepness = _peaks(level)
     if covered is not None:
         free = covered[v, u] == 0
@@ -126,7 +127,7 @@ def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
 
 
 def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Pixels u, v (N,) where the saddle is steepest within two pixels and above the noise; its steepness."""
+    """Pixels u, v (N,) where the steepness is a local maximum above the noise, and the steepness."""
     uu, uv, vv = level.curvature
     height, width = uv.shape
     least = np.float32((_THRESHOLD * level.noise) ** 2)
@@ -149,7 +150,7 @@ def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
 
 
 def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Ports, contrast, and whether it looks like a vertex, from the brightness (rays, N) [DN] on a ring."""
+    """Ports, contrast, and whether each looks like a vertex, from the brightness (rays, N) [DN] on rings."""
     count = profile.shape[1]
     ports, contrast = np.zeros((count, 4)), np.zeros(count)
     high, low = profile.max(axis=0), profile.min(axis=0)

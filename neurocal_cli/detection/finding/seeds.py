@@ -1,4 +1,4 @@
-"""Seeds of grids: blocks of 3 x 3 vertices linked by edges, or of 2 x 3 where there are none.
+"""Find seeds of grids: blocks of 3 x 3 linked vertices, or of 2 x 3 if there are none.
 
 In: linked saddles. Out: blocks of saddles, the most regular ones first, for `grids` to grow.
 """
@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array
 
 # Insensitive; tests/test_finding.py.
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
-_SECOND = 0.4  # ... and the weight of these differences themselves
+_SECOND = 0.4  # ... or greatest second difference times this weight
 
 
 def find_seeds_3x3(links: Links) -> Index:
@@ -23,7 +23,7 @@ def find_seeds_3x3(links: Links) -> Index:
     Returns
     -------
     members : (S, 3, 3) int array
-        Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle one, r along port 1.
+        Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle saddle and r along port 1.
     """
     centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
@@ -71,7 +71,7 @@ def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
 
 
 def _closed(links: Links) -> NDArray[np.bool_]:
-    """(N, 4) whether four links from port p lead around the square to port p + 1."""
+    """(N, 4) whether four links, starting at port p, lead around a square and back to port p + 1."""
     count = len(links.to)
     at = np.repeat(np.arange(count)[:, None], 4, axis=1)
     port = np.repeat(np.arange(4)[None], count, axis=0)
@@ -84,9 +84,9 @@ def _closed(links: Links) -> NDArray[np.bool_]:
 
 
 def _irregularity(grid: Array) -> Array:
-    """How far (S, 3, 3, 2) blocks are from a smooth map [squares]; (S,) array.
+    """(S,) deviation of (S, 3, 3, 2) blocks from a smooth map [squares].
 
-    Perspective and distortion make squares grow steadily, and alike in neighbouring rows.
+    Perspective and distortion change the size of squares steadily, and alike in neighbouring rows.
     """
     if not len(grid):
         return np.zeros(0)

@@ -1,11 +1,12 @@
-"""Searching for a board in a rectified view, in which a wide lens does not bend its lines.
+"""Search a board in a rectified view, without the distortion of a wide lens.
 
-The squares of a board near a wide lens bend, and change from one to the next, more than growth tolerates.
-Their links are found nevertheless, and determine the lens and the plane. In a frontal view of that plane
-lines are straight and squares are equal, so that growth finds the remaining vertices.
+Near a wide lens, the squares of a board are bent, and change from one to the next by more than `grow` allows.
+They are linked nevertheless, and an equidistant lens and a plane can be fitted to a group of linked saddles.
+In a view perpendicular to that plane, lines are straight and squares are equal, so growth finds the missing
+vertices.
 
-In: a level with its linked saddles, and the lattices already known. Out: the lattice of a linked group of
-saddles found in that view, in the level's pixels.
+In: a level with its linked saddles, and the lattices already known. Out: lattices found in such views, in the
+level's pixels.
 """
 
 from __future__ import annotations
@@ -28,30 +29,31 @@ from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles belong to the lattice, farther ones not to its next line
-_LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles of such a line
-_GROUPS = 3  # of linked saddles that are tried
+# Saddles at a distance between these [squares] from a lattice may be its next line: nearer ones are its own.
+_OWN, _BESIDE = 0.4, 2.0
+_LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles, of such a line
+_GROUPS = 3  # greatest number of linked groups that are tried
 _OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
-_OUTLIER = 0.3  # ... and greatest distance of a vertex that is not left out of it
-_ROUNDS = 3  # of leaving such vertices out
-_WIDE = 0.5  # rad; least angle from the axis at which a lens may have stopped the growth of a lattice
-_MORE = 1.1  # least ratio of a group to the known vertices in it, to be searched again
-_AROUND, _LEAST_AROUND = 0.75, 4.0  # of the group's extent, and squares, that the view shows around it
-_SQUARE = 24.0  # px; a square of the view ...
-_MOST_PIXELS = 1.4e6  # ... in a view of at most this size
-_LARGEST = 1.5  # px; farthest that a vertex moves when it is refined in the image
-_SIGMA = 0.15  # of a square's width; smoothing of derivatives, in steps of 0.25 px
+_OUTLIER = 0.3  # ... and least limit of the distance beyond which a vertex is an outlier
+_ROUNDS = 3  # of removing such outliers
+_WIDE = 0.5  # rad; least angle from the axis at which lens distortion may be why a lattice is unfinished
+_MORE = 1.1  # a group is searched again if it has this many times the known vertices in it
+_AROUND, _LEAST_AROUND = 0.75, 4.0  # margin of the view around the group: share of its extent, least squares
+_SQUARE = 24.0  # px; side of a square in the view ...
+_MOST_PIXELS = 1.4e6  # ... unless the view would be larger than this
+_LARGEST = 1.5  # px; greatest shift of a vertex when it is refined in the image
+_SIGMA = 0.15  # squares; smoothing of derivatives, in steps of 0.25 px
 
 
 @frozen_dataclass(eq=False)
 class PlaneView:
-    """A frontal view of a plane, and the lens through which the image shows it.
+    """A view perpendicular to a plane, sampled from the image through the fitted lens.
 
     Attributes
     ----------
     fit : WideFit
     square : float [px]
-        In the view.
+        Side of a square in the view.
     first : (2,) array [squares]
         Grid coordinates of the view's first pixel.
     size : (width, height) [px]
@@ -64,7 +66,7 @@ class PlaneView:
 
     @classmethod
     def of(cls, fit: WideFit, places: Array) -> PlaneView:
-        """A view of places (N, 2) of the plane and their surroundings."""
+        """Choose the view that shows places (N, 2) of the plane and their surroundings."""
         low, high = places.min(axis=0), places.max(axis=0)
         around = np.maximum(_AROUND * (high - low), _LEAST_AROUND)
         extent = high - low + 2 * around
@@ -73,11 +75,11 @@ class PlaneView:
         return cls(fit, square, low - around, (width, height))
 
     def back(self, points: Array) -> Array:
-        """Points (..., 2) of the view in the image [px]."""
+        """Map points (..., 2) of the view to the image [px]."""
         return self.fit.at(self.first + points / self.square)
 
     def seen(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The view, resampled from the image."""
+        """Sample the view from the image."""
         width, height = self.size
         v, u = np.mgrid[0:height, 0:width].astype(float)
         places = self.back(np.stack([u, v], axis=-1)).astype(np.float32)
@@ -86,7 +88,7 @@ class PlaneView:
 
 
 def any_left(links: Links, known: list[Lattice]) -> bool:
-    """Whether linked saddles belong to no lattice: a block of their own, or a line beside a lattice."""
+    """Whether linked saddles outside all lattices form a block, or a line beside a lattice."""
     saddles = links.saddles
     linked = (links.to >= 0).any(axis=1)
     blocks = np.zeros(len(saddles), dtype=bool)
@@ -108,23 +110,23 @@ def find_bent(
     unfinished: list[Lattice],
     search: Callable[[NDArray[np.float32]], list[Lattice]],
 ) -> list[Lattice]:
-    """Search again where more saddles are linked than lattices hold, and around unfinished lattices.
+    """Search again around groups of linked saddles that exceed the lattices, and around unfinished lattices.
 
     Parameters
     ----------
     level : Level
     links : Links
-        Of the whole level, those of known lattices too.
+        Of the whole level, including known lattices.
     known : list of Lattice
     unfinished : list of Lattice
-        Those known ones that are smaller than the board.
+        Known lattices that a wide lens may have kept from growing.
     search : function of an image
-        Finds its lattices.
+        Finds the lattices of an image.
 
     Returns
     -------
     lattices : list of Lattice
-        Each larger than the known ones at the same place.
+        Each has more vertices than the known ones at the same place.
     """
     found: list[Lattice] = []
     groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]
@@ -146,14 +148,14 @@ def find_bent(
 
 
 def _groups(links: Links) -> Iterator[tuple[Index, Index]]:
-    """Places (N, 2) and saddles (N,) of linked groups of at least 3 x 3, from different starting vertices."""
+    """Places (N, 2) and saddles (N,) of linked groups of at least 9, each from a different middle saddle."""
     middles = whole_blocks(links)
     covered = np.zeros(len(links.to), dtype=bool)
     for _ in range(_GROUPS):
         free = middles[~covered[middles]]
         if not len(free):
             return
-        # The strongest vertex is the least likely to be clutter.
+        # The vertex with the highest contrast is the least likely to be clutter.
         middle = int(free[np.argmax(links.saddles.contrast[free])])
         places, members = linked_group(links, middle)
         covered[members] = covered[middle] = True
@@ -169,7 +171,7 @@ def _shared(lattice: Lattice, pixels: Array) -> int:
 
 
 def _fitted(places: Array, pixels: Array, level: Level) -> WideFit | None:
-    """The lens fitted to most vertices of a group; None if they do not lie on a plane seen through a lens."""
+    """Fit lens and plane robustly to the vertices of a group; None if they do not fit."""
     height, width = level.image.shape
     kept = np.ones(len(places), dtype=bool)
     for _ in range(_ROUNDS):
@@ -192,7 +194,7 @@ def _widths(fit: WideFit, places: Array) -> Array:
 
 
 def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | None:
-    """A lattice of the view in the level, without vertices outside it."""
+    """Map a lattice of the view to the level, without vertices outside the level."""
     pixels = view.back(lattice.pixels)
     room = np.array(level.image.shape[::-1]) - 2
     with np.errstate(invalid="ignore"):
@@ -204,7 +206,7 @@ def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | No
 
 
 def refined_locally(level: Level, lattice: Lattice, most: float) -> Lattice:
-    """The lattice with its vertices at saddle points within `most` px, smoothed for squares of any size."""
+    """Move vertices to saddle points within `most` px, with smoothing by the local width of the squares."""
     row, col, predicted = lattice.predicted
     sigma = np.clip(np.round(_SIGMA * predicted.width / 0.25) * 0.25, 0.75, 2.0)
     pixels = lattice.pixels.copy()

@@ -1,6 +1,6 @@
-"""Stretching the image of a very oblique board across its narrow squares.
+"""Stretch the image of a very oblique board across its narrow squares.
 
-In: the saddles of a level without grids. Out: a stretched part of the level, in which to search again.
+In: the saddles of a level without grids. Out: a stretched part of the level, which is searched again.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# For boards seen almost from the side, as in tests/test_finding.py. The limits have not been varied on
-# images that reach this step.
+# For boards seen almost from the side, as in tests/test_finding.py. The limits have not been varied on images
+# that reach this step.
 _FACTOR = 2.0  # of the stretch
-_ANISOTROPY = 1.8  # least ratio of the gradients across and along the squares
-_AROUND = 12  # px; beyond the outermost saddles
-_STRAY = 3.0  # times the median distance from the middle; farther saddles are ignored
-_LARGEST = 0.25  # share of the image that the saddles may cover
+_ANISOTROPY = 1.8  # least ratio of the rms gradients across and along the squares
+_AROUND = 12  # px; margin around the outermost saddles
+_STRAY = 3.0  # median distances from the middle; farther saddles are ignored
+_LARGEST = 0.25  # greatest share of the image that the saddles may cover
 
 
 @frozen_dataclass(eq=False)
@@ -28,16 +28,16 @@ class Stretched:
     Attributes
     ----------
     level : Level
-        The part; coordinates of its own.
+        The part, with its own pixel coordinates.
     forth : (2, 3) array
-        From pixels of the original to those of the part.
+        Affine map from pixels of the original to those of the part.
     """
 
     level: Level
     forth: Array
 
     def back(self, points: Array) -> Array:
-        """Points (..., 2) of the part in the original [px]."""
+        """Map points (..., 2) of the part to the original [px]."""
         return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
 
 
@@ -52,7 +52,7 @@ def stretch(level: Level, saddles: Array) -> Stretched | None:
     Returns
     -------
     part : Stretched or None
-        None where saddles cover too much of the image, or edges have no main direction.
+        None if the saddles cover too much of the image, or the edges have no main direction.
     """
     height, width = level.image.shape
     away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)

@@ -1,6 +1,6 @@
-"""Sub-pixel positions of saddle points, by Newton's method on smoothed derivatives.
+"""Refine saddle points to sub-pixel accuracy by Newton's method on smoothed derivatives.
 
-In: an image and points about a pixel from saddle points. Out: the saddle points, NaN where there is none.
+In: an image and points about a pixel from saddle points. Out: the saddle points, NaN if there is none.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
 
 @lru_cache(maxsize=32)
 def _derivatives(sigma: float) -> tuple[int, Array]:
-    """Half width of a window, and the weights of its pixels for u, v, uu, uv, vv; (pixels, 5)."""
+    """Half width of the window, and weights (pixels, 5) for the derivatives u, v, uu, uv, vv."""
     half = int(np.ceil(2.5 * sigma))
     d = np.arange(-half, half + 1.0)
     g = np.exp(-0.5 * (d / sigma) ** 2)
@@ -34,13 +34,13 @@ def _derivatives(sigma: float) -> tuple[int, Array]:
 
 @lru_cache(maxsize=32)
 def _window(half: int, width: int) -> NDArray[np.intp]:
-    """From a pixel to those of a window around it, in the flat image of a width."""
+    """Flat index offsets from a pixel to the window around it, in an image of a width."""
     offset = np.arange(-half, half + 1)
     return (offset[:, None] * width + offset).ravel()
 
 
 def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
-    """Move points to the saddle points next to them.
+    """Move points to the nearest saddle points.
 
     Parameters
     ----------
@@ -54,20 +54,20 @@ def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) ->
     Returns
     -------
     points : (N, 2) array [px]
-        NaN where there is no saddle point or the window leaves the image.
+        NaN if there is no saddle point or the window leaves the image.
     """
     half, _ = _derivatives(sigma)
     height, width = image.shape
     if min(height, width) < 2 * half + 1:
         return np.full(start.shape, np.nan)
-    # Coordinates in rows: sums over many short rows take longer.
+    # Coordinates are kept in rows, because sums over many short rows are slower.
     given = start.T
     low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
     padded = (given >= low) & (given <= high)
     good = padded[0] & padded[1]
     centre = np.rint(np.where(good, given, low))
     step, saddle = _newton(image, centre, sigma)
-    # Derivatives are those of the nearest pixel: only points that moved to another one go on.
+    # Derivatives are taken at the nearest pixel, so only points that moved to another pixel continue.
     for _ in range(rounds - 1):
         ahead = np.minimum(np.maximum(np.rint(centre + step), low), high)
         moved = np.flatnonzero((ahead[0] != centre[0]) | (ahead[1] != centre[1]))
@@ -81,7 +81,7 @@ def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) ->
 
 
 def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Newton steps (2, N) from pixels (2, N) to a zero of the gradient, and whether it is a saddle."""
+    """Newton steps (2, N) from pixels (2, N) to a zero of the gradient, and whether each is a saddle."""
     width = image.shape[1]
     half, kernels = _derivatives(sigma)
     place = (centre[1] * width + centre[0]).astype(np.intp)

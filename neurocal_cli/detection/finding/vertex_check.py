@@ -1,7 +1,7 @@
-"""Whether the image around a point looks like a vertex.
+"""Check whether the image around a point looks like a vertex.
 
 In: points, the steps of the grid there, and the expected colours. Out: contrast, evenness, and a decision for
-each point, from twelve samples: inside the four squares and on both sides of the four edges.
+each point, from twelve samples: one in each of the four squares, and one on each side of the four edges.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from neurocal_cli.detection.finding.predict import PredictedVertices
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Insensitive, apart from _INTO and _ALONG: doubled, samples reach the next squares, and 66 of 279 points of
-# three photographs are lost.
-_INTO = 0.3  # squares; from the vertex into the four squares around it
-_ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
-_LEAST_EVENNESS = 0.6  # a visible vertex has 0.9 and more, even if blurred or noisy
-_LEAST_EDGE = 0.3  # of the contrast, across every edge
+# Insensitive, except _INTO and _ALONG: doubled, samples reach the next squares, and 66 of 279 points of three
+# photographs are lost.
+_INTO = 0.3  # squares; offset of the samples in the four squares, along both axes
+_ALONG, _ASIDE = 0.36, 0.16  # squares; offsets of the other samples along and across the edges
+_LEAST_EVENNESS = 0.6  # a visible vertex has at least 0.9, even if blurred or noisy
+_LEAST_EDGE = 0.3  # least step across every edge, relative to the contrast
 
 
 @frozen_dataclass(eq=False)
 class VertexCheck:
-    """Results of the samples around points.
+    """Result of the samples around points.
 
     Attributes
     ----------
     contrast : (N,) array [DN]
-        Bright minus dark squares around the vertex; negative when their colours are the other way.
+        Mean of the bright minus mean of the dark squares; negative if the colours are swapped.
     evenness : (N,) array
         Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
     is_vertex : (N,) bool array
-        Two bright and two dark squares, and an edge between every two.
+        Whether there are two bright and two dark squares, and an edge between each two neighbours.
     """
 
     contrast: Array
@@ -42,17 +42,19 @@ class VertexCheck:
 
 
 def _offsets() -> Array:
-    """(12, 2) places in squares: inside the four squares, then beside the four edges."""
+    """(12, 2) sample positions [squares]: in the four squares, then beside the four edges."""
     i, a, s = _INTO, _ALONG, _ASIDE
-    inside = [(i, i), (-i, i), (-i, -i), (i, -i)]  # colours alternate, the first dark
+    inside = [(i, i), (-i, i), (-i, -i), (i, -i)]  # colours alternate, beginning with dark
     beside = [(a, s), (-s, a), (-a, -s), (s, -a)]  # on the dark side of each edge
     across = [(a, -s), (s, a), (-a, s), (-s, -a)]
     return np.array(inside + beside + across)
 
 
 _OFFSETS = _offsets()
-_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)  # mean of bright minus mean of dark squares
-_STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])  # at edges
+# Weights of the samples for the contrast and for the steps across the edges. The samples' signs are changed
+# first, so that dark squares have the larger values.
+_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)
+_STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])
 
 
 def check_vertices(level: Level, points: Array, predicted: PredictedVertices, dark: Array) -> VertexCheck:
@@ -65,7 +67,7 @@ def check_vertices(level: Level, points: Array, predicted: PredictedVertices, da
     predicted : PredictedVertices
         The steps of the grid at the points.
     dark : (N,) array of +-1
-        +1 where the square towards growing c and r is dark.
+        +1 if the square towards growing c and r is dark.
     """
     places = predicted.around(_OFFSETS, points)
     value = interpolate(level.smooth, places)
@@ -78,6 +80,6 @@ def check_vertices(level: Level, points: Array, predicted: PredictedVertices, da
     is_vertex &= (value @ _STEPS).min(axis=1) > _LEAST_EDGE * contrast
     size = np.array(level.image.shape[::-1])
     if places.min() <= -1 or (places.max(axis=(0, 1)) >= size).any():
-        # Samples beyond the border only repeat it.
+        # Samples beyond the border only repeat its pixels.
         is_vertex &= ((places > -1) & (places < size)).all(axis=(1, 2))
     return VertexCheck(contrast, flat, is_vertex)

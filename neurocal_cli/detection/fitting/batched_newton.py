@@ -1,12 +1,12 @@
-"""Damped Gauss-Newton on thousands of fits of five to seven values at once, in float32.
+"""Damped Gauss-Newton for thousands of fits of five to seven values at once, in float32.
 
-This is not the package's least-squares core, because its problems are different: one image has hundreds of
-independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
-memory traffic, and fits that have not converged with the others go on by themselves. The small
-systems of normal equations are solved in float64.
+This does not use the package's least-squares core, because the problems are different: one image has hundreds
+of independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
+memory traffic, and fits that have not converged with the others continue separately. The small normal
+equations are solved in float64.
 
-In: pixels, their model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information
-and chi2.
+In: pixels, their model with derivatives, initial values, a prior. Out: `BatchFit` with values, Fisher
+information and chi2.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 Single = NDArray[np.float32]
-Part = NDArray[np.intp] | slice  # of the fits
+Part = NDArray[np.intp] | slice  # indices of some of the fits
 
-# The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
+# Positions of the last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
-LEAST_BLUR = 0.2905  # px; a pixel's box alone has sqrt(1/12) = 0.2887
+LEAST_BLUR = 0.2905  # px; the pixel's box alone has sqrt(1/12) = 0.2887
 # Insensitive.
-_MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step is below so many standard deviations
-_MORE_STEPS = 20  # at most, of fits that have not converged with the others
+# The iteration ends when this share of the fits has a last step below so many standard deviations.
+_MOST, _CONVERGED = 0.9, 0.5
+_MORE_STEPS = 20  # greatest number, for fits that have not converged with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
 _FLOAT32 = 1e-6  # relative error of float32 sums
 _NOTHING = 1e-9  # information that keeps fits without pixels regular
@@ -38,16 +39,16 @@ _NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 @frozen_dataclass(eq=False)
 class FitPixels:
-    """The pixels of fits, (E, N) float32 arrays.
+    """Pixels of fits, (E, N) float32 arrays.
 
     Attributes
     ----------
     value : array [DN]
-        Minus the slope of the mean level.
+        Without the gradient of the mean level.
     gain : array
-        Half contrast there, relative to that of the fit's middle.
+        Half contrast at the pixel, relative to that at the fit's middle.
     Q : array
-        The effect of other lines on the light; see the models.
+        Effect of other lines on the light; see the models.
     root : array [1/DN]
         Inverse standard deviation of the noise; 0 for pixels that are not used.
     beyond : (E,) array
@@ -61,11 +62,11 @@ class FitPixels:
     beyond: Array
 
     def part(self: Pixels, which: Part) -> Pixels:
-        """The pixels of some fits."""
+        """Select the pixels of some fits."""
         return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
 
     def weighed(self: Pixels, weight: Single) -> Pixels:
-        """The same pixels with other weights [1/DN^2]; unused ones stay unused."""
+        """Set the weights [1/DN^2] of the pixels; unused pixels stay unused."""
         root = np.sqrt(weight)
         root *= self.root > 0
         return replace(self, root=root)
@@ -76,7 +77,7 @@ Pixels = TypeVar("Pixels", bound=FitPixels)
 
 @frozen_dataclass(eq=False)
 class LevelPrior:
-    """Gaussian prior of mean level, half contrast and blur.
+    """Gaussian prior for mean level, half contrast and blur.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class LevelPrior:
     precision: Array
 
     def part(self, which: NDArray[np.intp]) -> LevelPrior:
-        """The prior of some fits."""
+        """Select the priors of some fits."""
         return LevelPrior(self.mean[which], self.precision[which])
 
 
@@ -103,8 +104,8 @@ class ProfileShape:
     nonlinearity : (RESPONSE_TERMS,) array
         b_0, b_1, ... of the response, the same for all edges.
     half : (E, 2) array or None [px]
-        Half widths of the pixel's box along the edges' normals (see `pixel_box`), for edges so sharp that
-        they matter; (V, 2, 2) of both lines through vertices.
+        Half widths of the pixel's box along the edges' normals (see `pixel_box`), if edges are so sharp that
+        they matter; (V, 2, 2) for both lines through vertices.
     """
 
     tails: Array
@@ -112,13 +113,13 @@ class ProfileShape:
     half: Array | None = None
 
     def part(self, which: Part) -> ProfileShape:
-        """The part of some fits."""
+        """Select the shapes of some fits."""
         return ProfileShape(
             self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
         )
 
     def elsewhere(self, half: Array) -> ProfileShape:
-        """The shape for other fits of the same image, with half widths of the pixel's box if they matter."""
+        """Shape for other fits of the same image, with these half widths of the pixel's box if it is used."""
         tails = np.tile(self.tails.mean(axis=0), (len(half), 1))
         return ProfileShape(tails, self.nonlinearity, None if self.half is None else half)
 
@@ -130,7 +131,7 @@ class Linearised:
     Attributes
     ----------
     rows : (E, R, N) array
-        The residual and the model's derivatives by the P values, in standard deviations of the pixels' noise;
+        The residual and the model's derivatives by the P values, in standard deviations of the pixel noise;
         see `rows_for`.
     z, x : (E, N) arrays
         Distance from the edge in sigma, and light between the levels.
@@ -142,26 +143,26 @@ class Linearised:
 
     @property
     def residual(self) -> Single:
-        """(E, N) pixels less the model, in standard deviations of the noise."""
+        """(E, N) pixels minus the model, in standard deviations of the noise."""
         return self.rows[:, 0]
 
     def products(self, count: int) -> Array:
-        """(E, P + 1, P + 1) sums over pixels for P values: chi2, the gradient beside it, the information."""
+        """(E, P + 1, P + 1) sums of products over pixels: chi2 first, then gradient and information."""
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
 
     def part(self, which: NDArray[np.intp]) -> Linearised:
-        """The part of some fits."""
+        """Select some fits."""
         return Linearised(self.rows[which], self.z[which], self.x[which])
 
     def put(self, which: NDArray[np.intp], part: Linearised) -> None:
-        """Replace the part of some fits, in place."""
+        """Replace some fits in place."""
         self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
 
 
 def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) -> NDArray[np.floating]:
-    """An array (E, R, N) for the rows of a model, R padded with zeros to a multiple of eight.
+    """Allocate an array (E, R, N) for the rows of a model, R padded with zeros to a multiple of eight.
 
-    Products of six rows take twice as long as those of eight in OpenBLAS.
+    In OpenBLAS, products of six rows take twice as long as those of eight.
     """
     used = 1 + values
     rows = np.empty((count, -(-used // 8) * 8, pixels), dtype=kind)
@@ -171,12 +172,12 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
 
 @frozen_dataclass(eq=False)
 class BatchFit:
-    """Fitted values.
+    """Result of many fits.
 
     Attributes
     ----------
     values : (E, P) array
-        Coordinates first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
+        Offsets and tilts first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
     information : (E, P, P) array
         Fisher information of the pixels, without the prior.
     prior : LevelPrior
@@ -186,7 +187,7 @@ class BatchFit:
     pixels : FitPixels
     shape : ProfileShape
     step : (E,) array
-        The last step, in standard deviations.
+        Length of the last step, in standard deviations.
     linear : Linearised
         The model at the values.
     """
@@ -203,11 +204,11 @@ class BatchFit:
 
     @cached_property
     def covariance(self) -> Array:
-        """(E, P, P) of the values."""
+        """(E, P, P) covariance of the values."""
         total = self.information.copy()
         total[:, MEAN:, MEAN:] += self.prior.precision
         diagonal = np.einsum("eii->ei", total)  # a view
-        # float32 sums may be slightly indefinite where values are strongly correlated.
+        # float32 sums may be slightly indefinite if values are strongly correlated.
         diagonal *= 1 + _FLOAT32
         diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
@@ -218,23 +219,23 @@ class BatchFit:
         return np.count_nonzero(self.pixels.root, axis=1)
 
     @property
-    def roughness(self) -> Array:
-        """(E,) chi2 of each pixel."""
+    def chi2_per_pixel(self) -> Array:
+        """(E,) chi2 per pixel."""
         return self.chi2 / np.maximum(self.count, 1)
 
     @property
     def variance_growth(self) -> Array:
-        """(E,) factor on variances for fits whose last step was longer than a standard deviation."""
+        """(E,) factor on variances; above 1 for fits whose last step exceeded a standard deviation."""
         return np.where(self.step > 1, 1 + self.step**2, 1.0)
 
     def scaled(self, noise: float) -> BatchFit:
-        """The same fits for a variance of the pixels that is larger by a factor."""
+        """Rescale the fits to a pixel variance that is larger by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
 
     def continued(
         self, shape: ProfileShape, steps: int, more: int = _MORE_STEPS, weight: Single | None = None
     ) -> BatchFit:
-        """Further steps from these values, with another shape, and with other weights [1/DN^2] if given."""
+        """Continue from these values with another shape, and with other weights [1/DN^2] if given."""
         pixels = self.pixels if weight is None else self.pixels.weighed(weight)
         return fit_batch(self.model, pixels, self.values, self.prior, shape, steps, more)
 
@@ -248,18 +249,18 @@ def fit_batch(
     steps: int,
     more: int = _MORE_STEPS,
 ) -> BatchFit:
-    """Run all fits together, then continue those that have not converged separately.
+    """Run all fits together, and then continue those that have not converged.
 
     Parameters
     ----------
     model : function of pixels, values and shape
     pixels : FitPixels
     start : (E, P) array
-        Values to begin with.
+        Initial values.
     prior : LevelPrior
     shape : ProfileShape
     steps, more : int
-        Greatest number, of all fits and of those that have not converged.
+        Greatest numbers of steps of all fits together, and of those that have not converged.
     """
 
     def model_of(part: Part) -> Callable[[Array], Linearised]:
@@ -268,7 +269,7 @@ def fit_batch(
 
     whole = model_of(slice(None))
     state = _State.of(whole, start, prior)
-    # A few fits that do not converge must not delay the others.
+    # A few fits that cannot converge must not delay the others.
     state.iterate(whole, prior, steps, _MOST)
     unconverged = np.flatnonzero(state.size >= _CONVERGED)
     if len(unconverged) and more:
@@ -281,7 +282,7 @@ def fit_batch(
 
 @dataclass(eq=False)
 class _State:
-    """Fits between steps: values, model there, its products, cost, damping, and size of the last step."""
+    """State of fits between steps: values, linearised model, products, cost, damping, size of last step."""
 
     values: Array
     linear: Linearised
@@ -292,13 +293,13 @@ class _State:
 
     @classmethod
     def of(cls, model: Callable[[Array], Linearised], values: Array, prior: LevelPrior) -> _State:
-        """Fits before their first step, at values (n, P)."""
+        """Initial state of fits at values (n, P)."""
         linear = model(values)
         products, none = linear.products(values.shape[1]), np.zeros(len(values))
         return cls(values, linear, products, _cost(products, values, prior), none, none)
 
     def part(self, which: NDArray[np.intp]) -> _State:
-        """Some of the fits."""
+        """Select some fits."""
         return _State(
             self.values[which],
             self.linear.part(which),
@@ -339,7 +340,7 @@ class _State:
                 break
 
     def _step(self, prior: LevelPrior) -> Array:
-        """The next step; sets `size` to the length of the undamped one."""
+        """Compute the next step, and set `size` to the length of the undamped step."""
         information, gradient = self.products[:, 1:, 1:].copy(), self.products[:, 1:, 0].copy()
         pull = self.values[:, MEAN:] - prior.mean
         gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
@@ -349,7 +350,7 @@ class _State:
         step = _solved(information, gradient)
         sharpest = (self.values[:, BLUR] <= LEAST_BLUR) & (step[:, BLUR] < 0)
         if sharpest.any():
-            # A blur at its limit is held there while the other values are solved for.
+            # A blur at its lower limit is held fixed while the other values are solved for.
             information[sharpest, BLUR] = 0.0
             information[sharpest, :, BLUR] = 0.0
             gradient[sharpest, BLUR] = 0.0
@@ -373,7 +374,7 @@ def _solved(information: Array, gradient: Array) -> Array:
 
 
 def _moved(values: Array, step: Array) -> Array:
-    """Values after a step that is limited to where the model is nearly linear."""
+    """Values after a step, limited to the range in which the model is nearly linear."""
     sigma = values[:, BLUR]
     most = sigma[:, None]
     moved = values + step

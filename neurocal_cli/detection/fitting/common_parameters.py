@@ -1,6 +1,6 @@
-"""Parameters that all edges of a board have in common: pixel noise, profile shape, blur, levels.
+"""Estimate the common parameters of a board's edges: pixel noise, profile shape, blur, levels.
 
-In: the fits of all edges. Out: their common parameters, as weights, shape and priors for the next fits.
+In: the fits of all edges. Out: weights, profile shape and priors for the next fits.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
+# Insensitive, except _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
 _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level
-_LEAST_SHARE = 0.3  # of the largest noise; clipped pixels seem to have less
-_ROUND = 0.5  # relative deviation of the squared blur at which an edge counts half ...
-_ROUND_EDGES = 1.0  # ... and the weight, in edges, of the prior that blur is the same in all directions
-_FIELD_STEPS, _FIELD_SPREAD = 5, 0.25  # reweighted fits; log sigma at whose deviation an edge counts half
-_BLUR_SPREAD = 0.03  # least relative deviation of an edge's blur from the board's
-_ENOUGH = 10000  # pixels that are enough to estimate the profile's shape
-# Prior standard deviations of tails and response: they matter where blur and contrast have the same effect,
-# and are weak against ten thousand pixels.
+_LEAST_SHARE = 0.3  # least noise variance relative to the largest one; clipped pixels seem to have less noise
+_ROUND = 0.5  # relative deviation of the squared blur at which an edge has half the weight ...
+_ROUND_EDGES = 1.0  # ... and weight, in edges, of the prior that blur is isotropic
+_FIELD_STEPS, _FIELD_SPREAD = 5, 0.25  # reweighted fits; deviation of log sigma at which the weight is half
+_BLUR_SPREAD = 0.03  # least relative standard deviation of an edge's blur from the board's
+_ENOUGH = 10000  # pixels, enough to estimate the profile's shape
+# Prior standard deviations of tails and response. They matter if blur and contrast have the same effect, and
+# are weak compared with ten thousand pixels.
 _TAILS, _RESPONSE = 0.01, 0.06
 _RIDGE = 1e-5
-_LEAST_SPREAD = 0.0002  # of the levels' variance, in variances of the noise
+_LEAST_SPREAD = 0.0002  # least prior variance of the levels, in variances of the noise
 _TINY = np.float32(1e-30)
 
 
 @frozen_dataclass
 class PixelNoise:
-    """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
+    """Noise variance of the pixels [DN^2] on the dark side, at the edge, and on the light side."""
 
     dark: float
     edge: float
@@ -62,13 +62,13 @@ class PixelNoise:
 
     @classmethod
     def of(cls, fit: BatchFit, floor: float) -> PixelNoise:
-        """From the residuals of fits.
+        """Estimate the noise from the residuals of fits.
 
         Parameters
         ----------
         fit : BatchFit
         floor : float [DN^2]
-            Least variance, by rounding.
+            Least variance, that of rounding.
         """
         x, root = fit.linear.x, fit.pixels.root
         used = root > 0
@@ -84,11 +84,11 @@ class PixelNoise:
         return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
 
     def times(self, factor: float) -> PixelNoise:
-        """The noise times a factor."""
+        """Multiply the variances by a factor."""
         return PixelNoise(factor * self.dark, factor * self.edge, factor * self.light)
 
     def weights(self, x: Single) -> Single:
-        """Inverse variances [1/DN^2] of pixels at a light x between the levels."""
+        """Inverse variances [1/DN^2] of pixels with light x between the levels."""
         variance = np.minimum(np.maximum(x, 0), 1) * np.float32(self.light - self.edge)
         variance += np.maximum(np.minimum(x, 0), -1) * np.float32(self.edge - self.dark)
         variance += np.float32(self.edge)
@@ -98,7 +98,7 @@ class PixelNoise:
 def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     """Improve the shape of the profile by linear least squares on the residuals of all fits.
 
-    Shift, blur and levels are unknowns too, because the fits have absorbed part of the shape in them.
+    Shift, blur and levels are unknowns, too, because they have absorbed a part of the shape.
 
     Parameters
     ----------
@@ -106,11 +106,11 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     good : (E,) bool array
         Edges to use.
     """
-    # A part of the pixels is enough for a dozen numbers.
+    # A part of the pixels is enough for a dozen unknowns.
     data, shape = fit.pixels, fit.shape
     step = max(1, int(fit.count[good].sum()) // _ENOUGH)
     edges, (_, width, length) = np.flatnonzero(good)[:, None], fit.linear.rows.shape
-    # Each edge with another offset, or all pixels would lie at the same distances from the edges.
+    # Each edge starts at another pixel; otherwise all samples would lie at the same distances from the edges.
     some = np.arange(0, length - step + 1, step) + 7 * edges % step
     place, first = edges * length + some, edges * (width * length) + some
     z, x, Q, root, scale = (
@@ -120,7 +120,7 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     scale *= root
     scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
     steep = scale * Q if not shape.nonlinearity.any() else response(x, shape.nonlinearity)[1] * Q * scale
-    # One product for each edge: these are too small for threads, whose start takes longer.
+    # One product per edge is too small for BLAS to start threads, which would take longer.
     columns = rows_for(len(z), RESPONSE_TERMS + 6, z.shape[1], z.dtype)
     others, tails, bends = np.split(columns[:, : RESPONSE_TERMS + 7], [5, 7], axis=1)
     tail_terms(z, density, out=tails)
@@ -131,11 +131,11 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     np.multiply(x, scale, out=others[:, 3])
     others[:, 4] = root
     products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
-    # The residual is the first row, the unknowns follow; the shape comes last.
+    # The residual is the first row; the unknowns follow, with those of the shape last.
     rest = slice(1, RESPONSE_TERMS + 7)
     normal, right = products[rest, rest], products[rest, 0]
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
-    normal[np.diag_indices_from(normal)] += _TINY  # no edge may be good
+    normal[np.diag_indices_from(normal)] += _TINY  # in case no edge is good
     # Blur, contrast, tails and the odd terms of the response are strongly correlated.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _RESPONSE)]) ** -2
     known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
@@ -147,14 +147,14 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
 
 @frozen_dataclass(eq=False)
 class BoardBlur:
-    """Blur of all edges of a board: ``sigma^2 = n^T S n`` for an edge with the normal n.
+    """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n.
 
     Attributes
     ----------
     matrix : (2, 2) array [px^2]
-        S: a multiple of the identity without motion blur and astigmatism.
+        S; a multiple of the identity if there is no motion blur and no astigmatism.
     spread : float [px^2]
-        Variance of the blur of single edges around that, without the variance of the fits.
+        Variance of the blur of single edges around it, without the variance of the fits.
     """
 
     matrix: Array
@@ -162,13 +162,13 @@ class BoardBlur:
 
     @classmethod
     def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
-        """From the fits of edges with normals (E, 2), as far as they are good."""
+        """Estimate the blur from the good fits of edges with normals (E, 2)."""
         if not good.any():
             good = np.ones_like(good)
         sigma, (n_u, n_v) = fit.values[good, BLUR], normal[good].T
         usual = upper_median(sigma)
         terms = np.stack([n_u * n_u, 2 * n_u * n_v, n_v * n_v])
-        # Robust against single edges, and isotropic unless many edges disagree.
+        # The weights make it robust against single edges, the prior isotropic unless many edges disagree.
         rest = sigma**2 - usual**2
         weight = 1 / (1 + (rest / (_ROUND * usual**2)) ** 2)
         normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_EDGES
@@ -186,7 +186,7 @@ class BoardBlur:
 
 @frozen_dataclass(eq=False)
 class FieldBlur:
-    """Blur that grows towards the rim of a wide lens: log sigma by place and direction.
+    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction.
 
     Attributes
     ----------
@@ -195,7 +195,7 @@ class FieldBlur:
     terms : (8,) array
         Coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a.
     relative : float
-        Variance of the logarithm around that, without the variance of the fits.
+        Variance of log sigma of single edges around it, without the variance of the fits.
     """
 
     frame: Frame
@@ -204,7 +204,7 @@ class FieldBlur:
 
     @classmethod
     def of(cls, fit: BatchFit, lines: Lines, good: NDArray[np.bool_], frame: Frame) -> FieldBlur:
-        """From the fits of edges, as far as they are good."""
+        """Estimate the blur from the good fits of edges."""
         if not good.any():
             good = np.ones_like(good)
         usual = upper_median(fit.values[good, BLUR])
@@ -213,7 +213,7 @@ class FieldBlur:
         terms = np.zeros(some.shape[1])
         for _ in range(_FIELD_STEPS):
             weight = 1 / (1 + ((log - some @ terms) / _FIELD_SPREAD) ** 2)
-            # Constant unless many edges disagree.
+            # The prior makes it constant unless many edges disagree.
             normal = (some.T * weight) @ some + np.eye(len(terms)) * _ROUND_EDGES
             terms = np.linalg.solve(normal, some.T @ (weight * log))
         scatter = upper_median((log - some @ terms) ** 2) / CHI2_MEDIAN
@@ -237,7 +237,7 @@ def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
 def level_prior(
     shading: Shading, place: Array, sigma: Array, blur_spread: Array | float, noise: float
 ) -> LevelPrior:
-    """Prior of the levels and the blur of single edges from those of the whole board.
+    """Prior for the levels and the blur of single edges from those of the whole board.
 
     Parameters
     ----------
@@ -246,14 +246,14 @@ def level_prior(
     sigma : (E,) array [px]
         Blur.
     blur_spread : float or (E,) array [px^2]
-        Variance of the blur of single edges around that.
+        Variance of the blur of single edges around it.
     noise : float [DN^2]
         Variance of a pixel.
     """
     mean, contrast = shading.at(place)
     low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
     precision = np.zeros((len(place), 3, 3))
-    # Of A = (light + dark) / 2 and B = (light - dark) / 2, from those of dark and light.
+    # Precisions of A = (light + dark) / 2 and B = (light - dark) / 2 from those of dark and light.
     precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
     precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
     precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)

@@ -1,12 +1,12 @@
-"""Model of straight edges, or edges of known curvature, for maximum-likelihood fits to all their pixels.
+"""Model of edges of known curvature, for maximum-likelihood fits to all their pixels.
 
-With (s, d) the coordinates of `Lines` and z = (d - offset - tilt s / (half length)) / sigma, the light around
-an edge is
+With (s, d) the coordinates of `Lines` and z = (d - offset - tilt s / (half length)) / sigma, the intensity
+around an edge is
 
     I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R
 
-A and B are mean level and half contrast, with fixed slopes; E and F are `edge_profile.profile` and
-`response`; Q and R, of `edge_pixels`, are the effect of other lines.
+A and B are mean level and half contrast, with fixed gradients. E and F are `edge_profile.profile` and
+`response`. Q and R, from `edge_pixels`, are the effect of other lines.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
-    """Offset, slope and blur of edges in closed form, for an edge anywhere in its strip.
+    """Estimate offset, slope and blur of edges in closed form, for an edge anywhere in its strip.
 
     With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and that of 1 - e^2 is
-    4 sigma / sqrt(pi) over the width. Inaccurate, but needs no start.
+    4 sigma / sqrt(pi) over the width. The estimate is inaccurate, but needs no initial value.
 
     Parameters
     ----------
@@ -56,13 +56,13 @@ def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> 
 
 
 def light_at(data: EdgePixels, values: Array) -> Single:
-    """The light x (E, N) between the levels, approximately, for weights that vary slowly with it."""
+    """Approximate the light x (E, N) between the levels, for the weights, which vary slowly with it."""
     offset, sigma = (values[:, k, None].astype(np.float32) for k in (OFFSET, BLUR))
     return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
 
 
 def edge_model(data: EdgePixels, values: Array, shape: ProfileShape) -> Linearised:
-    """The light around edges with some values, and its derivatives."""
+    """Intensity around edges with given values, and its derivatives."""
     offset, tilt, mean, contrast, sigma = np.ascontiguousarray(values.T, data.value.dtype)[:, :, None]
     z = data.d - offset
     z -= tilt * data.lever

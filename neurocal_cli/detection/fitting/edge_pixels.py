@@ -1,9 +1,9 @@
-"""The pixels of the edge fits: how far across the edge, how near to other lines, how many, and their light.
+"""Gather the pixels of the edge fits, with the effect of other lines on their light.
 
-Other lines change the light of an edge by the factor Q, a product of erf(t), with t the distances in sigma
+Other lines change the light of an edge by the factor Q, a product of erf(t). The t are the distances in sigma
 from the lines that cross the edge at both ends and from its two parallel neighbours. R corrects Q for the
-crossing angle: blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between the
-normals.
+crossing angle: blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ..., with rho the cosine of the angle
+between the normals.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Half of REACH raises errors by 16 %; doubled it lowers them by 2 %, with twice the pixels. Half of SHARP
+# Half of REACH raises errors by 16 %; doubled, it lowers them by 2 %, with twice the pixels. Half of SHARP
 # raises the errors of edges sharper than a pixel up to 9 times. The others are insensitive.
-REACH = 4.0  # sigma on both sides of an edge; farther pixels hold no information on its place
+REACH = 4.0  # sigma on both sides of an edge; farther pixels hold no information on its position
 SHARP = 0.45  # px; below this blur the box of the pixel is modelled exactly
 ALONE = 9.0  # sigma; a parallel line at this distance has no effect
-_NEAREST = 0.5  # sigma from the crossing lines
-_NEAREST_FIRST, _ENDS = 2.0, 0.12  # before the last fit: sigma, at most this share of the length
-_NEAREST_SHARP = 0.75  # px from the crossing lines; no nearer pixel is cut by them
-_RIM, _RIM_BLUR = 0.1, 3.0  # of the length, and sigma, left out where the board ends: it may be cut
+_NEAREST = 0.5  # sigma; least distance of pixels from the crossing lines
+_NEAREST_FIRST, _ENDS = 2.0, 0.12  # the same before the last fit: sigma, at most this share of the length
+_NEAREST_SHARP = 0.75  # px; the same for sharp edges: the crossing lines cut only nearer pixels
+_RIM, _RIM_BLUR = 0.1, 3.0  # share of the length, and sigma, left out at the board's end, which may be cut
 _COLUMNS = 40  # columns of pixels along an edge before the last fit
 
 
 @frozen_dataclass(eq=False)
 class EdgePixels(FitPixels):
-    """The pixels of edges as the fits need them, (E, N) float32 arrays.
+    """Pixels of edges for the fits, (E, N) float32 arrays.
 
     Attributes
     ----------
@@ -42,6 +42,7 @@ class EdgePixels(FitPixels):
     d : array [px]
         Distance from the edge's line.
     R : array
+        See the module.
     """
 
     lever: Single
@@ -58,7 +59,7 @@ def edge_pixels(
     stride: int,
     crossed: NDArray[np.bool_] | None = None,
 ) -> EdgePixels:
-    """Gather the pixels around edges, all of weight 1.
+    """Gather the pixels around edges, all with weight 1.
 
     Parameters
     ----------
@@ -68,12 +69,12 @@ def edge_pixels(
         Blur.
     shading : Shading
     reach : (E,) array [px]
-        On both sides of the edges.
+        Half width of the strips.
     stride : int
-        Use every n-th column only; 1 for the last fit, when the crossing lines are well known.
+        Use only every n-th column; 1 for the last fit, when the crossing lines are well known.
     crossed : (E, 2) bool array, optional
-        Whether another line crosses the edge at its ends, as at all ends if not given. At the others the
-        board may end, and a part of the edge is left out.
+        Whether another line crosses the edge at each end; by default at all. At other ends the board may end,
+        and a part of the edge is left out.
     """
     crossed = np.ones((len(sigma), 2), dtype=np.bool_) if crossed is None else crossed
     trim = (_RIM * lines.length + _RIM_BLUR * sigma)[:, None] * ~crossed
@@ -109,5 +110,5 @@ def edge_pixels(
 
 
 def usual_stride(lines: Lines) -> int:
-    """The stride of columns before the last fit, for speed."""
+    """Stride of columns before the last fit, chosen for speed."""
     return max(2, int(upper_median(lines.length) / _COLUMNS))

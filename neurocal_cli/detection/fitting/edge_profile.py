@@ -1,12 +1,12 @@
-"""The profile of a blurred edge, from -1 on the dark side to +1 on the light side.
+"""Edge spread function, from -1 on the dark side to +1 on the light side.
 
 With z the distance from the edge in units of sigma_t, ``sigma_t^2 = psf^2 + 1/12``,
 
     E(z) = erf(z / sqrt 2) + phi(z) (a_3 He_3(z) + a_5 He_5(z))
 
 where phi is the normal density and He_k are Hermite polynomials (Gram-Charlier series). The coefficients
-describe the tails of the blur, the pixel's box (see `box_kurtosis`) and sharpening. A nonlinear response,
-by gamma or clipping, then maps the light x between the levels -1 and +1 to
+describe the tails of the blur, the pixel's box (see `box_kurtosis`) and sharpening. Then a nonlinear
+response, due to gamma or clipping, maps the light x between the levels -1 and +1 to
 
     F(x) = x + (1 - x^2) (b_0 + b_1 x + b_2 x^2 + ...)
 
@@ -24,9 +24,9 @@ Real = NDArray[np.floating]
 
 RESPONSE_TERMS = 6
 
-# erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun
-# 7.1.26) with seven terms, made minimax by Lawson's method: the error is at most 7.3e-10, which
-# tests/test_fit_models.py checks. For the pixels of 93 edges, error function and density take 0.13 ms;
+# erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun 7.1.26)
+# with seven minimax coefficients, found by Lawson's method. The error is at most 7.3e-10
+# (tests/test_fit_models.py). For the pixels of 93 edges, error function and density take 0.13 ms;
 # scipy.special.erf takes 1.0 ms, and 0.1 s to import.
 _P = 0.34
 _C = (
@@ -48,7 +48,7 @@ def erf_and_density(z: Real) -> tuple[Real, Real]:
     Parameters
     ----------
     z : array
-        float32 or float64, which the results are as well.
+        float32 or float64; the results have the same type.
     """
     bell = z * z
     bell *= -0.5
@@ -68,7 +68,7 @@ def erf_and_density(z: Real) -> tuple[Real, Real]:
 
 
 def with_sign(size: Real, of: Real) -> Real:
-    """Give a positive array the sign of another, in place; by its bit, because `numpy.copysign` is slower."""
+    """Give a positive array the sign of another, in place, by the sign bit; faster than `numpy.copysign`."""
     kind, sign = _SIGN_BITS[of.dtype.itemsize]
     bits = size.view(kind)
     bits |= of.view(kind) & sign
@@ -97,9 +97,9 @@ def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
 
 
 def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
-    """The contribution of the tails (E, 2) to a profile at z (E, N), and its derivative."""
+    """Contribution of the tails (E, 2) to the profile at z (E, N), and its derivative."""
     square = z * z
-    # By powers of z^2; d/dz phi He_k = -phi He_{k+1}.
+    # Polynomials in z^2; d/dz phi He_k = -phi He_{k+1}.
     value, slope = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
     more, steeper = _polynomial(square, value), _polynomial(square, slope)
     more *= z
@@ -108,7 +108,7 @@ def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
     return more, steeper
 
 
-# He_3 / z and He_5 / z, and -He_4 and -He_6, by powers of z^2.
+# Coefficients of He_3 / z and He_5 / z, and of -He_4 and -He_6, as polynomials in z^2.
 _ODD_POWERS = np.array([[-3.0, 1.0, 0.0], [15.0, -10.0, 1.0]])
 _EVEN_POWERS = np.array([[-3.0, 6.0, -1.0, 0.0], [15.0, -45.0, 15.0, -1.0]])
 
@@ -124,7 +124,7 @@ def _polynomial(x: Real, coefficients: Real) -> Real:
 
 
 def tail_terms(z: Real, density: Real, out: Real) -> None:
-    """The functions ``phi He_3`` and ``phi He_5`` of z (E, N); out is an (E, 2, N) array."""
+    """Write ``phi He_3`` and ``phi He_5`` of z (E, N) to `out` (E, 2, N)."""
     square = z * z
     odd = density * z
     np.multiply(odd, square - 3, out=out[:, 0])
@@ -152,7 +152,7 @@ def response(x: Real, coefficients: Array) -> tuple[Real, Real]:
 
 
 def response_terms(x: Real, scale: Real, out: Real) -> None:
-    """The functions ``scale (1 - x^2) x^k`` of x (E, N); out is an (E, RESPONSE_TERMS, N) array."""
+    """Write ``scale (1 - x^2) x^k`` of x (E, N) to `out` (E, RESPONSE_TERMS, N)."""
     np.multiply(scale, 1 - x * x, out=out[:, 0])
     for k in range(1, RESPONSE_TERMS):
         np.multiply(out[:, k - 1], x, out=out[:, k])
@@ -161,7 +161,7 @@ def response_terms(x: Real, scale: Real, out: Real) -> None:
 def box_kurtosis(normal: Array, sigma: Array) -> Array:
     """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``.
 
-    From the fourth cumulant -(n_u^4 + n_v^4)/120 of the box seen along the normal, by Edgeworth's series.
+    It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Rejecting fits that disagree with their pixels, with the rest of the board, or with the map.
+"""Reject fits that disagree with their pixels, with the rest of the board, or with the map.
 
 In: fits. Out: masks of the typical fits, from which common parameters are estimated, and of the reliable
-ones, which are reported.
+fits, which are reported.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, MEAN, 
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
-# Insensitive within what they must contain: a ratio of 1 to the prior, and fits of 8 pixels for the smallest
-# squares. tests/test_measuring.py counts the fits of hidden edges that are accepted.
+# Insensitive as long as they admit a ratio of 1 to the prior, and fits of 8 pixels for the smallest squares.
+# tests/test_measuring.py counts the fits of hidden edges that are accepted.
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
-_MOST_BLUR = 2.0  # ratio to the prior, or its inverse
-_MOST_BEYOND = 0.3  # share of the pixels outside the image
+_MOST_BLUR = 2.0  # greatest ratio to the prior, or of the prior to it
+_MOST_BEYOND = 0.3  # greatest share of the pixels outside the image
 _LEAST_COUNT = 8  # pixels
-_LIMIT = 6.0  # standard deviations, of the distance from the map and of chi2
+_LIMIT = 6.0  # standard deviations, for the distance from the map and for chi2
 _ROUGH = 0.5  # relative excess of chi2 that is always accepted
-_LEAST_SHARE = 0.2  # of good fits; fewer agree by chance
-_MOST_SPREAD = 0.5  # standard deviation of an offset, in sigma
-# A fit has converged if its last step is below so many standard deviations or px. The latter is for sharp
-# images, whose noise is below the error of the edge model.
+_LEAST_SHARE = 0.2  # least share of good fits; fewer may agree by chance
+_MOST_SPREAD = 0.5  # sigma; greatest standard deviation of an offset
+# A fit has converged if its last step is below the first limit [standard deviations] or the second [px]. The
+# latter is for sharp images, whose noise is below the error of the edge model.
 _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 
 
 def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
-    """(E,) mask of fits with the contrast and chi2 of most fits of the board."""
+    """(E,) mask of fits whose contrast and chi2 are like those of most fits of the board."""
     contrast = fit.values[:, CONTRAST] / upper_median(fit.values[:, CONTRAST])
-    rough = fit.roughness
+    rough = fit.chi2_per_pixel
     usual = upper_median(rough)
     scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
@@ -46,15 +46,15 @@ def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> 
     departure : (E,) array
         Distance from the map, in standard deviations.
     known : array, optional
-        chi2 of each pixel in fits that are known to be reliable; without it, the fits are compared with
-        each other.
+        chi2 per pixel of fits that are known to be reliable; without it, the fits are compared with each
+        other.
     """
     contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
     good &= (fit.pixels.beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
-    # The values before the levels are offset and tilt of each line in turn.
+    # The values before the levels are alternately the offset and the tilt of a line.
     offsets = range(0, fit.values.shape[1] + MEAN, 2)
     spread = fit.covariance[:, offsets, offsets]
     good &= (spread > 0).all(axis=1)
@@ -62,7 +62,7 @@ def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> 
     good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
-    rough = fit.roughness
+    rough = fit.chi2_per_pixel
     among = rough[good] if known is None else known
     usual = upper_median(among) if len(among) else 1.0
     scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0

@@ -1,7 +1,8 @@
-"""The fits of all edges of a board, in stages: from vertices known to half a pixel to the noise limit.
+"""Fit all edges of a board in stages, from vertices known to half a pixel to the noise limit.
 
-A map through the found vertices, offsets of the edges from moments, a first fit with independent levels,
-common parameters, a last fit, and the map through it. In: `GridImage`. Out: `GridFit`, for `measuring`.
+The stages are: a map through the found vertices, offsets of the edges from moments, a first fit with
+independent levels, common parameters, a last fit, and the map through its edges. In: `GridImage`. Out:
+`GridFit`, for `measuring`.
 """
 
 from __future__ import annotations
@@ -50,21 +51,21 @@ from neurocal_cli.geometry import Array
 Image = NDArray[np.generic]
 
 # Insensitive: later stages correct the errors of earlier ones.
-_START_SIGMA = 0.3  # px, of the coordinates of the found vertices
-_GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
-# Displacement by the lens, relative to the distance from its centre, above which a wide lens is tried: at
-# once, after the first fit, and there if the residuals are ...
+_START_SIGMA = 0.3  # px; standard deviation of the coordinates of the found vertices
+_GOOD_START = 1.3  # chi2 per coordinate of these vertices below which no richer map is tried
+# Relative radial displacement by the lens above which a wide lens is tried: at once; after the first fit; and
+# after the first fit if the excess variance is below _UNEVEN.
 _STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
-_UNEVEN = 100.0  # ... below so many variances of the noise
-_NOT_NOISE, _CLEARLY = 2.0, 0.5  # least variance over the noise's, and its share with a wide lens
-_PARAMETER = 2.0  # chi2 that a parameter must be worth, in the choice between two kinds of lenses
-_ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
-_ENOUGH = 60  # edges that need no such anchors
-_MOMENT_SIGMA = 0.05  # px, of offsets from moments
-_WIDEST = 12.0  # px, half width of the strips for moments
-_STEPS = 6  # Gauss-Newton steps, at most
+_UNEVEN = 100.0
+_NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tried, and share it must leave
+_PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
+_ANCHOR = 2.0  # px; standard deviation of the found vertices as anchors, which keep later maps regular
+_ENOUGH = 60  # edges above which such anchors are not needed
+_MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
+_WIDEST = 12.0  # px; greatest half width of the strips for moments
+_STEPS = 6  # greatest number of Gauss-Newton steps
 _LEAST_VARIANCE = 1e-12  # px^2
-_LEAST_SCALE = 0.1  # of the noise by the final residuals, relative to the first estimate
+_LEAST_SCALE = 0.1  # least ratio of the noise variance from the final residuals to the first estimate
 _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
 
 
@@ -79,7 +80,7 @@ class GridEdges:
     vertical : (E,) bool array
     centre : (E, 2) array [squares]
     light : (E,) array
-        +1 where the light side is that of growing r (c for vertical ones), else -1.
+        +1 if the light side is that of growing r (growing c for vertical edges), else -1.
     known : (E, 2) bool array
         Whether the vertices at both ends are known.
     """
@@ -97,7 +98,7 @@ class GridEdges:
 
     @classmethod
     def to_rim(cls, grid: Grid) -> GridEdges:
-        """All edges with one known vertex: those to the board's rim, and to vertices that were not found."""
+        """All edges with one known vertex: edges to the board's rim, and to vertices that were not found."""
         return cls._with_known_ends(grid, 1)
 
     @classmethod
@@ -119,7 +120,7 @@ class GridEdges:
         return cls(index.astype(np.int64), vertical, centre, light, known)
 
     def lines(self, at: SmoothMap) -> Lines:
-        """The edges in the image, by a map."""
+        """Map the edges to the image."""
         return grid_lines(at, self.centre, self.vertical, self.light)
 
 
@@ -135,7 +136,7 @@ class GridImage:
     anchors : Observations
         The found vertices.
     floor : float [DN^2]
-        Least variance of the pixels, by rounding.
+        Least variance of the pixels, that of rounding.
     """
 
     image: Image
@@ -146,7 +147,7 @@ class GridImage:
 
     @classmethod
     def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
-        """From an image and a grid in it."""
+        """Prepare an image and a grid in it."""
         vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
         anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
         return cls(image, grid, GridEdges.of(grid), anchors, floor)
@@ -167,7 +168,7 @@ class GridImage:
         return self.grid.pixels[self.grid.seen]
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
-        """Edges as observations of a map, with an unknown common shift to the light side."""
+        """Use edges as observations of a map, with an unknown common shift towards the light side."""
         value = (lines.middle * lines.normal).sum(axis=1) + offset
         edges = Observations(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
         if len(offset) > _ENOUGH:
@@ -200,10 +201,10 @@ class GridFit:
 
     @property
     def unevenness(self) -> float:
-        """Variance [px^2] of the edges around the smooth map beyond that of their fits.
+        """Variance of the edges around the smooth map in excess of that of their fits [px^2].
 
-        Its causes are an uneven print or board, and errors of the model of the pixels. For a calibration it
-        is noise of the points.
+        It is caused by an uneven print or board, and by errors of the pixel model. A calibration treats it as
+        noise of the points.
         """
         if not self.good.any():
             return 0.0
@@ -211,7 +212,7 @@ class GridFit:
 
 
 def fit_grid(grid_image: GridImage) -> GridFit:
-    """All stages: map of the found vertices, moments, first fit, common parameters, last fit."""
+    """Run all stages: map of the found vertices, moments, first fit, common parameters, last fit."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
@@ -228,7 +229,7 @@ def fit_grid(grid_image: GridImage) -> GridFit:
 def _wide_if_better(
     grid_image: GridImage, found: MapFit, observations: Observations, enough: float = 0.0
 ) -> MapFit:
-    """The map of a wide lens if it fits better than radial distortion of a pinhole."""
+    """Fit the map of a wide lens as well, and choose the better one."""
     start = wide_start(found.map.frame, grid_image.vertices, grid_image.pixels, grid_image.size)
     if start is None:
         return found
@@ -241,9 +242,10 @@ def _wide_if_better(
 
 
 def _may_be_wide(found: MapFit, vertices: Array) -> bool:
-    """Whether a wide lens, which the map does not model, can explain the remaining variance.
+    """Whether the excess variance of a map may be due to a wide lens, which `SmoothMap` does not model.
 
-    The map follows a weak bend to hundredths of a pixel; more than that comes from an uneven board.
+    If the lens displaces points only weakly, `SmoothMap` is accurate to hundredths of a pixel, and a larger
+    excess comes from an uneven board.
     """
     if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
         return False
@@ -252,9 +254,9 @@ def _may_be_wide(found: MapFit, vertices: Array) -> bool:
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
-    """The map through offsets from moments, and the blur [px]."""
+    """Fit the map to offsets from moments, and estimate the blur [px]."""
     lines = grid_image.edges.lines(found.map)
-    # Oblique crossing lines enter wide strips from the side.
+    # Oblique crossing lines enter wide strips, so these are narrower.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
@@ -268,7 +270,7 @@ def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple
 def _first_fit(
     grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
 ) -> GridFit:
-    """Edges fitted with independent levels, and the map through them."""
+    """Fit edges with independent levels, and the map through them."""
     lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
     fit = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
@@ -277,7 +279,7 @@ def _first_fit(
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
-    # At least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
+    # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
     chosen = select_map(
         mapped.map,
         observations,
@@ -287,19 +289,19 @@ def _first_fit(
     )
     if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
-        # An uneven board departs from both.
+        # An uneven board departs from both maps.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
     return GridFit(lines, fit, chosen, shading, PixelNoise(noise, noise, noise), good)
 
 
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
-    """Edges fitted with common parameters, and the map through them."""
+    """Fit edges with common parameters, and the map through them."""
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
     fit, noise = _fine_fit(grid_image, first, lines, shading)
-    scale = max(upper_median(fit.roughness[good]) if good.any() else 1.0, _LEAST_SCALE)
+    scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
@@ -308,8 +310,8 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
-    # An uneven board deviates from its map everywhere: that makes no single edge an outlier, but all
-    # of them less certain.
+    # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges
+    # are less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     return GridFit(lines, fit, mapped, shading, noise, is_reliable(fit, departure))
@@ -318,19 +320,19 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
 ) -> tuple[BatchFit, PixelNoise]:
-    """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
+    """Fit edges to all pixels, with levels, blur, profile and noise of the whole board."""
     n = len(first.good)
     shape = profile_shape(first.fit, first.good)
     noise = PixelNoise.of(first.fit, grid_image.floor)
     blur = _blur(first, lines, lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
-        # A fit that diverged in the dark of the rim restarts at the map.
+        # A fit that failed in the dark rim of the image starts at the map again.
         offset = np.where(first.good, offset, first.map.shift[0])
     fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
-        # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
+        # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
         fit = fit.continued(shape, _STEPS, weight=noise.weights(fit.linear.x))
@@ -347,7 +349,7 @@ def _fitted(
     noise: PixelNoise,
     crossed: NDArray[np.bool_] | None = None,
 ) -> BatchFit:
-    """Fits of edges to all their pixels, started at offsets (E,), with the common parameters of the board."""
+    """Fit edges to all their pixels from initial offsets (E,), with the common parameters of the board."""
     sigma, spread = blur
     data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
@@ -357,7 +359,7 @@ def _fitted(
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
-    """Fits of the edges to the board's rim, after those of all others, whose common parameters they have."""
+    """Fit the edges to the board's rim with the common parameters of all other edges."""
     edges = GridEdges.to_rim(grid_image.grid)
     lines = edges.lines(fitted.map.map)
     shift = fitted.map.shift[0]
@@ -373,15 +375,15 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     )
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
-    # A rim that is bad all around would be consistent with itself.
-    good = is_reliable(fit, departure, known=fitted.fit.roughness[fitted.good])
+    # Compare with the other edges, because the edges of a rim that is bad all around agree with each other.
+    good = is_reliable(fit, departure, known=fitted.fit.chi2_per_pixel[fitted.good])
     return edges, replace(fitted, lines=lines, fit=fit, good=good)
 
 
 def fit_grid_vertices(
     grid_image: GridImage, fitted: GridFit
 ) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
-    """Fits of all known vertices after those of the edges, with their lines and a mask of reliable ones."""
+    """Fit all known vertices after the edges; returns also their lines and a mask of the reliable ones."""
     grid = grid_image.vertices
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
@@ -395,7 +397,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
-    fit = fit.scaled(max(upper_median(fit.roughness), _LEAST_SCALE))
+    fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
@@ -405,7 +407,7 @@ def fit_grid_vertices(
 
 
 def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:
-    """Blur (E,) [px] of lines by the fits of all edges, and the variance of single ones around it [px^2]."""
+    """Blur (E,) [px] of lines from the fits of all edges, and variance of single edges around it [px^2]."""
     if isinstance(fitted.map.map, WideMap):
         field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
         sigma = field.along(lines.normal, lines.middle)
@@ -415,7 +417,7 @@ def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | f
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V, 2, 2) mask of known vertices without a neighbour: before and after, along c and along r."""
+    """(V, 2, 2) mask of missing neighbours of known vertices: along c and along r, before and after."""
     beyond = ~np.pad(seen, 1)
     along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
     along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
@@ -423,7 +425,7 @@ def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _shading(first: GridFit) -> Shading:
-    """Shading of the whole board from the levels of its edges."""
+    """Estimate the shading of the whole board from the levels of its edges."""
     covariance, values, good = first.fit.covariance, first.fit.values, first.good
     both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
     cross = 2 * covariance[:, MEAN, CONTRAST]

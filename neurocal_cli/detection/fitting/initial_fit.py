@@ -1,4 +1,4 @@
-"""The first fits of a board's edges, each with its own levels, to estimate blur and profile.
+"""First fits of a board's edges, each with its own levels, to estimate blur and profile.
 
 In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates the common
 parameters of all edges.
@@ -32,14 +32,15 @@ from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
-# Insensitive, apart from edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
-# of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, never taking the box, makes them 8 times larger.
+# Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
+# of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them 8 times
+# larger.
 _SLACK = 0.5  # px, added to the strips because lines are not accurate yet
 _FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
 _CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box
-_WORSE = 1.2  # ratio of chi2 from which on fits with the new blur are rejected
-_BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
-_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
+_WORSE = 1.2  # ratio of chi2 above which fits with the new blur are rejected
+_BLUR_OFF = 0.2  # relative error of the blur above which the fits are repeated
+_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to contrast and blur
 
 
 def fit_initial(
@@ -52,9 +53,9 @@ def fit_initial(
     image : (H, W) array
     lines : Lines
     offset : (E,) array [px]
-        Start of the edges' distances from their lines.
+        Initial distances of the edges from their lines.
     sigma : float [px]
-        Start of the blur.
+        Initial blur.
     shading : Shading
     noise : float [DN^2]
         Variance of a pixel.
@@ -70,7 +71,7 @@ def fit_initial(
         start = np.where(typical[:, None], started.values, start)
         start[:, BLUR] = found
         again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
-        if upper_median(again.roughness) < _WORSE * upper_median(started.roughness):
+        if upper_median(again.chi2_per_pixel) < _WORSE * upper_median(started.chi2_per_pixel):
             return again
     return _with_best_profile(started, lines, sigma)
 
@@ -78,7 +79,7 @@ def fit_initial(
 def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
 ) -> BatchFit:
-    """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
+    """Fit with few steps, to estimate the blur; `known` (E, 3) are prior mean level, contrast and blur."""
     blur = known[:, 2]
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
     data = data.weighed(np.full_like(data.root, 1 / noise))
@@ -89,10 +90,10 @@ def _few_steps(
 
 
 def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
-    """Continue the fits with the blur profile that gives the lower chi2."""
+    """Continue the fits with each blur profile, and choose the one with the lower chi2."""
     results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
-    smooth, box = (upper_median(results[k].roughness) for k in (0, -1))
-    # Prefer the pixel's box: both agree where all edges run along the pixels.
+    smooth, box = (upper_median(results[k].chi2_per_pixel) for k in (0, -1))
+    # Prefer the pixel's box if they are about equal, as they are if all edges run along the pixels.
     return results[0] if smooth < _CLEARLY * box else results[-1]
 
 
@@ -103,11 +104,11 @@ def _converged(fit: BatchFit, shape: ProfileShape) -> BatchFit:
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
-    """Profiles of pure blur: the series and, for sharp images, the pixel's box."""
+    """Initial profiles: the Gram-Charlier series and, for sharp images, the pixel's box."""
     none = np.zeros(RESPONSE_TERMS)
     tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
     shapes = [ProfileShape(tails[:, None] * [1.0, 0.0], none)]
     if sigma < SHARP:
-        # Cameras that sharpen images do not leave the profile of a pixel's box.
+        # The series is tried, too, because sharpening in the camera changes the profile of the pixel's box.
         shapes.append(ProfileShape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
     return shapes

@@ -1,12 +1,12 @@
-"""Robust dense fit of the smooth map, and the choice of its model.
+"""Robust dense fit of the smooth map, and selection of its model.
 
-This is not the package's least-squares core, because its problem is different: a dense fit of 8 to 64
-parameters to about a hundred observations, 0.5 ms each and eight times for each grid. It has no blocks to
-eliminate, Tukey's weights change from step to step, and fits end early when a model gains too little.
+This does not use the package's least-squares core, because the problem is different: a dense fit of 8 to 64
+parameters to about a hundred observations, 0.5 ms each and eight times per grid. There are no blocks to
+eliminate, Tukey's weights change from step to step, and a fit ends early if a model gains too little.
 
-The model is the simplest one of the start's `models` that the observations do not contradict.
+The selected model is the simplest one of the initial map's `models` that the observations do not contradict.
 
-In: a start, observations. Out: the map with its covariance, residuals, weights of outliers, excess variance.
+In: an initial map and observations. Out: the map with its covariance, residuals, weights and excess variance.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # Insensitive.
-_STEPS = 25  # at most
-_SHIFT_PRIOR = 1e-2  # 1/px^2, of the shifts: 10 px
+_STEPS = 25  # greatest number
+_SHIFT_PRIOR = 1e-2  # 1/px^2; prior standard deviation of the shifts: 10 px
 _TINY = 1e-300
 _BELIEF = 20  # weight, in observations, of the prior that the given variances are true
-_CREEPING = 5e-3  # relative gain of chi2 below which steps end
-_CONVERGED = 0.2  # of chi2
-_DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
+_CREEPING = 5e-3  # relative gain of chi2 below which the iteration ends
+_CONVERGED = 0.2  # the same for the gain in units of the squared scale
+_DAMPING = 1e-4  # initial damping of the normal equations' scaled diagonal
 _ROBUST = 1.5  # standard deviation over the median absolute value, about 1.4826
 _TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
 
-# A richer model must lower chi2 by this much for each of its parameters; chance alone gives 1. Residuals far
-# above the noise come from an uneven board, which a polynomial must not follow: the price is higher then.
-# Insensitive, as all constants here; tests/test_fit_parts.py selects known models.
+# A richer model must lower chi2 by this much for each additional parameter; chance alone gives 1. Residuals
+# far above the noise come from an uneven board, which a polynomial must not follow, so the price is higher
+# then. Insensitive, like all constants here; tests/test_fit_parts.py selects known models.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
-_FIRST_SHARE = 0.3  # of that price; what the first step must gain for a model to be fitted further
-_FUTILE = 2  # richer models without gain, of the lens or the polynomial, after which no more are tried
-_UNEVEN = 4.0  # residuals over noise from which a polynomial is tried although no lens model gained
+_FIRST_SHARE = 0.3  # share of that price which the first step must gain for the fit to continue
+_FUTILE = 2  # richer lens models, or polynomials, without gain, after which no more are tried
+_UNEVEN = 4.0  # ratio of residuals to noise above which polynomials are tried although no lens model gained
 
 
 @frozen_dataclass(eq=False)
 class Observations:
-    """Positions known along one direction each: ``direction . p = value``.
+    """Positions measured along one direction each: ``direction . p = value``.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Observations:
     value : (N,) array [px]
     variance : (N,) array [px^2]
     shift : (N, K) array
-        Derivatives of the values by further unknowns, which are fitted with the map.
+        Derivatives of the values by additional unknowns, which are fitted with the map.
     """
 
     grid: Array
@@ -64,7 +64,7 @@ class Observations:
 
     @classmethod
     def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Observations:
-        """Both coordinates of points (N, 2)."""
+        """Observe both coordinates of points (N, 2)."""
         n = len(grid)
         return cls(
             np.tile(grid, (2, 1)),
@@ -76,12 +76,12 @@ class Observations:
 
     @property
     def informative(self) -> NDArray[np.bool_]:
-        """(N,) mask of the observations that determine the map; anchors, maybe more than half, do not."""
+        """(N,) mask of the observations that determine the map; anchors do not, and may be more than half."""
         quarter = len(self.variance) // 4
         return np.asarray(self.variance < 100 * np.partition(self.variance, quarter)[quarter])
 
     def joined_with(self, other: Observations) -> Observations:
-        """Both together."""
+        """Join two sets of observations."""
         pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
         return Observations(*map(np.concatenate, pairs))
 
@@ -94,15 +94,15 @@ class MapFit:
     ----------
     map : SmoothMap
     shift : (K,) array [px]
-        Unknowns of `Observations.shift`.
+        Values of the additional unknowns; see `Observations.shift`.
     shift_variance : (K,) array [px^2]
     residual : (N,) array [px]
         Value minus map and shift.
     weight : (N,) array
-        From 1 down to 0 for outliers.
+        Tukey's weight, from 1 to 0 for outliers.
     excess : float
-        Variance of the good and informative residuals relative to the given variances; 1 where the
-        difference may be chance, less where they are smaller.
+        Variance of the good and informative residuals relative to the given variances; shrunk towards 1 if
+        it may differ by chance, at most 1 then.
     """
 
     map: SmoothMap
@@ -119,7 +119,7 @@ class MapFit:
 
 
 def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFit:
-    """Levenberg-Marquardt with Tukey's weights, from a start that is nearly right.
+    """Fit a map by Levenberg-Marquardt with Tukey's weights, from a nearby initial map.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFi
         Its model is kept.
     observations : Observations
     shift : (K,) array [px]
-        Start of the shifts.
+        Initial shifts.
     """
     return _with_covariance(_solved_map(start, observations, shift), observations)
 
@@ -145,13 +145,13 @@ def select_map(
     Parameters
     ----------
     start : SmoothMap
-        Of any model.
+        May have any model.
     observations : Observations
     shift : (K,) array [px]
     enough : float
-        Chi2 per observation at which no richer model is tried.
+        Chi2 per observation below which no richer model is tried.
     least, most : int
-        Indices of the simplest and the richest model that are tried; the richest of all by default.
+        Indices of the simplest and the richest model that are tried; by default all are.
     """
     best: _Solution | None = None
     now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
@@ -186,14 +186,14 @@ def select_map(
 
 
 def _price(scale: float) -> float:
-    """Chi2 that each parameter of a richer model must gain, in units of the squared scale."""
+    """Chi2 that each additional parameter must gain, in units of the squared scale."""
     chance = _PRICE / max(scale, 1.0) ** 2
     return max(chance, _UNEVEN_PRICE - chance)
 
 
 @frozen_dataclass(eq=False)
 class _Solution:
-    """A fitted map: shifts, residuals (N,) and derivatives (P, N) of the predictions."""
+    """A fitted map with shifts, residuals (N,) and derivatives (P, N) of the predictions."""
 
     map: SmoothMap
     shift: Array
@@ -216,7 +216,7 @@ def _solved_map(start: SmoothMap, observations: Observations, shift: Array, wort
         return residual, np.concatenate([along[free], observations.shift.T])
 
     residual, jacobian = compared(start, shift)
-    # Before the first step all residuals may be large: no weights yet.
+    # All residuals may be large before the first step, so there are no robust weights yet.
     precision, informative = inverse_sigma * inverse_sigma, observations.informative
     weight, damping, least = precision, _DAMPING, 0.0
     square = residual * residual
@@ -232,7 +232,7 @@ def _solved_map(start: SmoothMap, observations: Observations, shift: Array, wort
         before = weight @ square + prior @ (values * values)
         after = weight @ square_ahead + prior @ (moved * moved)
         if not after <= before:
-            # Strongly correlated parameters: keep the damping from now on.
+            # The parameters are strongly correlated: keep at least this damping from now on.
             damping = least = 10 * damping
             continue
         start, values, residual, jacobian, square = tried, moved, ahead, slopes, square_ahead
@@ -249,7 +249,7 @@ def _solved_map(start: SmoothMap, observations: Observations, shift: Array, wort
 
 
 def loss_of(z: Array) -> float:
-    """Chi2 of normalised residuals z (N,) with every term limited to 100, for outliers."""
+    """Chi2 of normalised residuals z (N,), with each term limited to 100 for outliers."""
     return float(np.minimum(z * z, 100.0).sum())
 
 
@@ -261,13 +261,13 @@ def _tukey(z: Array) -> Array:
 def _robust_scale(z: Array) -> float:
     """Robust standard deviation of normalised residuals; at least 1.
 
-    Errors of the map that most observations share do not make them outliers.
+    So common errors of the map do not turn most observations into outliers.
     """
     return max(1.0, _ROBUST * upper_median(np.abs(z)))
 
 
 def _solved(normal: Array, gradient: Array, damping: float) -> Array:
-    """Solution of damped normal equations, with scaled parameters."""
+    """Solve damped normal equations with scaled parameters."""
     size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
     scaled = normal * size[:, None] * size
     scaled.ravel()[:: len(size) + 1] += damping
@@ -275,7 +275,7 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
 
 
 def _with_covariance(solution: _Solution, observations: Observations) -> MapFit:
-    """A solution with its covariance, weights and excess variance."""
+    """Compute covariance, weights and excess variance of a solution."""
     now, shift, residual, jacobian = solution.map, solution.shift, solution.residual, solution.jacobian
     free, informative = now.free, observations.informative
     z = residual / np.sqrt(observations.variance)

@@ -1,14 +1,14 @@
-"""The exact profile of an edge so sharp that its blur is mostly the pixel's own box.
+"""Exact edge spread function for edges so sharp that the pixel's box dominates the blur.
 
-With psf the blur's standard deviation [px], x a distance from the edge [px], e = erf(x / (psf sqrt 2)) and
+With psf the blur's standard deviation [px], x the distance from the edge [px], e = erf(x / (psf sqrt 2)) and
 p the normal density of x / psf, the light of a step and its integrals are
 
     e,    G = x e + 2 psf p,    H = (x^2 + psf^2) e / 2 + psf x p.
 
 Along the edge's normal, the pixel is the convolution of two boxes with half widths a = |n_u| / 2 and
-b = |n_v| / 2. E is therefore the second difference of H over 4 a b, its slope that of G, and since
-dH/dpsf = psf e, its derivative by psf that of e. The profile without blur, a ramp with rounded ends, is
-computed separately, against cancellation in these differences.
+b = |n_v| / 2. Therefore E is the second difference of H over 4 a b, and its slope is that of G. Because
+dH/dpsf = psf e, the derivative of E by psf is the second difference of psf e. The profile without blur, a
+ramp with rounded ends, is computed separately to avoid cancellation in these differences.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, p
 from neurocal_cli.geometry import Array
 
 PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
-# Against division by 0 in blurs and boxes that cannot be measured; insensitive.
+# Limits that avoid division by 0, below what can be measured; insensitive.
 _LEAST_PSF = 0.02  # px
 _LEAST_HALF = 5e-3  # px
 
@@ -30,7 +30,7 @@ def half_widths(normal: Array) -> Array:
 
 
 def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
-    """Light between -1 and +1, and its derivatives.
+    """Edge spread function from -1 to +1, and its derivatives.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
     a, b = (half[:, k, None].astype(kind) for k in (0, 1))
     psf = np.sqrt(np.maximum(sigma * sigma - kind.type(PIXEL), kind.type(_LEAST_PSF**2)))
     share = 1 / (4 * a * b)
-    # Without blur: a ramp, rounded off within 2 b of its ends.
+    # Without blur, the profile is a ramp, rounded off within 2 b of its ends.
     size = np.abs(d)
     ramp = np.minimum(size, a - b) / a
     beyond = np.clip(size - (a - b), 0, 2 * b)
@@ -73,10 +73,10 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
 def sharp_profile(
     z: Real, sigma: Real, tails: Real, half: Array | None
 ) -> tuple[Real, Real, Real | None, Real]:
-    """E(z), its derivative by z, the excess derivative by log sigma, and the normal density.
+    """E(z), its derivative by z, the extra derivative by log sigma, and the normal density.
 
-    The derivative of E(d / sigma) by log sigma is -z times that by z. The box of the pixel does not grow
-    with the blur, which adds the third result.
+    If the profile only scaled with sigma, the derivative of E(d / sigma) by log sigma would be -z times that
+    by z. The pixel's box does not grow with the blur, which adds the third result.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Levels of the dark and the light squares over the image: polynomials of low degree, fitted robustly.
+"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly.
 
-In: levels measured inside squares or by edge fits. Out: `Shading`, the levels and their slopes anywhere.
+In: levels measured inside squares or by edge fits. Out: `Shading`, the levels and their gradients anywhere.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from neurocal_cli.geometry import Array
 Single = NDArray[np.float32]
 
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
-# Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
+# Bilinear weights (64, 4) of a square's corners for samples of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
 # Insensitive.
-_STEPS = 2  # reweighted fits after the last degree has been reached
-_TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
+_STEPS = 2  # reweighted fits after the highest degree has been reached
+_TUKEY = 5.0  # standard deviations beyond which a level is an outlier
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
-_LEAST_CONTRAST = 1e-3  # DN, against division by 0
-_NEAREST = 3  # levels that count most at a place
+_LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
+_NEAREST = 3  # the distance of the n-th nearest level is the width of the weights
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -60,7 +60,7 @@ class Shading:
     dark, light : (6,) arrays [DN]
         Coefficients of 1, x, y, x^2, x y, y^2.
     spread : (2,) array [DN^2]
-        Variance of single squares around the dark and the light polynomial, with that of the polynomial.
+        Variance of single squares around the dark and the light polynomial, including that of the polynomial.
     """
 
     frame: Frame
@@ -84,19 +84,19 @@ class Shading:
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
     def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
-        """Subtract the slopes of the levels at places (N, 2) from the pixels around them.
+        """Remove the gradient of the mean level at places (N, 2) from the pixels around them.
 
         Parameters
         ----------
         place : (N, 2) array [px]
         u, v : (N, M) arrays [px]
-            Of pixels, relative to the places.
+            Coordinates of the pixels relative to the places.
         value : (N, M) array [DN]
 
         Returns
         -------
         value : (N, M) array [DN]
-            Without the slope of the mean level.
+            Without the gradient of the mean level.
         gain : (N, M) array
             Half contrast relative to that at the places.
         """
@@ -108,14 +108,14 @@ class Shading:
 
 @frozen_dataclass(eq=False)
 class LocalShading(Shading):
-    """Levels that also follow the squares nearby: light falls fast towards the rim of a wide lens's image.
+    """Levels that also follow nearby squares, for the strong vignetting of wide lenses.
 
     Attributes
     ----------
     near : pair of (N, 2) arrays [px]
-        Where dark and light levels were measured.
+        Places at which the dark and the light levels were measured.
     above : pair of (N,) arrays [DN]
-        Their differences from the polynomials there.
+        Their differences from the polynomials.
     """
 
     near: tuple[Array, Array]
@@ -123,7 +123,7 @@ class LocalShading(Shading):
 
     @classmethod
     def of(cls, smooth: Shading, dark: Levels, light: Levels) -> Shading:
-        """From polynomials, and the levels that they were fitted to; the polynomials where these are few."""
+        """Add the levels to which polynomials were fitted; with few levels, return the polynomials."""
         if min(len(dark.level), len(light.level)) <= _NEAREST:
             return smooth
         above, spread = [], []
@@ -149,7 +149,7 @@ class LocalShading(Shading):
 
 
 def _nearby(near: Array, value: Array, place: Array, itself: bool = True) -> Array:
-    """Means of values at places (N, 2) near others (M, 2), weighted by their distances; (M,) array."""
+    """(N,) means at places (N, 2) of values (M,) at places `near` (M, 2), weighted by their distances."""
     away = ((place[:, None] - near) ** 2).sum(axis=-1)
     if not itself:
         np.fill_diagonal(away, np.inf)
@@ -195,20 +195,20 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     terms = _terms(frame, levels.place)
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
-    # From the median to higher degrees: hidden squares must be found before they can change a slope.
+    # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
-        # The median is robust against the outliers that the weights have to find.
+        # The median is robust against the outliers that the weights are to find.
         scatter = upper_median(residual**2) / CHI2_MEDIAN * n / max(n - used, 1)
         weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
         weighted = terms[:, :used].T * root
         normal = weighted @ weighted.T
-        # Keeps inseparable terms finite.
+        # Keeps the solution finite if terms cannot be separated.
         normal.ravel()[:: used + 1] *= 1 + _RIDGE
         coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
         residual = levels.level - terms[:, :used] @ coefficients[:used]
-        # The spread of the squares is only the part that the errors of the levels do not explain.
+        # The spread of the squares is the part that the errors of the levels do not explain.
         chance = 1 + 4 / np.sqrt(n)
         spread = max(scatter - chance * upper_median(levels.variance), 0.0)
     return coefficients, spread + most / n * upper_median(levels.variance)

@@ -1,14 +1,14 @@
-"""The smooth map from grid coordinates to pixels: homography, radial distortion, polynomial.
+"""Smooth map from grid coordinates to pixels: homography, radial distortion, polynomial.
 
-It predicts mid-points along their edges and the curvature of edges; `map_fit` fits it. With x the
-grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
+It predicts the mid-points along their edges and the curvature of edges; `map_fit` fits it. With grid
+coordinates x, y scaled to [-1, 1], and pixels relative to the image centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
     p = q + e (k1 rho + k2 rho^2) + sum_k a_k T_k(x, y),    e = q - c
     rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
 
-with m and n for pixels that are not square, and T_k products of Chebyshev polynomials of a total degree
-of at least 2.
+m and n model pixels that are not square. T_k are products of Chebyshev polynomials with a total degree of at
+least 2.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
 _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
 # Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
-# [half diagonals]. Insensitive: they only matter for what the data do not determine.
+# [half diagonals]. Insensitive: they matter only for parameters that the data do not determine.
 _CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
 
@@ -38,7 +38,7 @@ class Frame:
     Attributes
     ----------
     origin, half : (2,) arrays [squares]
-        Grid coordinate 0 and 1 of the map.
+        Grid coordinates of the scaled coordinate 0, and the grid length of 1.
     centre : (2,) array [px]
     unit : float [px]
         Half of the image's diagonal.
@@ -51,14 +51,14 @@ class Frame:
 
     @classmethod
     def of(cls, grid: Array, size: tuple[int, int]) -> Frame:
-        """For grid points (N, 2) in an image of (width, height)."""
+        """Choose the scales for grid points (N, 2) in an image of (width, height)."""
         low, high = grid.min(axis=0), grid.max(axis=0)
         half = np.maximum(0.5 * (high - low), 0.5)
         centre = 0.5 * (np.array(size, dtype=float) - 1)
         return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)))
 
     def ground(self, grid: Array) -> Array:
-        """(3, N) scaled coordinates x and y of grid points (N, 2), and 1."""
+        """(3, N) homogeneous scaled coordinates x, y, 1 of grid points (N, 2)."""
         ground = np.ones((3, len(grid)))
         ground[:2] = ((grid - self.origin) / self.half).T
         return ground
@@ -73,9 +73,9 @@ class Places:
     ground : (3, N) array
         Scaled coordinates x and y, and 1.
     axis : (2, N) array [px]
-        Unit vectors, times the frame's unit.
+        The directions as unit vectors, times the frame's unit.
     origin : (N,) array [px]
-        The frame's centre along them.
+        Coordinate of the frame's centre along each direction.
     rest : (2 m, N) array or None [px]
         Derivatives by the polynomials' coefficients, along u and along v.
     """
@@ -96,19 +96,19 @@ class SmoothMap:
     parameters : (P,) array
         h0..h7, c_u, c_v, k1, k2, m, n, then a_k along u and along v.
     radial : int
-        Free parameters of the lens: none; k1; k1, k2 and the centre; all with m and n.
+        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n.
     degree : int
-        Of the polynomial; 0 without.
+        Of the polynomial; 0 for none.
     covariance : (P, P) array
         Of the parameters; 0 for fixed ones.
     """
 
-    # The simplest first: (set of radial parameters, degree of the polynomial).
+    # (radial, degree) of each model, the simplest first.
     models: ClassVar[tuple[tuple[int, int], ...]] = (
         (0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6)
     )  # fmt: skip
     richest_lens: ClassVar[int] = 3  # index of the richest model without a polynomial
-    lenses: ClassVar[tuple[tuple[int, ...], ...]] = _FREE_LENS  # free parameters of each, by their positions
+    lenses: ClassVar[tuple[tuple[int, ...], ...]] = _FREE_LENS  # positions of the free parameters of each set
     rest: ClassVar[int] = _REST  # position of the first coefficient of the polynomial
 
     frame: Frame
@@ -133,7 +133,7 @@ class SmoothMap:
         return weights
 
     def with_model(self, radial: int, degree: int) -> SmoothMap:
-        """The map with other free parameters; new ones are 0, and old ones are dropped."""
+        """Change the model: new parameters are 0, and parameters that it does not have are dropped."""
         old = self.parameters[self.rest :].reshape(2, -1)
         rest = np.zeros((2, len(polynomial_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
@@ -143,7 +143,7 @@ class SmoothMap:
         return replace(self, parameters=values, radial=radial, degree=degree, covariance=None)
 
     def moved(self, which: NDArray[np.intp], values: Array) -> SmoothMap:
-        """The map with other values of some parameters."""
+        """Replace the values of some parameters."""
         parameters = self.parameters.copy()
         parameters[which] = values
         return replace(self, parameters=parameters, covariance=None)
@@ -168,19 +168,19 @@ class SmoothMap:
         return np.asarray(q)
 
     def _stretch(self, q: Array) -> tuple[Array, Array]:
-        """Points (2, N) relative to the lens's centre, and the share of that by which it displaces them."""
+        """Points (2, N) relative to the centre of distortion, and their relative radial displacement (N,)."""
         values = self.parameters
         e = q - values[8:10, None]
         rho = (e * (self._metric @ e)).sum(axis=0)
         return e, rho * (values[10] + values[11] * rho)
 
     def bend(self, grid: Array) -> float:
-        """Greatest displacement by the lens at grid points (N, 2), over the distance from its centre."""
+        """Greatest relative radial displacement by the lens at grid points (N, 2)."""
         homogeneous = self._homography @ self.frame.ground(grid)
         return float(np.abs(self._stretch(homogeneous[:2] / homogeneous[2])[1]).max())
 
     def places(self, grid: Array, direction: Array) -> Places:
-        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this model."""
+        """Prepare grid points (N, 2) and unit vectors (2, N) for maps of this model."""
         frame = self.frame
         ground = frame.ground(grid)
         axis = frame.unit * direction
@@ -191,18 +191,18 @@ class SmoothMap:
         return Places(ground, axis, frame.centre @ direction, rest)
 
     def along(self, places: Places) -> tuple[Array, Array]:
-        """Pixels along the places' directions, and their derivatives.
+        """Pixel coordinates along the places' directions, and their derivatives.
 
         Parameters
         ----------
         places : Places
-            N of them.
+            Of N points.
 
         Returns
         -------
         value : (N,) array [px]
         derivatives : (P, N) array
-            By the parameters; 0 for fixed ones of the lens.
+            By the parameters; 0 for fixed parameters of the lens.
         """
         values, axis = self.parameters, places.axis
         out = np.empty((len(values), axis.shape[1]))
@@ -227,7 +227,7 @@ class SmoothMap:
         return value, out
 
     def _lens(self, q: Array, axis: Array, out: Array) -> tuple[Array, Array]:
-        """Contribution of the lens along axes (2, N) and its derivative by q; out (6, N) takes the others."""
+        """Contribution of the lens along axes (2, N) and its derivative by q; writes the others to `out`."""
         (k1, k2), metric = self.parameters[10:12], self._metric
         e = q - self.parameters[8:10, None]
         slope = metric @ e
@@ -269,7 +269,7 @@ class SmoothMap:
 
 
 def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
-    """The homography through points by linear least squares; (N, 2) arrays, N >= 4 or else affine."""
+    """Fit a homography to points (N, 2) by linear least squares; affine for fewer than 4 points."""
     x, y, one = frame.ground(grid)
     u, v = ((pixels - frame.centre) / frame.unit).T
     zero = np.zeros_like(x)
@@ -283,8 +283,8 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
 def polynomial_orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
     """Orders (i, j) of the polynomials in x and in y.
 
-    Edges determine the map along a line at the line's vertices only. An order must therefore be lower than
-    the number of vertices minus one.
+    Along a line, the edges determine the map only at the line's vertices. Therefore an order must be
+    lower than the number of vertices minus one.
     """
     most_x, most_y = (2 * frame.half - 1).tolist()
     return _orders_up_to(degree, max(most_x, 0), max(most_y, 0))

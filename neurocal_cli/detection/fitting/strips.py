@@ -1,6 +1,6 @@
 """Lines of a grid in the image, and the strips of pixels along them.
 
-In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, its pixels, for the edge fits.
+In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, the pixels around each edge.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from neurocal_cli.geometry import Array
 Single = NDArray[np.float32]
 
 _AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
-_CLOSEST = 0.5  # px, least distance of parallel lines, against division by 0; insensitive
+_CLOSEST = 0.5  # px, least distance of parallel lines, to avoid division by 0; insensitive
 _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
@@ -26,7 +26,7 @@ class Lines:
     Attributes
     ----------
     middle : (E, 2) array [px]
-        Pixel of the middle of the piece; origin of the frame.
+        Pixel of the middle of the piece, the origin of the frame.
     tangent, normal : (E, 2) arrays
         Unit vectors; the normal points to the light side.
     curvature : (E,) array [1/px]
@@ -36,7 +36,7 @@ class Lines:
     crossing : (E, 2, 2) array
         Unit normals of the lines that cross at the two ends, pointing into the piece.
     apart : (E, 2) array [px]
-        Distance to the next parallel lines, against the normal and along it.
+        Distances to the next parallel lines, against the normal and along it.
     """
 
     middle: Array
@@ -54,15 +54,15 @@ class Lines:
 
     @property
     def length(self) -> Array:
-        """(E,) from end to end [px]."""
+        """(E,) distance between the ends [px]."""
         return self.ends[:, 1] - self.ends[:, 0]
 
     def pixels(self, s: Single, d: Single) -> tuple[Single, Single]:
-        """Pixels u and v, relative to the middles, of tangential and normal coordinates (E, N)."""
+        """Convert tangential and normal coordinates (E, N) to pixels u and v relative to the middles."""
         across = s * s
         across *= _column(0.5 * self.curvature)
         across += d
-        # The vectors are orthogonal, but longer than one on curved lines.
+        # The vectors are orthogonal, but slightly longer than 1 on curved lines.
         square = (self.tangent**2).sum(axis=1, keepdims=True)
         t, n = self.tangent / square, self.normal / square
         u, v = s * _column(t[:, 0]), s * _column(t[:, 1])
@@ -72,7 +72,7 @@ class Lines:
 
 
 def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
-    """Lines of a grid in the image, by a map.
+    """Map lines of a grid to the image.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     vertical : (E,) bool array
         Whether the line runs along r.
     light : (E,) array
-        +1 where the light side is that of growing r (of growing c for vertical ones), else -1.
+        +1 if the light side is that of growing r (growing c for vertical lines), else -1.
     """
     swap = vertical[:, None, None]
     offsets = np.concatenate([_AROUND, _NEIGHBOURS])
@@ -95,7 +95,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     normal = turned * (light * np.where(vertical, -1, 1))[:, None]
     ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
     sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
-    # A parabola through both ends; turn the frame by its slope at the origin.
+    # Put a parabola through both ends, and turn the frame by its slope at the origin.
     curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
     slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
     tangent, normal = tangent + slope[:, None] * normal, normal - slope[:, None] * tangent
@@ -111,7 +111,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
 
 @frozen_dataclass(eq=False)
 class Strips:
-    """Pixels around lines, padded to the same number for all; float32.
+    """Pixels around lines, padded to the same number for each line; float32.
 
     Attributes
     ----------
@@ -138,10 +138,10 @@ class Strips:
 def strip_pixels(
     image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
 ) -> Strips:
-    """Pixels of the strips ``|d| <= half_width`` between the ends of lines.
+    """Gather the pixels of the strips ``|d| <= half_width`` between the ends of lines.
 
-    Each strip is a parallelogram of whole pixels: columns along the line, where it is more horizontal
-    than vertical (else rows), and in each column the pixels around the line.
+    A strip is selected from a parallelogram of whole pixels: columns along the line (rows if the line is more
+    vertical than horizontal), and in each column the pixels around the line.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def strip_pixels(
     trim : (E, 2) array [px]
         Length to leave out at the two ends.
     stride : int
-        Use every n-th column only.
+        Use only every n-th column.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -166,7 +166,7 @@ def strip_pixels(
     column = first[:, None] + stride * np.arange(count)
     a: Array = column - middle[:, :1]
     along = a / t[:, :1]
-    # Height of the curve over its tangent, to first order.
+    # Position of the curve in each column, to first order in the curvature.
     height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
@@ -174,7 +174,7 @@ def strip_pixels(
     down = np.arange(rows, dtype=np.float32)
 
     def along_axis(axis: Array) -> Single:
-        """(E, C rows) coordinates of the parallelograms' pixels along directions (E, 2) from the middles."""
+        """(E, C rows) coordinates of the parallelograms' pixels along directions (E, 2), from the middles."""
         first = (a * axis[:, :1] + (top - middle[:, 1:]) * axis[:, 1:]).astype(np.float32)
         return (first[:, :, None] + (_column(axis[:, 1]) * down)[:, None]).reshape(len(axis), -1)
 
@@ -194,7 +194,7 @@ def strip_pixels(
 
 
 def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> Single:
-    """The image at whole pixels (E, N), relative to the lines' middles; padding may lie anywhere."""
+    """Image values at pixels (E, N) given relative to the lines' middles; padding may lie outside."""
     column, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
     row *= image.shape[1]
     row += column
@@ -202,7 +202,7 @@ def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> S
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Positions of the wanted elements of each row, side by side.
+    """Indices of the wanted elements of each row, without gaps.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[
     Returns
     -------
     index : (E, M) int array
-        In the flat array; 0 beyond a row's count.
+        Indices in the flat array; 0 beyond a row's count.
     inside : (E, M) bool array
         False beyond a row's count.
     """
@@ -229,9 +229,10 @@ def _column(x: Array) -> Single:
 
 
 def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
-    """(E, C rows) which pixels, `rows` of them from `top` (E, C) in columns (E, C), lie in (E, 2) limits.
+    """(E, C rows) mask of the parallelograms' pixels inside the image; None if all are.
 
-    None if all do.
+    The pixels are `rows` consecutive ones from `top` (E, C) in each `column` (E, C); `size` (E, 2) is that of
+    the image.
     """
     wide, high = size[:, :1], size[:, 1:]
     last = top + (rows - 1)

@@ -1,13 +1,13 @@
-"""Model of the vertices, where two edges cross, for maximum-likelihood fits to their pixels.
+"""Model of vertices, where two edges cross, for maximum-likelihood fits to their pixels.
 
-The values are offset and tilt of both lines through each vertex, and those of `BatchFit`. With z1, z2 the
-distances from the two lines in sigma, towards growing r and growing c, the light is
+The values of a fit are offset and tilt of both lines through the vertex, and those of `BatchFit`. With z1, z2
+the distances from the two lines in sigma, towards growing r and growing c, the light is
 
     x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
 
-with the sign of the square between them, rho the cosine between the normals, and Q the effect of the
-parallel lines on both sides. The pixels are those of two strips along the two lines, each with the pixels
-that are nearer to its own line.
+The sign is that of the square between the normals, rho is the cosine of the angle between them, and Q is the
+effect of the parallel lines on both sides. The pixels come from two strips along the two lines, each with the
+pixels nearer to its own line.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, str
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-# Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
-# along r, then those of `BatchFit`.
+# Positions of the values of a fit: offset [px] and tilt [px over the half length] of the line along c, then
+# of that along r, then the values of `BatchFit`.
 FIRST, SECOND = 0, 2
 # Insensitive.
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
-# Terms of the series for oblique crossings up to a cosine, and for all others; tests/test_fit_models.py
-# compares them with a rendered cross.
+# Number of terms of the series for crossings with a cosine below each limit, and for all others;
+# tests/test_fit_models.py compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 
 
 @frozen_dataclass(eq=False)
 class VertexPixels(FitPixels):
-    """The pixels of vertices as the fits need them; (V, N) float32 arrays, Q with the sign of the square.
+    """Pixels of vertices for the fits; (V, N) float32 arrays, Q with the sign of the square.
 
     Attributes
     ----------
@@ -60,9 +60,9 @@ class VertexPixels(FitPixels):
 
 
 def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
-    """The lines along c and along r through vertices (V, 2), half a square to both sides.
+    """Lines along c and along r through vertices (V, 2), half a square to both sides.
 
-    Their normals point to growing r and growing c.
+    Their normals point towards growing r and growing c.
     """
     ones = np.ones(len(grid))
     flat = np.zeros(len(grid), dtype=np.bool_)
@@ -77,19 +77,19 @@ def vertex_pixels(
     shading: Shading,
     last: NDArray[np.bool_],
 ) -> VertexPixels:
-    """Gather the pixels around vertices, all of weight 1.
+    """Gather the pixels around vertices, all with weight 1.
 
     Parameters
     ----------
     image : (H, W) array
     lines : pair of Lines
     light : (V,) array
-        +1 where the square between the two normals is light, else -1.
+        +1 if the square between the two normals is light, else -1.
     sigma : (V,) array [px]
         Blur.
     shading : Shading
     last : (V, 2, 2) bool array
-        Which ends of the two lines are the board's. At a fold, another plane's light is blurred into these.
+        Which ends of the two lines are ends of the board. At a fold, light of another plane blurs into them.
     """
     parts = []
     for k in (0, 1):
@@ -102,7 +102,7 @@ def vertex_pixels(
     )
     (_, d1), (_, d2) = (_coordinates(line, u, v) for line in lines)
     nearer = np.abs(d1) <= np.abs(d2)
-    nearer[:, parts[0].u.shape[1] :] ^= True  # in the second strip, to the second line
+    nearer[:, parts[0].u.shape[1] :] ^= True  # in the second strip, nearer to the second line
     inside &= nearer
     index, inside = packed(inside, inside.sum(axis=1))
     u, v, value = (x.reshape(-1)[index] for x in (u, v, value))
@@ -118,7 +118,7 @@ def vertex_pixels(
 
 
 def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: Array) -> Single:
-    """The effect of near parallel lines on both sides of the edges."""
+    """Factor Q, the effect of near parallel lines on both sides."""
     Q = np.ones_like(distances[0])
     for line, d in zip(lines, distances, strict=True):
         for k, side in ((0, 1), (1, -1)):
@@ -137,7 +137,7 @@ def _coordinates(lines: Lines, u: Single, v: Single) -> tuple[Single, Single]:
 
 
 def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Linearised:
-    """The light around vertices with some values, and its derivatives; tails (V, 2) of the vertices."""
+    """Intensity around vertices with given values, and its derivatives; the shape has one row per vertex."""
     offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (
         x.astype(data.value.dtype)[:, None] for x in values.T
     )
@@ -169,17 +169,17 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     return Linearised(rows, z, x)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of fits that diverge, which are left out
+@np.errstate(over="ignore", invalid="ignore")  # in fits that diverge, which are rejected
 def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
-    """The effect of the angle between two lines on E(z1) E(z2), and its derivatives by z1 and z2.
+    """Correction of E(z1) E(z2) for the angle between two lines, and its derivatives by z1 and z2.
 
-    The tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1} He_{n-1},
-    with more terms for more oblique lines.
+    It is the tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1}
+    He_{n-1}, with more terms for more oblique lines.
     """
     most = float(np.abs(rho).max(initial=0.0))
     terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)
     power: Real = 4 * rho * density
-    # He_{n-1} and He_n of both.
+    # He_{n-1} and He_n of both distances.
     last1, now1, last2, now2 = np.ones_like(z1), z1, np.ones_like(z2), z2
     series, by_z1, by_z2 = power.copy(), -power * z1, -power * z2
     for n in range(2, terms + 1):

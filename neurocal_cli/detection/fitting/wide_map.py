@@ -1,15 +1,16 @@
-"""The smooth map of a board seen by a wide lens: a plane of directions, a radial profile, a polynomial.
+"""Smooth map of a board in front of a wide lens: homography to directions, radial profile, polynomial.
 
-A homography of slopes ends at 90 degrees from the axis, and a series in slopes long before. Here, with x the
-scaled grid coordinates, a homography gives directions, and their angle t from the axis the radius:
+A homography to slopes ends at 90 degrees from the axis, and a power series in slopes diverges long before.
+Here a homography maps the scaled grid coordinates x, y to directions, and their angle t from the axis gives
+the radius:
 
     D = R (h0 x + h1 y + h2, h3 x + h4 y + h5, 1 + h6 x + h7 y)
     t = angle between D and the axis,   e = unit vector of (D_u, D_v)
     q = t e sum_k a_k T_k(2 (t / t_max)^2 - 1)
     p = c + ((1 + m) q_u + n q_v, n q_u + (1 - m) q_v) + sum_k b_k T_k(x, y)
 
-R is a fixed rotation that turns z to the middle of the board, so that the homography stays regular for boards
-at any angle from the axis. `wide_start` gives the start; everything else is as in `smooth_map`.
+R is a fixed rotation of the z axis to the middle of the board, which keeps the homography regular at any
+angle from the axis. `wide_start` gives the initial map; everything else is as in `smooth_map`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _LENSES: tuple[tuple[int, ...], ...] = (
 # Prior standard deviations of the centre, of the profile beyond a_0, of m and n, and of the polynomial
 # [half diagonals].
 _CENTRE_PRIOR, _PROFILE_PRIOR, _SQUARE_PRIOR, _REST_PRIOR = 0.1, 0.3, 0.02, 0.1
-_ROOM = 1.05  # of the profile beyond the board's outermost vertex
+_ROOM = 1.05  # t_max relative to the angle of the board's outermost vertex
 _LEAST = 1e-9
 
 
@@ -75,7 +76,7 @@ class WideMap(SmoothMap):
         return np.asarray(1 / sigma**2)
 
     def _through_lens(self, ground: Array) -> Array:
-        """The map without its polynomial; see `SmoothMap`."""
+        """Map without the polynomial; see `SmoothMap`."""
         values = self.parameters
         direction, across, angle = self._seen(ground)
         stretch = angle * (values[_FIRST : _SQUARE.start] @ self._profile(angle)[0]) / across
@@ -116,7 +117,7 @@ class WideMap(SmoothMap):
         return value, out
 
     def _seen(self, ground: Array) -> tuple[Array, Array, Array]:
-        """Directions (3, N) of scaled coordinates (3, N), their length across the axis, angles from it."""
+        """Directions (3, N) of scaled coordinates (3, N), their length across the axis and angle from it."""
         direction = self.turn @ (self._homography @ ground)
         across = np.maximum(np.hypot(direction[0], direction[1]), _LEAST)
         return direction, across, np.arctan2(across, direction[2])
@@ -137,7 +138,7 @@ class WideMap(SmoothMap):
 
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:
-    """The map of an equidistant lens through vertices, (N, 2) arrays; None if none fits a plane.
+    """Fit the map of an equidistant lens to vertices; None if no plane fits them.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
-"""Whether the board ends at a side of a grid, or its pattern continues.
+"""Decide whether the board ends at a side of a grid, or its pattern continues.
 
-In: an image and a grid. Out: an `End` for each of its four sides. Beyond the outer vertices lies one more
-ring of squares. Where the board ends, the light beyond the ring is the same behind dark and light squares,
-and it begins where the next vertices would be. An occluder or the image's border cuts the ring elsewhere.
+In: an image and a grid. Out: an `End` for each of the four sides. One more ring of squares surrounds the
+outer vertices. If the board ends, the brightness beyond the ring is the same next to dark and light squares,
+and the change is where the next vertices would be. An occluder or the image border cuts the ring at another
+place.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-# Sides of a grid by the direction (c, r) that leads out of it.
+# Sides of a grid, named by their outward directions (c, r).
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
-# tests/test_identity.py classifies the ends of rendered boards, occluders and image borders.
+# With these limits tests/test_identity.py classifies ends of rendered boards, occluders and image borders.
 _STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
 _RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
-_ACROSS = np.array([0.3, 0.5, 0.7])  # of a square's width
-_SAME, _DIFFERENT = 0.35, 0.6  # of the contrast between a dark and a light square
+_ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
+_SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark and light squares
 _AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
-_SHARE = 0.75  # of the squares along a side that must agree
-_FEWEST = 2  # squares of a side that must be usable
+_SHARE = 0.75  # least share of the squares along a side that must agree
+_FEWEST = 2  # least number of usable squares at a side
 
 
 class End(Enum):
-    """What the image shows at a side of a grid."""
+    """State of a side of a grid in the image."""
 
     BOARD = "the board ends there"
     PATTERN = "the pattern goes on"
@@ -51,7 +52,7 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
 
 
 def _classify(light: NDArray[np.bool_], profile: Array) -> End:
-    """What a side's squares (N,) of the ring, light or dark, and the profiles (N, steps) across it show."""
+    """Classify a side by the colours (N,) of its ring squares and the profiles (N, steps) across the side."""
     ring = profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - light) < _SAME
     count = np.count_nonzero(valid)
@@ -73,10 +74,10 @@ def _classify(light: NDArray[np.bool_], profile: Array) -> End:
 
 
 def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
-    """Where each profile is halfway between its ends [squares]; arbitrary where these are equal."""
+    """Position where each profile is halfway between its two ends [squares]; arbitrary if they are equal."""
     rise = np.where(beyond > ring, 1.0, -1.0)[:, None]
     height = rise * (profile - 0.5 * (ring + beyond)[:, None])
-    k = np.argmax(height[:, 1:] > 0, axis=1)  # the first step that is past the middle
+    k = np.argmax(height[:, 1:] > 0, axis=1)  # the last step before the half-way level
     rows = np.arange(len(k))
     low, high = height[rows, k], height[rows, k + 1]
     share = np.minimum(np.maximum(-low / np.where(high == low, 1.0, high - low), 0.0), 1.0)
@@ -84,15 +85,15 @@ def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
 
 
 def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[NDArray[np.bool_], Array]]:
-    """Of two opposite sides: whether each square of the ring is light, and the profiles from it outwards.
+    """Colours of the ring squares at two opposite sides, True for light, and the profiles outwards from them.
 
-    A profile is 0 where it is dark and 1 where it is light, NaN where it leaves the image or vertices are
-    missing. The vertices (rows, n, 2) [px] are parallel to the sides, those along each in image order.
+    A profile is 0 at the dark and 1 at the light level, and NaN outside the image and where vertices are
+    missing. `rows` are the lines of vertices (rows, n, 2) [px] parallel to the two sides.
     """
     few = min(len(rows), 3)
     ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
     outer = np.array([[-1], [len(rows) - 1]])
-    # A square's colour is that of its first vertex.
+    # The colour of a square follows from the indices of its first vertex.
     light = (np.arange(rows.shape[1] - 1) + outer + dark) % 2 == 1
     inner = _between(0.5 * (ends[:, 0] + ends[:, 1]), np.array([0.5]))  # centres of the squares inside
     places = _between(_beyond(ends), _ACROSS)  # (2, steps, n - 1, across, 2)
@@ -100,7 +101,7 @@ def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[N
     level, values = values[: light.size].reshape(light.shape), values[light.size :].reshape(places.shape[:-1])
     padded = np.full((2, light.shape[1] + 2), np.nan)
     padded[:, 1:-1] = level
-    # The squares beside the inner one have the colour of the ring's square; one of them may be missing.
+    # The neighbours of the inner square have the colour of the ring square; one of them may be missing.
     before, after = padded[:, :-2], padded[:, 2:]
     same = 0.5 * (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after))
     contrast = np.where(light, same - level, level - same)
@@ -111,7 +112,7 @@ def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[N
 
 
 def _beyond(ends: Array) -> Array:
-    """Points (2, steps, n, 2) beyond rows (2, 2 or 3, n, 2), by parabolas through three of them, or lines."""
+    """Extrapolate rows (2, 2 or 3, n, 2) outwards to points (2, steps, n, 2), by parabolas or lines."""
     t = -_STEPS[:, None, None]
     first, second = ends[:, :1], ends[:, 1:2]
     line = first + t * (second - first)
@@ -122,12 +123,12 @@ def _beyond(ends: Array) -> Array:
 
 
 def _between(line: Array, shares: Array) -> Array:
-    """Points between neighbours on lines (..., n, 2); (..., n - 1, shares, 2) array."""
+    """Interpolate between neighbours on lines (..., n, 2); (..., n - 1, shares, 2) array."""
     return line[..., :-1, None, :] + shares[:, None] * (line[..., 1:, None, :] - line[..., :-1, None, :])
 
 
 def _sample(grey: NDArray[np.generic], places: Array) -> Array:
-    """The image at places (N, 2), by linear interpolation in float64; NaN outside."""
+    """Interpolate the image linearly at places (N, 2), in float64; NaN outside."""
     height, width = grey.shape
     if height < 2 or width < 2:
         return np.full(len(places), np.nan)

@@ -1,16 +1,16 @@
-"""Identifying the vertices of grids with those of the board.
+"""Identify the vertices of grids with those of the board.
 
 In: a board, the grids of an image, and the image. Out: `Located` grids. The criteria, in this order:
 
-1. A grid lies on a plane of its size. A partly hidden grid needs enough visible ends of the board to
-   make its position unique.
-2. Planes at an angle must fit one camera, which determines the orientation of each. A board in one
-   plane is seen from the side on which its axes have the same handedness as u and v.
+1. A grid is placed on a plane of its size. A partly hidden grid must show enough ends of the board that only
+   one place is left.
+2. Planes at an angle must fit one camera, which determines the orientation of each. A board in one plane is
+   seen from the side from which its axes have the handedness of u and v.
 3. Among the remaining arrangements, the square at vertex (0, 0) is dark on the first plane where they
-   differ; for a single board, OpenCV's `findChessboardCorners` begins at the same corner.
+   differ. For a single board, this is the corner at which OpenCV's `findChessboardCorners` begins.
 4. Arrangements with equal colours are distinguished by the image: of two, the one whose x axis points
-   right or down; of four, the one whose x axis points right. This changes when the board turns, so the
-   user is warned.
+   right or down; of four, the one whose x axis points right. The choice changes if the board is turned, so
+   the user is warned.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # tests/test_identity.py accepts and refuses rendered boards with these limits.
-_CLEARLY = 3.0  # ratio to the best rms error from which an arrangement is excluded
-_NOISE = 0.05  # px; rms errors below this exclude nothing
+_CLEARLY = 3.0  # ratio to the best rms error above which an arrangement is excluded
+_NOISE = 0.05  # px; least rms error in this ratio
 _MISFIT = 0.25  # squares; greatest rms error of the best arrangement, for distortion and uneven boards
 _SAMPLES = 25  # vertices of a grid used in these tests
-_NEARER = 1.5  # ratio of the squares' sizes from which on the larger of two boards is preferred
-_MOST_TRIED = 5000  # arrangements that are tried, for time; small pieces of large planes have more
-_KEPT = 200  # best arrangements that are extended by a further grid, for time
+_NEARER = 1.5  # ratio of the squares' sizes above which the larger of two boards is preferred
+_MOST_TRIED = 5000  # limits the time; small pieces of large planes have more arrangements
+_KEPT = 200  # best arrangements that are extended by a further grid; limits the time
 
 
 @frozen_dataclass(eq=False)
@@ -70,7 +70,7 @@ class Identified:
     located : tuple of Located
         In the order of the board's planes.
     warnings : tuple of str
-        The same texts in all images of a board that they concern.
+        Their texts do not depend on the image.
     """
 
     located: tuple[Located, ...]
@@ -84,14 +84,15 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
     ----------
     board : Board
     grids : sequence of Grid
-        All grids found in the image, also those that do not belong to the board.
+        All grids found in the image, including those that do not belong to the board.
     grey : (height, width) array
-        The image, for the ends of the board.
+        The image, in which the ends of the board are searched.
 
     Raises
     ------
     NoBoardError
-        No board, a board of another size, or several possible arrangements. The message says which.
+        There is no board, a board of another size, or more than one possible arrangement. The message says
+        which.
     """
     if not grids:
         if all(min(plane.cols, plane.rows) < 3 for plane in board.planes):
@@ -122,14 +123,14 @@ class _Candidate:
 
 @frozen_dataclass
 class _Arrangement:
-    """Placements for all grids together, and the rms error of one camera for them [px]."""
+    """One placement for each grid, and the rms error of a common camera [px]."""
 
     placements: tuple[Placement, ...]
     rms: float = 0.0
 
 
 def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> list[_Candidate]:
-    """Grids with possible placements, whole planes first; at most one for each plane."""
+    """Grids with possible placements, whole planes first; at most as many as the board has planes."""
     every = [_candidate(board, trimmed(grid, board.planes), grey) for grid in grids]
     usable = sorted((c for c in every if c.placements), key=lambda c: (-c.whole, -int(c.grid.seen.sum())))
     largest = max(every, key=lambda c: int(c.grid.seen.sum()))
@@ -142,7 +143,7 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
 
 
 def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
-    """Whether a grid may be a piece of the board of another size that a larger grid belongs to."""
+    """Whether a grid may be a piece of a larger grid's board, which has another size."""
     ends_seen = candidate.whole and set(candidate.ends.values()) == {End.BOARD}
     smaller = candidate.grid.seen.sum() < other.grid.seen.sum()
     behind = candidate.grid.square >= _NEARER * other.grid.square
@@ -150,9 +151,9 @@ def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
 
 
 def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate]:
-    """Whole planes, of each size as many as the board has: the nearest ones, if clearly nearer.
+    """Choose whole planes: of each size as many as the board has, the nearest if they are clearly nearer.
 
-    A board on a screen in the background, or mirrored in a window, looks much smaller than the board in
+    A board on a screen in the background, or mirrored in a window, appears much smaller than the board in
     front of the camera.
     """
     kept: list[_Candidate] = []
@@ -176,7 +177,7 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
         k for k, plane in enumerate(board.planes) if sorted(grid.shape) == sorted((plane.cols, plane.rows))
     ]
     ends = board_ends(grey, grid) if alone or not alike else {}
-    if not alone:  # beyond a fold lies the pattern of another plane
+    if not alone:  # the pattern of another plane continues beyond a fold
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
     possible = [
         placement
@@ -189,7 +190,7 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
 
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
-    """Arrangements of all grids that one camera can see, the best one first."""
+    """Arrangements of all grids that fit one camera, the best first."""
     if len(board.planes) == 1:
         return [_Arrangement((placement,)) for placement in chosen[0].placements]
     flat = is_flat(np.concatenate([_corners(plane) for plane in board.planes]))
@@ -213,7 +214,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement
         if not candidate.whole and count > 2 and found[0].rms > _CLEARLY * max(before, _NOISE):
             raise NoBoardError("a detected grid matches no plane of the board; hide other patterns")
         before = found[0].rms
-        # One that is poor with two planes may be the best with three.
+        # An arrangement that is poor with two planes may be the best with three.
         limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(found[0].rms, _NOISE)
         found = [one for one in found if one.rms <= limit][: None if count == len(chosen) else _KEPT]
     if len(chosen) > 1 and found[0].rms > _MISFIT * min(c.grid.square for c in chosen):
@@ -250,7 +251,7 @@ def _resolve_symmetry(
     left = [one for one, colour in zip(arrangements, colours, strict=True) if colour == max(colours)]
     if len(left) == 1:
         return left[0].placements, ()
-    # Ties are at 45 degrees to the axes of the image, an unusual pose.
+    # Ties occur at 45 degrees to the axes of the image, an unusual pose.
     towards = np.array([1.0, 1.0]) if len(left) == 2 else np.array([1.0, 0.0])
 
     def leading(arrangement: _Arrangement) -> tuple[float, float]:
@@ -261,7 +262,7 @@ def _resolve_symmetry(
 
 
 def _colours(grids: Sequence[Grid], arrangement: _Arrangement) -> tuple[bool, ...]:
-    """Whether the square at vertex (0, 0) is dark, plane by plane in the board's order."""
+    """Whether the square at vertex (0, 0) is dark, for each plane in the board's order."""
     pairs = sorted(zip(arrangement.placements, grids, strict=True), key=lambda pair: pair[0].plane)
     return tuple(placement.first_square_is_dark(grid.dark) for placement, grid in pairs)
 

@@ -1,7 +1,7 @@
-"""How well points of several planes fit one projective camera, by the direct linear transform.
+"""Fit one projective camera to points of several planes by the direct linear transform.
 
-It tests arrangements of grids in `identify`. Distortion is not modelled: its few pixels are small compared
-with the squares by which wrong arrangements miss.
+`identify` tests arrangements of grids with it. Distortion is not modelled: its few pixels are small compared
+with the errors of wrong arrangements, which are whole squares.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_FLAT = 1e-6  # ratio of smallest and largest extent of points in one plane: rounding errors
-_WEAK = 3.0  # ratio by which an affine camera must fit worse for perspective to be certain
+_FLAT = 1e-6  # greatest ratio of thickness to extent of points in one plane, for rounding errors
+_WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by this factor
 
 
 @frozen_dataclass
@@ -23,8 +23,8 @@ class CameraFit:
     ----------
     rms : float [px]
     handed : int
-        1 for a camera, -1 for the mirror image of one, 0 if undecided: too little perspective, or all points
-        in one plane.
+        1 for a camera, -1 for a mirror image, 0 if undetermined because of too little perspective or because
+        all points lie in one plane.
     """
 
     rms: float
@@ -45,7 +45,7 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
     world : (N, 3) array
     pixels : (N, 2) array [px]
     front : (3,) array, optional
-        Of points in one plane, the normal that must point away from the camera.
+        For points in one plane, its normal that must point away from the camera.
     """
     plane = _plane_coordinates(world, front) if is_flat(world) else None
     points = world if plane is None else plane
@@ -80,7 +80,7 @@ def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
 
 
 def _plane_coordinates(world: Array, front: Array | None) -> Array:
-    """Coordinates within the points' plane, turning clockwise when seen against `front`."""
+    """Coordinates within the points' plane; with `front`, their axes and `front` are right-handed."""
     centred = world - world.mean(axis=0)
     x, y, normal = np.linalg.svd(centred, full_matrices=False)[2]
     if front is not None and normal @ front * np.linalg.det([x, y, normal]) < 0:
@@ -89,7 +89,7 @@ def _plane_coordinates(world: Array, front: Array | None) -> Array:
 
 
 def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
-    """Matrix (3, d + 1) that projects points (N, d) to pixels, and its rms error [px]."""
+    """Projection matrix (3, d + 1) from points (N, d) to pixels, and its rms error [px]."""
     T, x = _scaled(points)
     S, d = _scaled(pixels)
     zeros = np.zeros_like(x)
@@ -112,7 +112,7 @@ def _rms(error: Array) -> float:
 
 
 def _scaled(points: Array) -> tuple[Array, Array]:
-    """Matrix that centres and scales points, and the homogeneous points it gives."""
+    """Matrix that centres and scales points, and the scaled homogeneous points."""
     centre = points.mean(axis=0)
     size = float(np.sqrt(((points - centre) ** 2).mean())) or 1.0
     d = points.shape[1]

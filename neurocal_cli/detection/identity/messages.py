@@ -1,4 +1,4 @@
-"""Messages about images whose grids cannot be located on the board."""
+"""Error messages about images whose grids cannot be located on the board."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ SYMMETRIC_BOARD = (
 
 
 class NoBoardError(NeurocalError):
-    """An image does not show the board, or not enough of it to locate its points.
+    """The image does not show the board, or not enough of it to locate its points.
 
     Parameters
     ----------
     message : str
     shown : (cols, rows), optional
-        Inner vertices of the board that the image shows instead of the given one.
+        Number of inner vertices of the board that the image shows instead of the wanted one.
     """
 
     def __init__(self, message: str, shown: tuple[int, int] | None = None) -> None:
@@ -32,12 +32,12 @@ class NoBoardError(NeurocalError):
 
 
 def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
-    """The error about a grid that has no place on the board."""
+    """Make the error about a grid that does not fit on the board."""
     wanted = _sizes(board)
     shape = grid.shape
     if len(board.planes) == 1:
         plane = board.planes[0]
-        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # in the user's order of columns and rows
+        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # columns and rows in the user's order
             shape = shape[1], shape[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
             return NoBoardError(
@@ -52,14 +52,13 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
 
 
 def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
-    """The message about grids with several arrangements, the best one with an rms error [px]."""
+    """Make the message about grids with several possible arrangements, the best with an rms error [px]."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:
         return (
-            f"detected {_size(part.shape)} of {_sizes(board)} inner vertices, but it is ambiguous which "
-            "ones; "
-            "show the whole board, or its outer border on more sides"
+            f"detected {_size(part.shape)} of {_sizes(board)} inner vertices, but it is ambiguous "
+            "which ones; show the whole board, or its outer border on more sides"
         )
     if len(grids) < len(board.planes):
         return (
@@ -68,8 +67,7 @@ def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
         )
     return (
         f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
-        "axes, "
-        "or take the image from nearer"
+        "axes, or take the image from nearer"
     )
 
 

@@ -1,4 +1,4 @@
-"""Placements of a grid on a plane of the board: turned, mirrored if seen from behind, and shifted."""
+"""Placements of a grid on a plane of the board: rotated, mirrored if seen from behind, and shifted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Placement:
     plane : int
         Position among the board's planes.
     matrix : 2 x 2 ints
-        A turn by a multiple of 90 degrees, or one with a reflection.
+        A rotation by a multiple of 90 degrees, with or without a reflection.
     offset : 2 ints
     """
 
@@ -47,13 +47,13 @@ class Placement:
         Parameters
         ----------
         dark : int
-            The grid's; see `Grid`.
+            That of the grid; see `Grid`.
         """
         centre = (np.array([0.5, 0.5]) - np.array(self.offset)) @ np.array(self.matrix)  # matrix^-1
         return bool((np.floor(centre).sum() + dark) % 2 == 0)
 
     def axis(self, grid: Grid) -> Array:
-        """Direction in the image of the plane's x axis, in the middle of a grid; (2,) unit vector."""
+        """Mean direction of the plane's x axis in the image of a grid; (2,) unit vector."""
         steps = (np.diff(grid.pixels, axis=1), np.diff(grid.pixels, axis=0))  # along c, along r
         along_c, along_r = (np.nanmean(step.reshape(-1, 2), axis=0) for step in steps)
         axis = self.matrix[0][0] * along_c + self.matrix[0][1] * along_r
@@ -68,7 +68,7 @@ def placements(
     *,
     mirrored: bool,
 ) -> Iterator[Placement]:
-    """All placements of a grid on a plane that agree with its ends.
+    """Enumerate the placements of a grid on a plane that agree with the board's ends.
 
     Parameters
     ----------
@@ -77,14 +77,14 @@ def placements(
     index : int
         Of the plane on its board.
     ends : dict of End
-        By the sides' directions; an absent one is unknown.
+        By the directions of the grid's sides; absent sides are unknown.
     mirrored : bool
         Whether the plane may be seen from behind.
     """
     last = plane.cols - 1, plane.rows - 1
     cols, rows = grid.shape
     for matrix in (*_TURNS, *(_MIRRORED if mirrored else ())):
-        corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # opposite to (0, 0)
+        corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # the grid's, opposite to (0, 0)
         size = abs(corner[0]), abs(corner[1])
         for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
             stop = start[0] + size[0], start[1] + size[1]
@@ -99,7 +99,7 @@ def _allowed(
     last: tuple[int, int],
     ends: Mapping[tuple[int, int], End],
 ) -> bool:
-    """Whether a grid's sides lie at the plane's ends, 0 and `last`, exactly where the board ends."""
+    """Whether a grid's sides lie at the ends of the plane, 0 and `last`, exactly where the board ends."""
     for direction, end in ends.items():
         if end is End.UNKNOWN:
             continue

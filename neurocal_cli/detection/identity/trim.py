@@ -1,7 +1,7 @@
-"""Removing outer lines of a grid that are not lines of the board.
+"""Remove outer lines of a grid that are not lines of the board.
 
-A corner of the paper can look like a vertex where the paper ends near the outer squares, and so can the
-corner of a square at a fold.
+False vertices occur where a corner of the paper lies near the outer squares, and at corners of squares on a
+fold.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ Side = tuple[slice | int, ...]
 
 _SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
 
-# tests/test_identity.py removes such lines, and keeps them on larger boards.
-_FEW = 0.34  # greatest share of vertices of a line that may be removed
-_FEW_AT_FOLDS = 0.6  # the same for several planes, because the fit of one camera tests them afterwards
+# With these limits tests/test_identity.py removes false lines, and keeps those of larger boards.
+_FEW = 0.34  # a line may be removed if at most this share of its vertices was found
+_FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a camera afterwards
 
 
 def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
@@ -33,7 +33,7 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     Returns
     -------
     grid : Grid
-        The given one if it fits, or does not fit without such lines either.
+        The given one if it fits, or if removing such lines does not make it fit.
     """
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
@@ -53,7 +53,7 @@ def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
 
 
 def _without(grid: Grid, side: Side) -> Grid:
-    """The grid without the line of a side, and without lines that are empty then."""
+    """Remove the line of a side, and lines that are then empty."""
     pixels = grid.pixels.copy()
     pixels[side] = np.nan
     seen = np.isfinite(pixels[..., 0])

@@ -1,1 +1,1 @@
-"""Camera files of other programs: each format one module, and between them one `CameraSet`."""
+"""Camera files of other programs: one module per format, which converts to and from a `CameraSet`."""

@@ -1,4 +1,4 @@
-"""The content of a camera file, independent of the program that wrote it."""
+"""Contents of a camera file of any program, and properties of the formats."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class CameraSet:
     ----------
     cameras : tuple of Camera
     relative : tuple of Pose
-        Of each further camera, from the first one: ``X_k = R X_0 + t``; one less than the cameras.
+        From the first camera to each further one: ``X_k = R X_0 + t``; one less than the cameras.
     poses : dict of Pose by view
         From the world to the first camera.
     unit : str, optional
         Of the translations; None if the file does not state it.
     origin : Calibration or Rig, optional
-        The full content of a neurocal file.
+        The whole contents of a neurocal file.
     program : str
-        The program that wrote the file, for messages.
+        Name of the program that wrote the file, for messages.
     """
 
     cameras: tuple[Camera, ...]
@@ -44,22 +44,22 @@ class CameraSet:
     def __post_init__(self) -> None:
         if len(self.relative) != len(self.cameras) - 1:
             raise InputError(
-                f"holds {len(self.cameras)} cameras, but not how they stand to each other; give a file with "
+                f"holds {len(self.cameras)} cameras, but not their relative poses; give a file with "
                 "one camera, or with the poses"
             )
 
     @property
     def has_lengths(self) -> bool:
-        """Whether it holds any translation, so that the unit matters."""
+        """Whether there is any translation, so that the unit matters."""
         return bool(self.relative or self.poses)
 
     def in_metres(self) -> CameraSet:
-        """The same with translations in metres.
+        """Convert the translations to metres.
 
         Raises
         ------
         InputError
-            A unit that is not known, or no length.
+            The unit is unknown or not a length.
         """
         if not self.has_lengths:
             return self
@@ -80,26 +80,26 @@ class CameraSet:
 
 @frozen_dataclass
 class Format:
-    """The capabilities of one program's file format, and its writer.
+    """Capabilities of a file format, and the function that writes it.
 
     Attributes
     ----------
     program : str
         Name for messages.
     models : tuple of str
-        Distortion models that it supports, by our names, the simplest first.
+        Our names of its distortion models, the simplest first.
     skew : bool
         Whether its programs support skew.
     poses : bool
-        Whether it holds the poses of views.
+        Whether it contains the poses of views.
     most_cameras : int
     metres : bool
-        Whether lengths are metres.
+        Whether lengths are in metres.
     needs_size : bool
-        Whether the size of the images must be known.
+        Whether the image size must be known.
     text : callable
-        The files' contents by their names; "" is the name of a single file. Its arguments are the cameras,
-        which fit the format, and the ending of the output's name, such as ".xml".
+        Returns the contents of the files by name; "" is the name of a single file. The arguments are the
+        cameras, which must fit the format, and the extension of the output, such as ".xml".
     """
 
     program: str

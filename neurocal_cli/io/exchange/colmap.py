@@ -1,8 +1,8 @@
 """COLMAP's text models: ``cameras.txt``, and in its folder ``images.txt``, ``rigs.txt`` and ``frames.txt``.
 
-The centre of the top-left pixel is (1/2, 1/2), so that principal points are larger by half a pixel than ours.
-An image's pose takes the world into its camera; a rig's sensor has a pose from the rig's frame, which is that
-of its reference camera.
+The centre of the top-left pixel is (1/2, 1/2), so principal points are larger than ours by half a pixel. The
+pose of an image maps the world to its camera. The pose of a rig's sensor maps the rig's frame, which is that
+of its reference camera, to the sensor.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quater
 from neurocal_cli.io.files import read_text, value_failures
 from neurocal_cli.io.yaml_text import number
 
-_HALF = 0.5  # of a pixel, from our origin to COLMAP's
+_HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
 
-# Our model, how many focal lengths, and for each of our coefficients the place of COLMAP's or None for 0.
+# Our model, number of focal lengths, and for each of our coefficients the index of COLMAP's, or None for 0.
 _MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
     "SIMPLE_PINHOLE": ("none", 1, ()),
     "PINHOLE": ("none", 2, ()),
@@ -35,7 +35,7 @@ _MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
     "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0, None, None, None)),
     "RADIAL_FISHEYE": ("fisheye", 1, (0, 1, None, None)),
-    # Of versions from 4 on.
+    # Since version 4.
     "SIMPLE_FISHEYE": ("fisheye", 1, (None, None, None, None)),
     "FISHEYE": ("fisheye", 2, (None, None, None, None)),
     "EUCM": ("eucm", 2, (0, 1)),
@@ -50,17 +50,17 @@ _NAMES = {
 
 
 def is_folder(name: str) -> bool:
-    """Whether this is a folder, which only COLMAP's models are."""
+    """Whether this is a folder, which only COLMAP uses for its models."""
     return name != "-" and os.path.isdir(name)
 
 
 def read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model, their relative poses and the poses of the images.
+    """Read the cameras of a model with their relative poses and the poses of the images.
 
     Raises
     ------
     FormatError
-        No text model.
+        The folder is not a text model.
     """
     path = os.path.join(folder, "cameras.txt")
     if not os.path.exists(path):
@@ -83,7 +83,7 @@ def parse(text: str, source: str) -> CameraSet:
     Raises
     ------
     FormatError, InputError
-        A line that is no camera, a model that is not known, several cameras.
+        A line is not a camera, its model is unknown, or there are several cameras.
     """
     return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
 
@@ -97,7 +97,7 @@ def _cameras(text: str, source: str) -> dict[int, Camera]:
     cameras = {}
     for k, words in _lines(text):
         if not words[0].isdecimal():
-            raise FormatError("is no line of a camera; correct it", source, k)
+            raise FormatError("is not the line of a camera; correct it", source, k)
         cameras[int(words[0])] = _camera(words, source, k)
     return cameras
 
@@ -114,14 +114,16 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
         if len(values) != focal + 2 + len([p for p in places if p is not None]):
             raise ValueError
     except (ValueError, IndexError) as error:
-        raise FormatError(f"is no line of a {model} camera; correct it", source, line) from error
+        raise FormatError(
+            f"is not the line of a camera with the model {model}; correct it", source, line
+        ) from error
     f, (cx, cy), k = values[:focal], values[focal : focal + 2] - _HALF, values[focal + 2 :]
     coefficients = np.array([0.0 if p is None else k[p] for p in places])
     return Camera(Intrinsics(f[0], f[-1], cx, cy), Distortion(ours, coefficients), size, f"camera{words[0]}")
 
 
 def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
-    """Poses of the further cameras from the first one."""
+    """Poses of the further cameras relative to the first one."""
     path = os.path.join(folder, "rigs.txt")
     if len(ids) == 1 or not os.path.exists(path):
         return ()
@@ -144,7 +146,7 @@ def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
     except (ValueError, IndexError, KeyError) as error:
         if isinstance(error, FormatError):
             raise
-        raise FormatError("is no line of a rig of these cameras; correct it", source, line) from error
+        raise FormatError("is not the line of a rig of these cameras; correct it", source, line) from error
 
 
 def _poses(folder: str, camera: int) -> dict[str, Pose]:
@@ -153,7 +155,7 @@ def _poses(folder: str, camera: int) -> dict[str, Pose]:
     if not os.path.exists(path):
         return {}
     text, source = read_text(path)
-    # The two lines of an image: the pose, and its points, which may be none at all.
+    # Each image has two lines: its pose, and its points, which may be empty.
     rows = [(k, line) for k, line in enumerate(text.split("\n"), start=1) if not line.startswith("#")]
     poses = {}
     for k, line in rows[::2]:
@@ -164,7 +166,7 @@ def _poses(folder: str, camera: int) -> dict[str, Pose]:
             if int(words[8]) == camera:
                 poses[words[9].strip()] = _pose(np.array(words[1:8], dtype=float))
         except (ValueError, IndexError) as error:
-            raise FormatError("is no line of an image; correct it", source, k) from error
+            raise FormatError("is not the line of an image; correct it", source, k) from error
     return poses
 
 
@@ -194,7 +196,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         for camera, mounted in enumerate(rig, start=1):
             number_of_image += 1
             data.append(f"CAMERA {camera} {number_of_image}")
-            # As in COLMAP's own rigs, each camera's images are in a folder of its name.
+            # As in COLMAP's rigs, the images of each camera are in a folder with its name.
             name = f"camera{camera}/{_word(view)}" if len(rig) > 1 else _word(view)
             files["images.txt"] += [f"{number_of_image} {_seven(after(mounted, pose))} {camera} {name}", ""]
         files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
@@ -202,7 +204,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 
 
 def _word(name: str) -> str:
-    """A name without blanks, where COLMAP's reader ends it."""
+    """Replace blanks in a name, because COLMAP's reader ends it there."""
     return "_".join(name.split()) or "_"
 
 

@@ -1,4 +1,4 @@
-"""Points in the formats of other programs: all views of one target as an array, or mrcal's table."""
+"""Write points for other programs: all views of one target as an array, or mrcal's table."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def corner_text(points: Correspondences, target: str, ending: str) -> str | byte
     target : str
         ``neurocal, opencv, matlab, json, npz`` or ``mrcal``.
     ending : str
-        Of the output's name, such as ".xml".
+        Extension of the output, such as ".xml".
 
     Raises
     ------
     InputError
-        A program that has no format for points, or points that its format cannot hold.
+        The program reads no files of points, or cannot represent these points.
     """
     if target == "neurocal":
         return format_points(points)
@@ -44,7 +44,7 @@ def corner_text(points: Correspondences, target: str, ending: str) -> str | byte
 
 
 def points_lost(points: Correspondences, target: str) -> list[str]:
-    """What the file cannot hold."""
+    """Remarks about properties of the points that are lost in the file."""
     if target == "neurocal":
         return []
     lost = []
@@ -59,7 +59,7 @@ def points_lost(points: Correspondences, target: str) -> list[str]:
 
 
 def _array(points: Correspondences) -> tuple[Array, list[str], Array]:
-    """World points (N, 3), their ids, and the pixels of each view (V, N, 2), NaN for missing points."""
+    """World points (N, 3), their ids, and the pixels of each view (V, N, 2), NaN where missing."""
     if points.point is not None:
         labels = [str(label) for label in points.point]
     else:
@@ -115,7 +115,7 @@ def _matlab(points: Correspondences, ending: str) -> bytes:
 
 
 def _mrcal(points: Correspondences, ending: str) -> str:
-    """A line for each vertex of the board, row by row; ``-`` for one that was not found."""
+    """Write a line for each vertex of the board, row by row; ``-`` if it was not found."""
     _, ids, pixels = _array(points)
     try:
         grid = np.array([[int(part) for part in label.split(":")] for label in ids])

@@ -1,11 +1,11 @@
-"""Points that other programs measured: corners of boards in dictionaries, lists and tables.
+"""Read corners of boards measured by other programs.
 
-* A dictionary (FileStorage, JSON, ``.npz``, ``.mat``) with image points of each view and places on the board;
+* A dictionary (FileStorage, JSON, ``.npz``, ``.mat``) with image points of each view and board points;
 * a single ``.npy`` array of image points;
 * mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
-* text files of numbers: one with the places on the board, and one for each view.
+* text files of numbers: one with the board points, and one for each view.
 
-Corners without a position on the board need the board. MATLAB counts pixels from 1, and corners down the
+If the files have no board points, the board must be given. MATLAB counts pixels from 1, and corners along the
 columns of the board. Kalibr has no file of corners: it detects them in a bag in each run.
 """
 
@@ -55,26 +55,26 @@ def read_corners(
     Parameters
     ----------
     paths : sequence of str or Path
-        One file, or the places on the board and then a file for each view.
+        One file; or a file of board points and then a file for each view.
     board : Board, optional
-        World positions of the corners, for files that do not state them.
+        Gives the board points if the files do not.
     notes : list of str
-        Remarks about what was left out are appended.
+        Remarks about ignored columns are appended.
     unit : str, optional
-        Of the places that a file states.
+        Of the board points in a file.
 
     Returns
     -------
-    Correspondences, or None where the first file holds no points.
+    Correspondences, or None if the first file has no points.
 
     Raises
     ------
     FormatError
-        A file that cannot be read, or corners that are not those of the board.
+        A file cannot be read, or its corners are not those of the board.
     """
     names = [str(path) for path in paths]
     if "-" in names:
-        return None  # it can be read only once, and may be a camera
+        return None  # stdin can be read only once, and may be a camera
     data, source = read_bytes(names[0])
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
         return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
@@ -119,7 +119,7 @@ def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspon
 def _corners(
     root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
 ) -> Correspondences:
-    """Points of a dictionary.
+    """Read the points of a dictionary.
 
     Parameters
     ----------
@@ -127,9 +127,9 @@ def _corners(
     board : Board, optional
     unit : str, optional
     first : float
-        Number of the first pixel.
+        Coordinate of the first pixel.
     down : bool
-        Whether corners without places run down the columns of the board, one after the other.
+        Whether corners without board points run along the columns of the board, one after the other.
     """
     field = next(root[name] for name in _IMAGE if name in root)
     pixels = _stack(field, 2) - first
@@ -150,7 +150,7 @@ def _corners(
 
 
 def _of_board(board: Board | None, count: int, field: Field, down: bool = False) -> tuple[Array, list[str]]:
-    """The vertices of a board of one plane, (1, N, 3), and their ids, along its rows or down its columns."""
+    """Vertices (1, N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
     if board is None:
         raise FormatError(
             f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
@@ -173,7 +173,7 @@ def _of_board(board: Board | None, count: int, field: Field, down: bool = False)
 
 
 def _stack(field: Field, width: int) -> Array:
-    """Points of each view, (V, N, width); places on a board may lack Z."""
+    """Points of each view, (V, N, width); board points may lack Z."""
     value = field.value
     if isinstance(value, dict):  # an OpenCV matrix, of one channel or several
         data = field["data"].array(-1, unknown=True)
@@ -203,11 +203,11 @@ def _stack(field: Field, width: int) -> Array:
 def _assembled(
     world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
 ) -> Correspondences:
-    """Rows of all views; corners that are NaN were not found. Board positions of one view hold for all."""
+    """Join the views to one data set, without corners that are NaN; `world` is (V, N, 3) or (1, N, 3)."""
     views, count = pixels.shape[:2]
     found = np.isfinite(pixels).all(axis=2)
     if not found.any():
-        raise FormatError("holds no corner that was found; give another file", source)
+        raise FormatError("has no detected corner; give another file", source)
     labels = ids if ids is not None else [str(k) for k in range(count)]
     with value_failures(""):
         return Correspondences(
@@ -242,7 +242,7 @@ def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> 
 
 
 def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board | None:
-    """The board of the variables that MATLAB's examples use: [rows, columns] of squares, and their side."""
+    """Read the board from variables of MATLAB's examples: [rows, columns] of squares, and their side."""
     size = next((tree[name] for name in ("boardSize", "patternDims") if name in tree), None)
     side = next((tree[name] for name in ("squareSize", "squareSizeInMM") if name in tree), None)
     if size is None or side is None:
@@ -258,7 +258,7 @@ def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board 
 
 
 def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
-    """Read mrcal's table; a corner that was not found is ``-``, and each level doubles the sigma."""
+    """Read mrcal's table; ``-`` means a corner was not found, and each level doubles sigma."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -273,7 +273,7 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
             level = float(words[3]) if len(words) > 3 and words[3] != "-" else 0.0
             corners.append((float(words[1]), float(words[2]), level))
         except (ValueError, IndexError) as error:
-            raise FormatError("is no line 'filename x y level'; correct it", source, number) from error
+            raise FormatError("is not a line 'filename x y level'; correct it", source, number) from error
     seen = {name: corners for name, corners in rows.items() if corners}
     counts = {len(corners) for corners in seen.values()}
     if len(counts) != 1:
@@ -282,7 +282,7 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
         )
     stack = np.array(list(seen.values()))
     world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
-    # A negative level marks a corner that mrcal itself takes for an outlier.
+    # A negative level marks a corner that mrcal considers an outlier.
     pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
     found = np.isfinite(pixels).all(axis=2)
     points = _assembled(world, pixels, _stems(seen), ids, board.unit if board else None, source)
@@ -293,7 +293,7 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
 
 
 def _separate(names: list[str], board: Board | None, unit: str | None) -> Correspondences | None:
-    """Files of numbers: the places on the board, X Y Z, unless a board is given, and u v of each view."""
+    """Read files of numbers: board points X Y Z, unless a board is given, and u v of each view."""
     tables = [_table(name) for name in names]
     if tables[0].shape[1] == 3 or board is None:
         if len(tables) == 1:
@@ -314,7 +314,7 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
 
 
 def _stems(names: Iterable[str]) -> list[str]:
-    """Names of files without folder and ending, if they still differ."""
+    """Names of files without folder and extension; the full names if these are not distinct."""
     stems = [Path(name).stem for name in names]
     return stems if len(set(stems)) == len(stems) else list(names)
 
@@ -329,7 +329,7 @@ def _table(name: str) -> Array:
         try:
             rows.append([float(word) for word in words if word])
         except ValueError as error:
-            raise FormatError("is no row of numbers; correct it", source, number) from error
+            raise FormatError("is not a row of numbers; correct it", source, number) from error
         if len(rows[-1]) != len(rows[0]) or len(rows[0]) not in (2, 3):
             raise FormatError("must be a row of 2 numbers or of 3, as all the others", source, number)
     if not rows:

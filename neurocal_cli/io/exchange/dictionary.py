@@ -1,9 +1,9 @@
 """Dictionaries of matrices: OpenCV's FileStorage (YAML, XML, JSON), plain JSON, NumPy's ``.npz``.
 
 One camera has ``camera_matrix`` and ``distortion_coefficients``; two have ``M1, D1, M2, D2, R, T`` as in
-OpenCV's stereo sample. Poses of views are ``extrinsic_parameters``, a row each of rotation vector and
-translation, as in its calibration sample, or ``rvecs`` and ``tvecs``, what ``calibrateCamera`` returns. Of
-OpenCV's omnidirectional cameras ``xi`` stands beside k1, k2, p1, p2.
+OpenCV's stereo sample. Poses of views are ``extrinsic_parameters``, with a row of rotation vector and
+translation for each view as in OpenCV's calibration sample, or ``rvecs`` and ``tvecs`` as returned by
+``calibrateCamera``. OpenCV's omnidirectional cameras have ``xi`` in addition to k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def from_tree(root: Field) -> CameraSet:
     Raises
     ------
     InputError, FormatError
-        What is missing or wrong.
+        A key is missing or wrong.
     """
     unit = root.read("unit", Field.text)
     sides = _sides(root)
@@ -57,26 +57,24 @@ def from_tree(root: Field) -> CameraSet:
     R = next((root[key] for key in _ROTATIONS if key in root), None)
     t = next((root[key] for key in _TRANSLATIONS if key in root), None)
     if R is None or t is None:
-        raise InputError(
-            "holds two cameras, but not R and T, how they stand to each other; give their file as well"
-        )
+        raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
 
 def read_npz(data: bytes, source: str) -> CameraSet:
-    """Read what ``numpy.savez`` wrote.
+    """Read a file of ``numpy.savez``.
 
     Raises
     ------
     FormatError
-        No such file, or one with Python objects.
+        The data are not such a file, or contain Python objects.
     """
     return from_tree(Field(arrays_of(data, source), source))
 
 
 def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """The arrays of an ``.npz`` file as nested lists."""
+    """Read the arrays of an ``.npz`` file as nested lists."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
@@ -90,13 +88,13 @@ def arrays_of(data: bytes, source: str) -> dict[str, Any]:
             raise FormatError(
                 "holds Python objects, which are not read; save each view's corners as numbers", source
             ) from error
-        raise FormatError("is no .npz file; save it again with numpy.savez", source) from error
+        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
     except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise FormatError("is no .npz file; save it again with numpy.savez", source) from error
+        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
 
 
 def _sides(root: Field) -> tuple[str, str] | None:
-    """The suffixes of the two cameras' keys."""
+    """Suffixes of the keys of the two cameras; None if there are no two cameras."""
     return next((pair for pair in _SIDES if all(has_matrix(root, side) for side in pair)), None)
 
 
@@ -117,7 +115,7 @@ def _poses(root: Field) -> dict[str, Pose]:
 
 
 def _flat(field: Field) -> Array:
-    """Numbers of nested lists of any depth, or of a matrix."""
+    """Flat array of the numbers in nested lists of any depth, or in a matrix."""
     if isinstance(field.value, dict):
         return matrix_data(field, -1)
     try:
@@ -130,7 +128,7 @@ def _flat(field: Field) -> Array:
 
 
 def entries(cameras: CameraSet) -> dict[str, Any]:
-    """The dictionary of one camera or two: texts, numbers, lists of names and matrices."""
+    """Make the dictionary of one or two cameras: texts, numbers, lists of names and matrices."""
     first = cameras.cameras[0]
     tree: dict[str, Any] = {}
     sides = ("",) if len(cameras.cameras) == 1 else ("1", "2")
@@ -171,7 +169,7 @@ def _opencv(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
 
 
 def json_text(tree: Mapping[str, Any]) -> str:
-    """The dictionary as JSON, an entry a line; numbers that are not known are null."""
+    """Write the dictionary as JSON, one entry per line; unknown numbers are null."""
     lines = ",\n".join(f"  {json.dumps(key)}: {_json_value(value)}" for key, value in tree.items())
     return f"{{\n{lines}\n}}\n"
 
@@ -185,7 +183,7 @@ def _json_value(value: Any) -> str:
 
 
 def npz_bytes(tree: Mapping[str, Any]) -> bytes:
-    """The dictionary for ``numpy.load``; numpy.savez would write the current time into it."""
+    """Write the dictionary for ``numpy.load``, without the time stamps of ``numpy.savez``."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for key, value in tree.items():

@@ -1,4 +1,4 @@
-"""The formats that `convert` writes, by the names of its option ``--to``."""
+"""The formats that `convert` writes, by the values of its option ``--to``."""
 
 from __future__ import annotations
 

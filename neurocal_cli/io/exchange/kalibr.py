@@ -1,8 +1,8 @@
-"""Kalibr's camchain files: cameras in a chain, lengths in metres.
+"""Kalibr's camchain files: cameras in a chain, with lengths in metres.
 
-``T_cn_cnm1`` takes points from the camera before into this one. The centre of the top-left pixel is (0, 0),
-as Kalibr's corners are OpenCV's. radtan is k1, k2, p1, p2; pinhole-equidistant is our fisheye, omni-radtan
-our omnidir, ds our double_sphere. Their own numbers come first among the intrinsics.
+``T_cn_cnm1`` maps points from the previous camera to this one. The centre of the top-left pixel is (0, 0),
+because Kalibr uses OpenCV's corners. radtan is k1, k2, p1, p2; pinhole-equidistant is our fisheye,
+omni-radtan our omnidir, ds our double_sphere. Parameters of the camera model come first among the intrinsics.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MODELS = {
     ("ds", "none"): "double_sphere",
     ("eucm", "none"): "eucm",
 }
-_OWN = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # numbers before fu, fv, pu, pv
+_OWN = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # number of parameters before fu, fv, pu, pv
 _WRITTEN = {
     "fisheye": ("pinhole", "equidistant"),
     "omnidir": ("omni", "radtan"),
@@ -39,7 +39,7 @@ _WRITTEN = {
 
 
 def is_tree(root: Field) -> bool:
-    """Whether the tree is a camchain, or one camera's part of it."""
+    """Whether the tree is a camchain, or the part of one camera."""
     return "cam0" in root or "camera_model" in root
 
 
@@ -49,7 +49,7 @@ def from_tree(root: Field) -> CameraSet:
     Raises
     ------
     InputError, FormatError
-        A camera model or distortion that is not known, a key that is missing.
+        The camera model or distortion model is unknown, or a key is missing.
     """
     if "cam0" not in root:
         return CameraSet((_camera(root, "camera"),), unit="m", program="Kalibr")

@@ -1,8 +1,8 @@
-"""MATLAB's ``.mat`` files: what ``cameraParameters`` and ``stereoParameters`` hold, and Bouguet's toolbox.
+"""MATLAB's ``.mat`` files with ``cameraParameters`` or ``stereoParameters``, and those of Bouguet's toolbox.
 
-MATLAB counts pixels from 1: principal points are larger by 1 than ours. Its matrices multiply rows from the
-right, so K, rotations and translations are transposed; the skew is ``IntrinsicMatrix(2, 1)``. Bouguet's
-``Calib_Results.mat`` counts from 0, multiplies columns, and has the skew as ``alpha_c``.
+MATLAB counts pixels from 1, so principal points are larger than ours by 1. Its matrices multiply row vectors
+from the right, so K, rotations and translations are transposed; the skew is ``IntrinsicMatrix(2, 1)``.
+Bouguet's ``Calib_Results.mat`` counts from 0, multiplies column vectors, and has the skew as ``alpha_c``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import from_vector
 from neurocal_cli.io.mat_file import read_variables
 
-FIRST_PIXEL = 1.0  # MATLAB's number of the first pixel
+FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
 _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 
@@ -32,7 +32,7 @@ def read_mat(data: bytes, source: str) -> CameraSet:
     Raises
     ------
     FormatError, InputError
-        What is wrong with it; objects of MATLAB's classes, which no other program can read.
+        The file is damaged, or has no camera outside objects of MATLAB's classes, which only MATLAB can read.
     """
     tree = read_variables(data, source)
     for name in _STRUCTS:
@@ -59,12 +59,12 @@ def read_mat(data: bytes, source: str) -> CameraSet:
 
 
 def saved(tree: dict[str, Any]) -> bytes:
-    """A ``.mat`` file of these variables; the same ones give the same file."""
+    """Write a ``.mat`` file of variables; the same variables give the same file."""
     from scipy.io import savemat
 
     buffer = io.BytesIO()
     savemat(buffer, tree, oned_as="row")
-    # The first 116 bytes are a comment with today's date.
+    # The first 116 bytes are a comment with the current date.
     return b"MATLAB 5.0 MAT-file, written by neurocal".ljust(116) + buffer.getvalue()[116:]
 
 
@@ -81,7 +81,7 @@ def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
 
 
 def unit_of(tree: dict[str, Any]) -> str | None:
-    """The unit that a struct states, None where it states none."""
+    """Unit stated in a struct; None if there is none."""
     unit = tree.get("WorldUnits")
     return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
         str(unit), unit if isinstance(unit, str) and unit else None
@@ -144,7 +144,7 @@ def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
     poses = {}
     for k in numbers:
         om, t = (np.asarray(tree[f"{name}_{k}"], dtype=float).ravel() for name in ("omc", "Tc"))
-        if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # images that were left out are NaN
+        if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # NaN for images left out
             poses[f"{k}"] = Pose(from_vector(om), t)
     return poses
 

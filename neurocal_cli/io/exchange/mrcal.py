@@ -1,7 +1,7 @@
-"""mrcal's camera models: one camera each, with its pose in a world that the cameras of a rig share.
+"""mrcal's camera models: one camera per file, with its pose in a world common to the cameras of a rig.
 
 The text is a Python dictionary. The centre of the top-left pixel is (0, 0). ``extrinsics`` (``rt_cam_ref`` in
-newer versions) is rotation vector and translation from the world to the camera.
+newer versions) are rotation vector and translation from the world to the camera.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neurocal_cli.io.exchange.rotations import from_vector, to_vector
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import number
 
-REFERENCE = "reference"  # the name of the world as a view
+REFERENCE = "reference"  # view name of the pose in the common world
 _LENGTHS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 _NAMES = {
     "none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8",
@@ -42,12 +42,12 @@ def parse(text: str, source: str) -> CameraSet:
     Raises
     ------
     FormatError, InputError
-        What is wrong with it, a lens model that is not known.
+        The text is malformed, or the lens model is unknown.
     """
     try:
         tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
-        raise FormatError("is no camera model of mrcal; write it again", source) from error
+        raise FormatError("is not a camera model of mrcal; write it again", source) from error
     root = Field(tree, source)
     model = root["lensmodel"].text().removeprefix("LENSMODEL_")
     if model not in _LENGTHS:
@@ -65,7 +65,7 @@ def parse(text: str, source: str) -> CameraSet:
 
 
 def _numbers(field: Field, count: int) -> Array:
-    """Numbers of a list or a tuple."""
+    """Read the numbers of a list or a tuple."""
     values = list(field.value) if isinstance(field.value, tuple) else field.value
     return Field(values, field.source, field.path).array(count)
 

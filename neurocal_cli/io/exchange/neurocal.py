@@ -1,4 +1,4 @@
-"""neurocal's own files, of cameras that were calibrated here or elsewhere."""
+"""neurocal's own files, for cameras calibrated by neurocal or another program."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.rig import Rig
 
-_UNKNOWN = "unknown"  # the unit of lengths that no file stated
+_UNKNOWN = "unknown"  # unit of lengths if no file states it
 
 
 def from_tree(root: Field, whole: bool) -> CameraSet:
-    """Read a calibration or a rig; without its poses and points unless the whole of it is wanted.
+    """Read a calibration or a rig, with poses and points only if `whole`.
 
     Raises
     ------
     FormatError
-        A key that is missing or wrong.
+        A key is missing or wrong.
     """
     if "neurocal" not in root:
         if not whole:
@@ -46,7 +46,7 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
 
 
 def camera_set(result: Calibration | Rig) -> CameraSet:
-    """The camera set of a calibration or a rig, with the full original for our own files."""
+    """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
     left = result if isinstance(result, Calibration) else result.left
     poses = {name: view.pose for name, view in left.views.items()}
     unit = None if result.unit == _UNKNOWN else result.unit
@@ -56,7 +56,7 @@ def camera_set(result: Calibration | Rig) -> CameraSet:
 
 
 def as_rig(cameras: CameraSet) -> Rig:
-    """The rig of two cameras, without points."""
+    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal."""
     if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
         return cameras.origin
     left, right = (_calibration(cameras, k) for k in range(2))

@@ -1,4 +1,4 @@
-"""Cameras from files of any program, which is recognised by the content, never by the file's name."""
+"""Read cameras from files of any program, which is recognised by the content, never by the file name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neurocal_cli.io.file_storage import parse_tree
 from neurocal_cli.io.files import decode, read_bytes, value_failures
 from neurocal_cli.io.tree_fields import Field
 
-# By what a binary file begins with.
+# Readers of binary files, by their first bytes.
 _BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
     (b"PK\x03\x04", dictionary.read_npz),
     (b"MATLAB 5.0 MAT-file", matlab.read_mat),
@@ -34,12 +34,12 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
         that holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left
         and the right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. ``-`` is stdin.
     whole : bool
-        Whether to read all of a neurocal file; otherwise its poses and points are skipped.
+        Whether all of a neurocal file is read; otherwise its poses and points are ignored.
 
     Raises
     ------
     FormatError
-        A file that cannot be read, is of no known kind, or holds a camera that is not supported.
+        A file cannot be read, is of an unknown kind, or has a camera that neurocal cannot represent.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
@@ -56,7 +56,7 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
 
 
 def _opened(name: str) -> CameraSet | Field:
-    """The cameras of a file, or the tree of a file that is one."""
+    """Read the cameras of a file, or its tree if it is YAML, XML or JSON."""
     if colmap.is_folder(name):
         return colmap.read_folder(name)
     data, source = read_bytes(name)
@@ -96,18 +96,18 @@ def _from_tree(root: Field, whole: bool) -> CameraSet:
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:
-    """One rig of two files of one camera each."""
+    """Join two files of one camera each to a rig."""
     for part, name in zip((left, right), names, strict=True):
         if len(part.cameras) != 1:
             raise FormatError("holds several cameras itself; give it alone", name)
     if left.program != right.program or left.program not in ("ROS", "mrcal"):
         raise InputError(
-            f"{names[0]} and {names[1]} do not say how the cameras stand to each other; give two files of "
+            f"{names[0]} and {names[1]} do not give the relative pose of the cameras; give two files of "
             "ROS or of mrcal, or the file of the rig"
         )
     if left.program == "ROS":
         return ros.joined(left, right)
-    # mrcal's poses are those of the cameras in one world.
+    # mrcal's poses are relative to one world.
     first, second = (part.poses[mrcal.REFERENCE] for part in (left, right))
     return replace(
         left,

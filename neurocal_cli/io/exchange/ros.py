@@ -1,7 +1,7 @@
-"""ROS's camera_info files: one camera each; a pair's rectified projections give the relative pose.
+"""ROS's camera_info files: one camera per file; the rectified projections of a pair give its relative pose.
 
-``projection_matrix`` of the right camera holds ``-fx b`` [px m], and the rectification matrices turn both
-cameras into parallel ones: so R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f.
+``projection_matrix`` of the right camera contains ``-fx b`` [px m], and the rectification matrices make both
+cameras parallel. Therefore R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
-_RECTIFIED = "rectified"  # the name under which a camera of a pair keeps its R and t / f in `poses`
+_RECTIFIED = "rectified"  # key in `poses` for rectification matrix and t / f of a camera of a pair
 
 
 def is_tree(root: Field) -> bool:
@@ -39,12 +39,12 @@ def from_tree(root: Field) -> CameraSet:
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:
-    """The rig of the files of its two cameras.
+    """Join the cameras of two files to a rig.
 
     Raises
     ------
     InputError
-        Files that are not those of a rectified pair.
+        The files are not those of a rectified pair.
     """
     first, second = (part.poses.get(_RECTIFIED) for part in (left, right))
     if first is None or second is None or not second.t.any() or first.t.any():

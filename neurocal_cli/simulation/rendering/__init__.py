@@ -1,4 +1,4 @@
-"""Pictures of chessboards, rendered exactly: the yardstick that detection is measured with.
+"""Exact rendering of chessboards, the reference for the accuracy of detection.
 
 `render` turns a `Scene` into an image and the exact positions of all vertices and mid-points.
 """

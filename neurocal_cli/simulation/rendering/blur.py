@@ -1,8 +1,8 @@
-"""The point-spread function: a Gaussian over the box of the pixel, integrated exactly.
+"""Point spread function: a Gaussian convolved with the pixel's box, integrated exactly.
 
-Most pixels are even inside, or change linearly under a gradient of light; they are convolved as a
-whole. Pixels with edges are made of cells: their means go with the rest, and what the cells differ
-from the mean is spread one pixel at a time.
+Most pixels are uniform, or linear under a gradient of light; they are convolved as a whole. Pixels with edges
+are divided into cells. Their means are convolved with the rest, and the differences of the cells from the
+mean are added pixel by pixel.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_TAIL = 5.7  # standard deviations beyond which the Gaussian counts as nothing: 1e-8 of the light
-_STRIP = 16  # rows at a time
+_TAIL = 5.7  # standard deviations at which the Gaussian is cut off; 1e-8 of the light is beyond
+_STRIP = 16  # rows processed at a time
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -38,27 +38,27 @@ class Blur:
 
     @property
     def radius(self) -> int:
-        """Pixels to each side that a pixel's light reaches."""
+        """Reach of a pixel's light to each side, in pixels."""
         return math.ceil(_TAIL * self.sigma + 0.5)
 
     @cached_property
     def whole(self) -> Array:
-        """(2 radius + 1,) array: light that an even pixel sends to its neighbours."""
+        """(2 radius + 1,) array: light of a uniform pixel at the pixel at offset j."""
         return _spread(np.arange(-self.radius, self.radius + 1.0), 0.5, self.sigma)
 
     @cached_property
     def slope(self) -> Array:
-        """(2 radius + 1,) array: weight of a pixel's slope for the pixel that sees it at +j."""
+        """(2 radius + 1,) array: light of a pixel's slope at the pixel that has it at offset j."""
         offsets = np.arange(-self.radius, self.radius + 1.0)
         t = 0.5 * _NODES
         return np.asarray((_response(offsets[:, None] + t, self.sigma) * t) @ (0.5 * _WEIGHTS))
 
     @cached_property
     def cell(self) -> Array:
-        """(2 radius + 1, parts) array: light that each cell sends to the pixel at +j.
+        """(2 radius + 1, parts) array: light of each cell at the pixel at offset j.
 
-        An edge within a cell is lost in the cell's mean, which adds the variance of a box as wide
-        as the cell; the Gaussian is made narrower by that.
+        The mean of a cell blurs an edge in it by a box as wide as the cell; the variance of the Gaussian is
+        reduced by that of the box.
         """
         sigma = math.sqrt(max(self.sigma**2 - 1 / (12 * self.parts**2), 0.0))
         centres = (np.arange(self.parts) + 0.5) / self.parts - 0.5
@@ -66,7 +66,7 @@ class Blur:
         return _spread(offsets[:, None] - centres, 0.5 / self.parts, sigma)
 
     def convolve(self, level: Array, slope_u: Array | None, slope_v: Array | None) -> Array:
-        """Blur an image of pixels that are even, or linear, inside.
+        """Blur an image whose pixels are uniform or linear inside.
 
         Parameters
         ----------
@@ -87,12 +87,12 @@ class Blur:
         return image
 
     def scatter(self, image: Array, row: NDArray[np.intp], column: NDArray[np.intp], cells: Array) -> None:
-        """Add to an image what the cells of pixels send, in place.
+        """Add the light of the cells of pixels to an image, in place.
 
         Parameters
         ----------
         image : (H, W) array
-            With a border of ``radius`` around what will be kept.
+            With a border of ``radius`` around the part that is kept.
         row, column : (N,) int arrays
             Different pixels, at least ``radius`` from the image's border.
         cells : (N, parts, parts) array
@@ -107,7 +107,7 @@ class Blur:
 
 
 def _along_u(image: Array, kernel: Array) -> Array:
-    """``out[y, x] = sum_j kernel[j] image[y, x + j]``, only where the kernel lies inside."""
+    """``out[y, x] = sum_j kernel[j] image[y, x + j]``, only where the kernel fits into the image."""
     width = image.shape[1] - len(kernel) + 1
     out = np.empty((image.shape[0], width))
     for first in range(0, len(image), _STRIP):  # strips stay in the cache
@@ -120,7 +120,7 @@ def _along_u(image: Array, kernel: Array) -> Array:
 
 
 def _along_v(image: Array, kernel: Array) -> Array:
-    """As `_along_u`, down the columns."""
+    """Like `_along_u`, along the columns."""
     height = len(image) - len(kernel) + 1
     out = np.empty((height, image.shape[1]))
     for first in range(0, height, _STRIP):
@@ -133,7 +133,7 @@ def _along_v(image: Array, kernel: Array) -> Array:
 
 
 def _response(t: Array, sigma: float) -> Array:
-    """Gaussian over the pixel's box: what a point of light at t gives to the pixel at 0."""
+    """Light of a point source at t in the pixel at 0: the Gaussian convolved with the pixel's box."""
     if sigma == 0:
         return (np.abs(t) < 0.5).astype(float)
     return _normal_cdf((t + 0.5) / sigma) - _normal_cdf((t - 0.5) / sigma)

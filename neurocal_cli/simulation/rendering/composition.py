@@ -1,7 +1,7 @@
-"""Layers put before one another: the light of small cells of the image, exactly.
+"""Compose layers: the exact light of small cells of the image.
 
-A pixel without an edge has one level. A pixel with edges is cut into cells, in each of which a
-straight edge cuts off a known area; a cell with two edges or more is cut once again.
+A pixel without an edge has a uniform level. A pixel with edges is divided into cells, in which the area on
+each side of a straight edge is known; a cell with more than one edge is divided once more.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
 
-_FINEST = 8  # parts of a cell's side where edges meet in it
-_PIXEL_SLACK = 0.1  # px by which an edge may bend between a pixel's centre and its corner
+_FINEST = 8  # divisions of the side of a cell with more than one edge
+_PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the corner of a pixel
 
 
 @frozen_dataclass(eq=False)
 class Composition:
-    """The layers of a scene, ready to be looked at.
+    """The layers of a scene, prepared for rendering.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Composition:
 
     @classmethod
     def of(cls, scene: Scene) -> Composition:
-        """Arrange a scene's layers."""
+        """Make the layers of a scene."""
         boards = tuple(BoardLayer.of(scene, target) for target in scene.targets)
         return cls(scene.camera, boards, scene.occluders)
 
@@ -50,7 +50,7 @@ class Composition:
         ----------
         rays : Rays of (N,) arrays
         behind : (N,) array
-            The background's reflectance.
+            Reflectance of the background.
         cell, slack : float [px]
             See `BoardLayer.cover`.
         """
@@ -67,15 +67,14 @@ class Composition:
             order = np.argsort([c.depth for c in covers], axis=0, kind="stable")
             alphas, lights = (np.take_along_axis(x, order, axis=0) for x in (alphas, lights))
         for alpha, own in zip(alphas, lights, strict=True):
-            # What is nearer covers another part of the cell, not the same share of every part:
-            # so two planes that meet at a fold leave no gap between them.
+            # Layers are taken to cover different parts of the cell, so planes leave no gap at their fold.
             taken = np.minimum(alpha, open_share)
             light += own * np.divide(taken, alpha, out=np.zeros_like(alpha), where=alpha > 0)
             open_share -= taken
         return light + open_share * behind, edges
 
     def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays]:
-        """Reflectance at pixels' centres, and which pixels have edges in them.
+        """Reflectance at the centres of pixels, and which pixels have edges.
 
         Parameters
         ----------
@@ -85,7 +84,7 @@ class Composition:
         Returns
         -------
         light : (N,) array
-            Right where there is no edge.
+            Correct for pixels without edges.
         edged : (N,) bool array
         rays : Rays
         """
@@ -94,7 +93,7 @@ class Composition:
         return light, edges > 0, rays
 
     def cells(self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, parts: int) -> Array:
-        """Mean reflectance of the cells of pixels.
+        """Mean reflectance of the cells of pixels with edges.
 
         Parameters
         ----------
@@ -123,7 +122,7 @@ class Composition:
     def _cut(
         self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, side: float, parts: int
     ) -> tuple[Array, NDArray[np.int8], Rays]:
-        """Light of the parts x parts cells of squares with a given side; all flat."""
+        """Light of the parts x parts cells of squares with a given side, as flat arrays."""
         offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * side
         shape = (len(u), parts, parts)
         cell_u = np.broadcast_to(u[:, None, None] + offsets, shape).reshape(-1)

@@ -1,4 +1,4 @@
-"""How much of a small square cell is covered, or lies on one side of a straight edge, exactly."""
+"""Exact share of a small square cell on one side of a straight edge, and what layers cover of cells."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-# Below this an edge counts as parallel to the cell's side; the area is then off by less than 1e-5.
+# Least component of a normal, to avoid division by 0; the error of the area is below 1e-5.
 _LEAST_COMPONENT = 1e-5
 
 
 class Cover(NamedTuple):
-    """What a layer covers of each cell.
+    """Part of each cell that a layer covers.
 
     Attributes
     ----------
@@ -23,9 +23,9 @@ class Cover(NamedTuple):
     light : array
         Reflectance, integrated over the covered share.
     depth : array [world unit]
-        Along the camera's axis; infinite where nothing is covered.
+        Along the camera's axis; infinite if nothing is covered.
     edges : int array
-        How many edges run through the cell.
+        Number of edges in the cell.
     """
 
     alpha: Array
@@ -44,11 +44,11 @@ def half_plane(
     distance : array [px]
         From the edge to the cell's centre, positive on the positive side.
     normal_u, normal_v : arrays
-        Unit normal of the edge; signs don't matter.
+        Unit normal of the edge; signs do not matter.
     cell : float [px]
         Side of the cells.
     slack : float [px]
-        Cells with an edge this close count as touched too.
+        Cells with an edge this close count as touched, too.
 
     Returns
     -------
@@ -65,7 +65,7 @@ def half_plane(
 
 
 def _area(distance: Array, normal_u: Array, normal_v: Array) -> Array:
-    """Area of the unit square's part where ``n . x > -distance``: a twice integrated difference."""
+    """Area of the part of the unit square with ``n . x > -distance``, as a second difference of ramps."""
     p = np.maximum(np.abs(normal_u), _LEAST_COMPONENT)
     q = np.maximum(np.abs(normal_v), _LEAST_COMPONENT)
     outer, inner = 0.5 * (p + q), 0.5 * (p - q)

@@ -1,4 +1,4 @@
-"""What each thing in a scene contributes to small square cells of the image."""
+"""Boards of a scene as layers: their cover of small square cells of the image."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
-# Cells further than this from the paper [squares] are not looked at; also keeps off the horizon.
+# Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
 _NEARBY = 2.0
 
 
 @frozen_dataclass(eq=False)
 class BoardLayer:
-    """A target as the camera sees it.
+    """A target in the frame of the camera.
 
     Parameters
     ----------
     target : Target
     inverse : (3, 3) array
-        From rays (x, y, z) to w (a, b, 1), w = 1 / depth, a and b in squares. Rays are slopes (z = 1) and
-        depths along the axis, or unit directions and depths along these.
+        Maps rays (x, y, z) to w (a, b, 1), with w = 1 / depth, and a and b in squares. Rays are slopes (z =
+        1) with depths along the axis, or unit directions with depths along these.
     """
 
     target: Target
@@ -35,7 +35,7 @@ class BoardLayer:
 
     @classmethod
     def of(cls, scene: Scene, target: Target) -> BoardLayer:
-        """Place a target before the scene's camera.
+        """Make the layer of a target in a scene.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class BoardLayer:
         return au, av, bu, bv
 
     def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
-        """What the target covers of cells around rays given as flat arrays.
+        """Cover of the cells around rays, which are flat arrays.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ def _axis(
     steepness = np.hypot(au, av)
     to_pixels = 1 / steepness
     nu, nv = au * to_pixels, av * to_pixels
-    # Lines at the pattern's ends are borders; only those strictly between change the colour.
+    # Lines at the pattern's ends are borders; only lines strictly between them change the colour.
     line = np.clip(np.rint(a), np.floor(pattern[0]) + 1, np.ceil(pattern[1]) - 1)
     beyond, crossed = half_plane((a - line) * to_pixels, nu, nv, cell, slack)
     sign = 1 - 2 * (line - 2 * np.floor(0.5 * line))

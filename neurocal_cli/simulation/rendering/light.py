@@ -1,4 +1,4 @@
-"""The light that reaches each pixel: layers, illumination, blur and vignetting, without noise."""
+"""Light at each pixel, from layers, illumination, blur and vignetting, without noise."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from neurocal_cli.simulation.rendering.blur import Blur
 from neurocal_cli.simulation.rendering.composition import Composition
 from neurocal_cli.simulation.rendering.scene import Illumination, Scene
 
-# Cells along a pixel's side, times the blur: what keeps the picture within 0.0005 of full scale.
+# Product of cells along a pixel's side and blur [px] that keeps the error below 0.0005 of full scale.
 _PARTS_BY_BLUR = 8.0
 _FEWEST_PARTS, _MOST_PARTS = 4, 24
-_STRIP = 32768  # pixels looked at together; small enough for the cache
-_CHUNK = 65536  # cells looked at together
+_STRIP = 32768  # pixels processed at a time; they fit into the cache
+_CHUNK = 65536  # cells processed at a time
 
 
 def image_light(scene: Scene, parts: int | None = None) -> Array:
-    """Light that falls on each pixel.
+    """Render the light at each pixel.
 
     Parameters
     ----------
     scene : Scene
     parts : int, optional
-        Cells along the side of a pixel with edges; the error falls with their square. By default as
-        many as keep it below 0.0005 of the contrast (0.0001 px for an edge).
+        Cells along the side of a pixel with edges; the error falls with their square. By default it is below
+        0.0005 of the contrast (0.0001 px for an edge).
 
     Returns
     -------
     light : (height, width) array
-        Linear, 1 being the sensor's full scale at gain 1.
+        Linear; 1 is the sensor's full scale at gain 1.
     """
     width, height = scene.size
     blur = Blur(scene.psf, parts or enough_parts(scene))
@@ -48,7 +48,7 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
 
 
 def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) -> Array:
-    """Illumination at image points [px], a factor."""
+    """Factor of the illumination at image points [px]."""
     width, height = size
     gu, gv = light.gradient
     slope = gu * (u - 0.5 * (width - 1)) / width + gv * (v - 0.5 * (height - 1)) / height
@@ -56,7 +56,7 @@ def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) 
 
 
 def enough_parts(scene: Scene) -> int:
-    """Cells along a pixel's side that `image_light` takes by default."""
+    """Default number of cells along a pixel's side in `image_light`."""
     return int(np.clip(np.ceil(_PARTS_BY_BLUR / scene.sigma_t), _FEWEST_PARTS, _MOST_PARTS))
 
 
@@ -74,10 +74,10 @@ def _fill(
     edged: NDArray[np.bool_],
     residual: Array,
 ) -> None:
-    """Replace the background in some rows by what stands before it.
+    """Render the layers over the background in some rows.
 
-    ``level`` becomes the mean reflectance of pixels without edges, the mean light of those with;
-    what the cells of these differ from it goes to ``residual``, spread.
+    ``level`` becomes the mean reflectance of pixels without edges, and the mean light of pixels with edges.
+    The differences of the cells of the latter from their mean are blurred and added to ``residual``.
     """
     pad = blur.radius
     grid = np.mgrid[rows, 0 : level.shape[1]].reshape(2, -1)
@@ -111,7 +111,7 @@ def _cell_light(scene: Scene, u: Array, v: Array, parts: int) -> Array:
 def _shaded(
     scene: Scene, level: Array, edged: NDArray[np.bool_], pad: int
 ) -> tuple[Array, Array | None, Array | None]:
-    """Light of the pixels and its slopes within those that have no edges."""
+    """Light of the pixels, and its gradients within pixels without edges."""
     light = scene.illumination
     width, height = scene.size
     if light.gradient == (0.0, 0.0):

@@ -1,4 +1,4 @@
-"""Pictures of chessboards with everything known about them."""
+"""Render pictures of chessboards with known truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 
 @frozen_dataclass(eq=False)
 class Rendered:
-    """A picture.
+    """A rendered picture.
 
     Attributes
     ----------
@@ -26,12 +26,12 @@ class Rendered:
 
 
 def render(scene: Scene, rng: np.random.Generator) -> Rendered:
-    """Take a picture of a scene.
+    """Render a picture of a scene.
 
     Parameters
     ----------
     scene : Scene
     rng : numpy Generator
-        Of the noise; everything else is in the scene.
+        For the noise; everything else is in the scene.
     """
     return Rendered(digitised(scene.sensor, image_light(scene), rng), ground_truth(scene))

@@ -1,7 +1,7 @@
-"""What a picture is made of: camera, chessboards, light, what stands in the way, and the sensor.
+"""Scenes for rendering: camera, chessboards, illumination, occluders and sensor.
 
-Radiances are linear and 1 is the sensor's full scale at gain 1. All image coordinates follow the
-package's convention: the centre of the top-left pixel is (0, 0).
+Radiances are linear, and 1 is the sensor's full scale at gain 1. Image coordinates follow the package's
+convention: the centre of the top-left pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from neurocal_cli.simulation.rendering.coverage import Cover
 
 @frozen_dataclass
 class Sides:
-    """A length on each side of a board, in squares; low and high along x_axis and y_axis."""
+    """Lengths at the sides of a board, in squares; low and high along x_axis and y_axis."""
 
     x_low: float = 1.0
     x_high: float = 1.0
@@ -50,10 +50,10 @@ class Target:
     first_black : bool
         Whether the square beyond vertex (0, 0), towards growing x and y, is black.
     reach : Sides [squares]
-        How far the pattern goes on beyond the outer vertices; 1 is one whole square, and 1/2 on both
-        planes of a fold makes squares that run across it.
+        Extent of the pattern beyond the outer vertices; 1 is a whole square, and 1/2 on both planes of a fold
+        makes squares across the fold.
     margin : Sides [squares]
-        White paper beyond the pattern; 0 where the pattern ends at the paper's edge or at a fold.
+        White paper beyond the pattern; 0 if the pattern ends at the paper's edge or at a fold.
     """
 
     plane: Plane
@@ -76,22 +76,22 @@ class Target:
 
     @property
     def paper_box(self) -> tuple[float, float, float, float]:
-        """Ends of the paper, as `pattern_box`."""
+        """Ends of the paper, like `pattern_box`."""
         x_low, x_high, y_low, y_high = self.pattern_box
         margin = self.margin
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 
 
 class Occluder(Protocol):
-    """Something in front of everything."""
+    """An object in front of all boards."""
 
     def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
-        """What it covers of cells around rays; see `layers.BoardLayer.cover`."""
+        """Cover of the cells around rays; see `layers.BoardLayer.cover`."""
 
 
 @frozen_dataclass
 class Background:
-    """What stands behind the boards, constant within each pixel before the blur.
+    """Background of the boards, uniform within each pixel before the blur.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Background:
 
 @frozen_dataclass
 class Illumination:
-    """Light that falls on the whole scene, ``level (1 + gradient . ((u - uc) / W, (v - vc) / H))``.
+    """Illumination of the scene, ``level (1 + gradient . ((u - uc) / W, (v - vc) / H))``.
 
     It multiplies the radiance before the blur; vignetting multiplies the blurred image by
     ``1 - vignetting rho^2``, rho = 1 in the image's corners.
@@ -125,18 +125,18 @@ class Illumination:
 
 @frozen_dataclass
 class Sensor:
-    """From light to numbers.
+    """Model of the sensor.
 
     Parameters
     ----------
     response : float or "srgb"
-        The image is signal^(1 / response), 1 being linear, or the sRGB curve.
+        The image is signal^(1 / response), so 1 is linear; or it follows the sRGB curve.
     gain, offset : float
         signal = gain radiance + offset, before the response.
     read_noise : float [DN of 8 bits, 1/255 of full scale]
         Standard deviation of Gaussian noise, after the response.
     full_well : float, optional [electrons]
-        Electrons at full scale; given, the signal has Poisson noise.
+        Electrons at full scale; if given, the signal has Poisson noise.
     bits : 8 or 16
     """
 
@@ -163,27 +163,27 @@ class Sensor:
 
 @frozen_dataclass
 class Scene:
-    """Everything that decides a picture but its noise.
+    """Everything that determines a picture except its noise.
 
     Parameters
     ----------
     camera : Camera
-        With the size of its images. Of other kinds of cameras `rays`, `project` and `sees` are enough.
+        With the image size. Other classes need only `rays`, `project` and `sees`.
     pose : Pose
         World to camera.
     targets : tuple of Target
-        Where they overlap in the image, the nearer one hides the other.
+        If they overlap in the image, the nearer one hides the other.
     background : Background
     occluders : tuple of Occluder
-        The first is foremost.
+        The first is in front.
     illumination : Illumination
     psf : float [px]
-        Standard deviation of the Gaussian blur, to which the pixel's box is added.
+        Standard deviation of the Gaussian blur, without the pixel's box.
     sensor : Sensor
     unit : str
-        Of the world.
+        Of the world coordinates.
     circle : callable, optional
-        What the round image of a fisheye leaves of the (height, width) light.
+        Applies the image circle of a fisheye to the (height, width) light.
     """
 
     camera: Camera
@@ -211,16 +211,16 @@ class Scene:
 
     @property
     def board(self) -> Board:
-        """The board that the targets make up."""
+        """Board made of the targets' planes."""
         return Board(tuple(target.plane for target in self.targets), self.unit)
 
     @property
     def sigma_t(self) -> float:
-        """Blur and pixel together, ``sqrt(psf^2 + 1/12)`` [px]."""
+        """Blur including the pixel's box, ``sqrt(psf^2 + 1/12)`` [px]."""
         return float(np.sqrt(self.psf**2 + 1 / 12))
 
     def plane_to_camera(self, target: Target) -> Array:
-        """(3, 3) matrix that takes grid coordinates (a, b, 1) [squares] into the camera's frame."""
+        """(3, 3) matrix that maps grid coordinates (a, b, 1) [squares] to the camera's frame."""
         plane = target.plane
         axes = np.array([plane.x_axis, plane.y_axis, plane.origin]).T
         columns = self.pose.R @ (axes * [plane.square, plane.square, 1.0])

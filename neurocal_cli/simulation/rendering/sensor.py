@@ -1,4 +1,4 @@
-"""From light to numbers: response curve, noise, rounding and clipping."""
+"""Model of the sensor: response curve, noise, rounding and clipping."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SRGB_LINEAR = 0.0031308
 
 
 def signal(sensor: Sensor, light: Array) -> Array:
-    """Linear signal of light, 1 being full scale."""
+    """Linear signal of light; 1 is full scale."""
     return sensor.gain * light + sensor.offset
 
 
@@ -34,14 +34,14 @@ def response(sensor: Sensor, linear: Array) -> Array:
 
 
 def digitised(sensor: Sensor, light: Array, rng: np.random.Generator) -> Image:
-    """Take the picture.
+    """Convert light to pixel values with noise.
 
     Parameters
     ----------
     sensor : Sensor
     light : (H, W) array
     rng : numpy Generator
-        Of the noise.
+        For the noise.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Where everything is in a rendered picture, and what of it can be seen."""
+"""Exact positions of all points in a rendered picture, and their visibility."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from neurocal_cli.simulation.rendering.scene import Scene, Target
 
 Mask = NDArray[np.bool_]
 
-_TINY_CELL = 1e-6  # px; a point
-_STEP = 1e-4  # squares; for directions in the image
+_TINY_CELL = 1e-6  # px; in place of a point
+_STEP = 1e-4  # squares; step of the differences that give directions in the image
 
 
 @frozen_dataclass(eq=False)
 class PlaneTruth:
-    """A plane's points in the picture.
+    """Points of a plane in the picture.
 
     Attributes
     ----------
     plane : Plane
     vertices : (rows, cols, 2) array [px]
-        Exact positions; NaN where the camera cannot project.
+        Exact positions; NaN if the camera cannot project them.
     vertex_ids : tuple of rows x cols str
         Row by row.
     vertices_visible : (rows, cols) bool array
-        In front of the camera, in the frame, and nothing in front, all with a clearance.
+        Whether the vertex is in front of the camera, in the image and not hidden, with a clearance.
     midpoints : (N, 2) array [px]
         Projections of the mid-points in space, in the order of `Plane.midpoint_grid`.
     midpoint_ids : tuple of N str
     midpoints_visible : (N,) bool array
     edges_visible : (N,) bool array
-        The mid-point, both ends and the quarters between them are visible.
+        Whether the mid-point, both ends and both quarter points are visible.
     ends : (N, 2) int array
-        Positions of the edge's ends among the vertices, row by row.
+        Flat indices of the edge's ends among the vertices.
     normals : (N, 2) array
         Unit normals of the edges in the image, towards growing y_axis for ``h``, x_axis for ``v``.
     lengths : (N,) array [px]
-        Of the edges, end to end.
+        Distances between the ends of the edges.
     polarity : (N,) int array
-        +1 where the square on the normal's side is white, -1 where it is black.
+        +1 if the square on the normal's side is white, -1 if it is black.
     """
 
     plane: Plane
@@ -62,7 +62,7 @@ class PlaneTruth:
 
 @frozen_dataclass(eq=False)
 class Truth:
-    """What a detector should find.
+    """Ground truth of a picture.
 
     Attributes
     ----------
@@ -74,14 +74,14 @@ class Truth:
 
 
 def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
-    """Find the exact positions of all points and which of them can be seen.
+    """Compute the exact positions of all points, and which of them are visible.
 
     Parameters
     ----------
     scene : Scene
     clearance : float, optional [px]
-        Distance from a visible point within which nothing hides its plane; three times the blur (pixel
-        included) by default.
+        A point is visible if nothing hides its plane within this distance; by default three times the blur
+        including the pixel.
     """
     sight = _Sight(scene, 3 * scene.sigma_t if clearance is None else clearance)
     return Truth(tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets))))
@@ -118,7 +118,7 @@ def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
 
 
 def _normals(sight: _Sight, index: int, grid: Array, half: Array) -> Array:
-    """Normals of the projected edges, on the side of the other axis."""
+    """Normals of the projected edges, towards the growing other axis."""
     along, across = _STEP * 2 * half, _STEP * (1 - 2 * half)
     tangent = sight.project(index, grid + along)[0] - sight.project(index, grid - along)[0]
     side = sight.project(index, grid + across)[0] - sight.project(index, grid - across)[0]
@@ -143,7 +143,7 @@ class _Sight:
         self.layers = [BoardLayer.of(scene, target) for target in scene.targets]
 
     def project(self, index: int, grid: Array) -> tuple[Array, Mask]:
-        """Pixels of a target's grid coordinates, NaN where not seen, and which are seen."""
+        """Pixels of a target's grid coordinates, NaN if the camera does not see them, and which it sees."""
         matrix = self.scene.plane_to_camera(self.scene.targets[index])
         points = grid @ matrix[:, :2].T + matrix[:, 2]
         pixels, seen = self.camera.project(points)[0], self.camera.sees(points)
@@ -163,7 +163,7 @@ class _Sight:
         return pixels, visible.reshape(seen.shape)
 
     def _open(self, index: int, pixels: Array) -> Mask:
-        """Whether nothing is in front of a plane at image points and on a circle around each."""
+        """Whether a plane is not hidden at image points and on a circle around each."""
         angle = np.arange(12) * (np.pi / 6)
         ring = self.clearance * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         around = pixels[:, None] + np.concatenate([np.zeros((1, 2)), ring])

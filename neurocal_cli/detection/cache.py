@@ -1,7 +1,7 @@
-"""Cache of detections in a folder, by the content of the images, so that a later run can reuse them.
+"""A folder that caches the outcomes of detection, so that a later run need not repeat it.
 
-Each image has its own file, named after the hash of its bytes, the detection options and neurocal's version.
-It is written at once, so that an interrupted run can be resumed.
+Each image has its own file, named after a hash of its bytes, the request, and neurocal's version. The file is
+written at once, so that an interrupted run continues where it stopped.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from neurocal_cli.io.writing import write_whole
 _FORMAT = 1
 
 
-class Memory:
-    """A folder of cached detections.
+class DetectionCache:
+    """A folder of cached outcomes.
 
     Parameters
     ----------
     folder : str
         Created if it does not exist.
-    asked : str
-        The detection options as text; different options give different texts.
+    request : str
+        A text that differs if the requested detection differs.
     """
 
-    def __init__(self, folder: str, asked: str) -> None:
-        self._folder, self._asked = folder, f"{_FORMAT} {__version__} {asked}".encode()
+    def __init__(self, folder: str, request: str) -> None:
+        self._folder, self._request = folder, f"{_FORMAT} {__version__} {request}".encode()
 
-    def recall(self, image: bytes) -> Outcome | None:
-        """The cached detection of an image, by the bytes of its file; None if there is none."""
-        path = self._place(image)
+    def find(self, image: bytes) -> Outcome | None:
+        """Find the outcome for an image, given the bytes of its file; None if it is not cached."""
+        path = self._path(image)
         if not os.path.exists(path):
             return None
         try:
@@ -55,11 +55,11 @@ class Memory:
                 overlay=None if tree["overlay"] is None else b64decode(tree["overlay"]),
                 shown=None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
             )
-        except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: look again
+        except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: detect again
             return None
 
-    def keep(self, image: bytes, outcome: Outcome) -> None:
-        """Write a detection at once, so that it is not lost if the command is interrupted.
+    def store(self, image: bytes, outcome: Outcome) -> None:
+        """Write an outcome at once, because the outputs that a command holds back are lost if it stops.
 
         Raises
         ------
@@ -75,10 +75,10 @@ class Memory:
             "shown": outcome.shown,
         }
         os.makedirs(self._folder, exist_ok=True)
-        Context().run(write_whole, self._place(image), json.dumps(tree) + "\n")
+        Context().run(write_whole, self._path(image), json.dumps(tree) + "\n")
 
-    def _place(self, image: bytes) -> str:
-        return os.path.join(self._folder, f"{hashlib.sha256(self._asked + image).hexdigest()}.json")
+    def _path(self, image: bytes) -> str:
+        return os.path.join(self._folder, f"{hashlib.sha256(self._request + image).hexdigest()}.json")
 
 
 def _tree(found: Detection) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def _tree(found: Detection) -> dict[str, Any]:
 
 
 def _detection(tree: dict[str, Any]) -> Detection:
-    """A detection without its grids, which only its picture needs."""
+    """Read a detection back, without its grids, which only its picture needs."""
     ids = tuple(map(str, tree["ids"]))
     width, height = tree["image_size"]
     return Detection(

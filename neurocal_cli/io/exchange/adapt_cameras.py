@@ -1,4 +1,4 @@
-"""Conversion of a camera set to what a format can hold, exactly or approximately, with the loss in pixels."""
+"""Adapt cameras to a file format, exactly or approximately, with the loss in pixels."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
-_NO_SKEW = 1e-3  # a loss below this [px] is negligible
-_NO_LOSS = 5e-3  # as is this share of the image
-_AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px
+_NO_SKEW = 1e-3  # px; a smaller loss is not reported
+_NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported
+_AS_NEAR, _NEARER = 1.1, 0.01  # a simpler model may lose this many times more than the best, or px more
 
-_Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
+_Adaptation = tuple[Camera, NearestCamera | None, str]  # None and "" if there is no loss to report
 
 
 @frozen_dataclass(eq=False)
-class Fitted:
-    """Cameras as a format can hold them.
+class AdaptedCameras:
+    """Cameras adapted to a format.
 
     Attributes
     ----------
     cameras : CameraSet
     losses : tuple of str
-        What was approximated, with its effect in pixels, for a warning.
+        Changes of the cameras and the resulting shifts of pixels, for warnings.
     remarks : tuple of str
-        What is missing from the file, for a note.
+        Data that are not in the file, for notes.
     moved : tuple of Distance or None
-        The losses as numbers: how far the pixels of each camera move.
+        Shifts of the pixels of each camera, as numbers.
     """
 
     cameras: CameraSet
@@ -41,26 +41,28 @@ class Fitted:
     moved: tuple[Distance | None, ...] = ()
 
 
-def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
-    """Make cameras fit a format, of one model if it is given.
+def adapt_cameras(
+    cameras: CameraSet, target: Format, force: bool, model: str | None = None
+) -> AdaptedCameras:
+    """Adapt cameras to a format, and to a distortion model if one is given.
 
-    Skew that the format's programs ignore is always removed, because they would ignore it silently. The
-    nearest camera without skew moves pixels by less than ignoring the skew does.
+    If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
+    nearest camera without skew moves pixels less than ignoring the skew.
 
     Parameters
     ----------
     cameras : CameraSet
     target : Format
     force : bool
-        Whether the nearest camera of another distortion model is acceptable.
+        Whether the nearest camera of another distortion model is accepted.
     model : str, optional
-        One of `MODELS`: the cameras become the nearest ones of this distortion model.
+        One of `MODELS`: the cameras are replaced by the nearest ones with this distortion model.
 
     Raises
     ------
     InputError
-        What the format cannot hold: a distortion model unless forced, too many cameras, an unknown unit or
-        image size.
+        The format cannot represent the distortion model (unless forced), the number of cameras, or an unknown
+        unit or image size.
     """
     if len(cameras.cameras) > target.most_cameras:
         raise InputError(
@@ -74,16 +76,16 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if model is not None and model not in target.models:
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
-    losses, remarks, fitted, moved = [], [], [], []
+    losses, remarks, adapted, moved = [], [], [], []
     for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
         if model is None:
-            new, near, loss = _fitted(camera, target, force, points)
+            new, near, loss = _adapted(camera, target, force, points)
         else:
             new, near, loss = _of_model(camera, model, target, points)
-        fitted.append(new)
+        adapted.append(new)
         losses += [f"{camera.name}: {loss}"] if loss else []
         moved.append(None if near is None else near.over_image)
-    changed = any(new is not old for new, old in zip(fitted, cameras.cameras, strict=True))
+    changed = any(new is not old for new, old in zip(adapted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
     if cameras.origin is not None and (changed or not own):
         remarks.append(
@@ -94,13 +96,13 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if cameras.poses and not target.poses:
         remarks.append(f"a file of {target.program} has no place for the poses of {len(cameras.poses)} views")
     origin = cameras.origin if own and not changed else None
-    return Fitted(
-        replace(cameras, cameras=tuple(fitted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
+    return AdaptedCameras(
+        replace(cameras, cameras=tuple(adapted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
     )
 
 
 def _pixels_of(cameras: CameraSet) -> list[Array | None]:
-    """Pixels of the points that each camera was calibrated with."""
+    """Pixels of the points with which each camera was calibrated; None if unknown."""
     origin = cameras.origin
     if origin is None:
         return [None] * len(cameras.cameras)
@@ -108,7 +110,7 @@ def _pixels_of(cameras: CameraSet) -> list[Array | None]:
     return [part.points.pixels for part in parts]
 
 
-def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Fitting:
+def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Adaptation:
     straight = target.skew or not camera.intrinsics.skewed
     if with_model(camera.distortion, model) is not None and straight:
         return _as_model(camera, model), None, ""
@@ -116,7 +118,7 @@ def _of_model(camera: Camera, model: str, target: Format, points: Array | None) 
     return near.camera, near, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
 
 
-def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Fitting:
+def _adapted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Adaptation:
     model = next((m for m in target.models if with_model(camera.distortion, m) is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
     if model is not None and straight:
@@ -135,7 +137,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
         )
     nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
-    # Prefer fewer coefficients if more bring next to nothing.
+    # Prefer a simpler model if it is nearly as good.
     most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
     near = next(
         n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
@@ -150,7 +152,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
 
 
 def _as_model(camera: Camera, model: str) -> Camera:
-    """The camera under the name of a model that holds its distortion; itself if it has that name."""
+    """Express the camera in a model that includes its distortion model; unchanged if that is the same."""
     distortion = with_model(camera.distortion, model)
     if distortion is camera.distortion or distortion is None:
         return camera
@@ -158,7 +160,7 @@ def _as_model(camera: Camera, model: str) -> Camera:
 
 
 def _straightened(camera: Camera) -> Camera:
-    """A camera whose skew is exactly zero."""
+    """Set the angle of the axes to exactly pi/2."""
     a, _, b, u0, v0 = camera.entries
     return replace(camera, intrinsics=Intrinsics(a, b, u0, v0))
 
