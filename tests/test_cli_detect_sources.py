@@ -84,7 +84,7 @@ def test_a_run_that_was_stopped_goes_on(
     assert read_points([tmp_path / "p.csv"]).n_views == 3
 
 
-def test_a_damaged_memory_is_looked_over(tmp_path: Path, looked: list[str]) -> None:
+def test_a_damaged_cache_is_ignored(tmp_path: Path, looked: list[str]) -> None:
     words = ["detect", IMAGES[0], *BOARD, "--cache", tmp_path / "cache"]
     first = run(*words)
     (file,) = (tmp_path / "cache").iterdir()
@@ -102,6 +102,18 @@ def test_a_damaged_memory_is_looked_over(tmp_path: Path, looked: list[str]) -> N
     result = run("detect", IMAGES[0], *BOARD, "--cache", tmp_path / "file")
     assert result.exit_code == 2
     assert "--cache" in result.stderr
+
+
+def test_a_cache_that_cannot_be_written_to_costs_no_detection(tmp_path: Path) -> None:
+    words = ["detect", IMAGES[0], *BOARD, "--cache", tmp_path / "cache"]
+    first = run(*words)
+    (file,) = (tmp_path / "cache").iterdir()
+    file.unlink()
+    file.mkdir()
+    again = run(*words)
+    assert again.exit_code == 0
+    assert again.stdout == first.stdout
+    assert "the detection is not cached: " in again.stderr
 
 
 def film(path: Path, fourcc: str) -> None:

@@ -113,9 +113,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         return Outcome(path, problem=str(error))
     try:
         found = _detected(image, options)
-        if options.cache is not None:
-            options.cache.store(data, found)
-        return _named(found, path, source)
+        return _named(_stored(found, data, options.cache), path, source)
     except NeurocalError as error:
         problem = str(error)
     except MemoryError:
@@ -125,6 +123,17 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
             raise
         problem = f"internal error: {type(error).__name__}: {error}; run with NEUROCAL_DEBUG=1 to see where"
     return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
+
+
+def _stored(found: Outcome, data: bytes, cache: DetectionCache | None) -> Outcome:
+    """Cache an outcome; a cache that cannot be written to does not cost the detection."""
+    if cache is not None:
+        try:
+            cache.store(data, found)
+        except (NeurocalError, OSError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            return replace(found, notes=(*found.notes, f"the detection is not cached: {reason}"))
+    return found
 
 
 def _named(found: Outcome, path: str, source: str) -> Outcome:

@@ -149,6 +149,8 @@ def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
 
 def write_stdout(data: bytes) -> None:
     """Write to stdout, after flushing earlier output."""
+    if sys.stdout is None:  # the shell closed it: >&-
+        raise NeurocalError("stdout is closed; give a file")
     try:
         buffer = getattr(sys.stdout, "buffer", None)
         if buffer is None:  # stdout was replaced by a text-only stream
