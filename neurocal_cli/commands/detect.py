@@ -59,20 +59,20 @@ _SECOND = 2  # images of another size that are no longer a single stray one
 @options.count(
     "--frames",
     "N",
-    "Number of frames that are taken of a video at most: sharp ones that differ from each other.",
+    "Maximum number of frames to take from a video: sharp ones that differ from each other.",
     default=50,
 )
 @options.path(
     "--cache",
     "DIR",
-    "Keep what is found in each image in this folder, and look there first. The same image is found "
-    "again under any name; a run that was stopped goes on.",
+    "Cache the detections in this folder, so that an interrupted run continues where it stopped. The same "
+    "image is recognised under any name.",
 )
 @options.number(
     "--watch",
     "SECONDS",
-    "Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
-    "pressed. After each image, report the verdict so far and the view that would help most.",
+    "Wait for more images in the folders and patterns. Stop when no image has arrived for this time, or at "
+    "Ctrl-C. After each image, report the verdict so far and the view that would help most.",
     without="no",
     positive=True,
 )

@@ -66,7 +66,7 @@ def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bo
     told = []
     for method, bound in bounds.items():
         if bound < _OWN * widest:
-            label = f"bound of {method}, which is told more"
+            label = f"bound of {method}, which is given more"
             (line,) = axes.loglog(over, over * bound, color=_LOOK[method][0], linewidth=1.0, linestyle=":")
             told.append((line, label))
     for method, one in study.methods.items():
