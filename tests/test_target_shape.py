@@ -228,6 +228,37 @@ def test_a_distortion_that_is_too_simple_is_not_taken_for_a_shape(seed: int, n_v
     assert "auto" in " ".join(found.verdict.advice)
 
 
+# The error is only 8 % larger without p1 and p2, but the centre is off by six standard deviations.
+def test_missing_tangential_coefficients_are_named() -> None:
+    points, truth = photographed("flat", 2, 10, k=(-0.12, 0.05, 0.001, -0.0007), model="k1k2p1p2")
+    found = calibrate(points, distortion="k1k2")
+    assert abs(found.intrinsics.v0 - truth.K[1, 2]) > 5 * found.std["v0"]
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word == "usable"
+    assert any("too simple: k1k2p1p2" in reason for reason in found.verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("seed", "n_views", "model", "k"),
+    slow_but(
+        ((100, 10, "k1", (-0.15,)),),
+        [
+            (s, n, m, k)
+            for s in range(101, 107)
+            for n, m, k in ((3, "k1k2", (-0.2, 0.08)), (15, "k1", (-0.15,)))
+        ],
+    ),
+)
+def test_a_distortion_that_is_rich_enough_is_not_called_too_simple(
+    seed: int, n_views: int, model: str, k: tuple[float, ...]
+) -> None:
+    points, _ = photographed("flat", seed, n_views, k=k, model=model)
+    found = calibrate(points, distortion=model)
+    assert found.verdict is not None
+    assert not any("too simple" in reason for reason in found.verdict.reasons)
+
+
 def test_a_bent_board_is_found_with_a_distortion_that_is_rich_enough() -> None:
     points, truth = photographed("parabola", 12, k=(-0.2,), model="k1")
     found = calibrate(points, distortion="k1")
