@@ -239,6 +239,25 @@ def test_missing_tangential_coefficients_are_named() -> None:
     assert any("too simple: k1k2p1p2" in reason for reason in found.verdict.reasons)
 
 
+# Of 40 lenses each, 4, 0 and 24 were good and off by more than four standard deviations.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("named", "model", "most"), [("none", "k1", 0), ("k1", "k1k2", 0), ("k1k2", "k1k2p1p2", 7)]
+)
+def test_of_models_that_are_too_simple_few_are_good_and_wrong(named: str, model: str, most: int) -> None:
+    wrong = 0
+    for seed in range(["none", "k1", "k1k2"].index(named) + 1000, 1120, 3):
+        rng = np.random.default_rng(seed)
+        k1 = float(rng.choice([-1, 1]) * 10 ** rng.uniform(-2.3, -0.7))
+        k = {"k1": (k1,), "k1k2": (k1, -0.4 * k1)}.get(model, (k1, -0.3 * k1, *rng.uniform(-0.001, 0.001, 2)))
+        points, truth = photographed("flat", seed, (3, 5, 8, 15)[seed % 4], k=k, model=model)
+        found = calibrate(points, distortion=named)
+        std = np.array([found.std[name] for name in PARAMETERS])
+        assert found.verdict is not None
+        wrong += found.verdict.word == "good" and bool((np.abs(errors(found, truth.K)) > 4 * std).any())
+    assert wrong <= most
+
+
 @pytest.mark.parametrize(
     ("seed", "n_views", "model", "k"),
     slow_but(
