@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.distorted import coefficients
 from support.image_bound import camera_bound
-from support.rendered import rendered
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
 from neurocal_cli.board import Board, Plane
@@ -24,6 +23,7 @@ from neurocal_cli.simulation.rendering import (
     Scene,
     Sensor,
     Target,
+    render,
 )
 
 SIZE = (400, 300)
@@ -66,7 +66,7 @@ def pictures(model: str, seed: int) -> list[tuple[Scene, Rendered]]:
             psf=0.7,
             sensor=Sensor(read_noise=2.0),
         )
-        picture = rendered(scene, rng, 6)
+        picture = render(scene, rng)
         if picture.truth.planes[0].vertices_visible.all():
             taken.append((scene, picture))
     return taken
