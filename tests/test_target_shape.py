@@ -26,6 +26,7 @@ from neurocal_cli.target_shape import find as find_module
 from neurocal_cli.target_shape import posterior as posterior_module
 from neurocal_cli.target_shape.find import LEAST_GAIN, find_target, sight_of
 from neurocal_cli.target_shape.information import Information, information_of
+from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
 from neurocal_cli.target_shape.posterior import known_sizes, posterior
 from neurocal_cli.target_shape.prior import Prior, prior_of
 from neurocal_cli.target_shape.system import System
@@ -37,8 +38,8 @@ TOO_SIMPLE = tuple(
 SIZES = {"bend": 0.3, "stretch": 0.2, "warp": 0.1, "place": 0.05, "height": 0.04}
 
 
-def minimum(points: Correspondences) -> tuple[Problem, Adjusted]:
-    problem = problem_for(points, 1, distortion=Distortion("k1k2"), skew=False)
+def minimum(points: Correspondences, model: str = "k1k2") -> tuple[Problem, Adjusted]:
+    problem = problem_for(points, 1, distortion=Distortion(model), skew=False)
     solution = fit(problem, options_for("lm", 20, 0))
     return solution.problem, solution.adjusted
 
@@ -264,7 +265,7 @@ def test_of_models_that_are_too_simple_few_are_good_and_wrong(named: str, model:
         ((100, 10, "k1", (-0.15,)),),
         [
             (s, n, m, k)
-            for s in range(101, 107)
+            for s in range(101, 181)
             for n, m, k in ((3, "k1k2", (-0.2, 0.08)), (15, "k1", (-0.15,)))
         ],
     ),
@@ -325,6 +326,19 @@ def test_some_of_many_views_tell_the_target_of_all(monkeypatch: pytest.MonkeyPat
     assert np.abs(some.target.found - whole.target.found).max() < 0.1
     alpha = problem.matrix(adjusted.state.entries[0])[0, 0]
     assert alpha == pytest.approx(truth.K[0, 0], abs=3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "model", "too_simple"), [("parabola", "k1k2", False), ("flat", "none", True)]
+)
+def test_some_of_many_views_tell_whether_a_model_is_too_simple(
+    shape: str, model: str, too_simple: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = minimum(photographed(shape, 14, 20, amount=0.1)[0], model)
+    monkeypatch.setattr(find_module, "_DENSE", 60)
+    found = find_target([fit])
+    assert found is not None
+    assert named_lens_is_too_simple([fit], found) == too_simple
 
 
 def test_given_poses_find_the_target_as_well() -> None:

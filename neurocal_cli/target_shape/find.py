@@ -97,20 +97,29 @@ def find_target(
     Found or None
         None if the points do not determine a target, or if the result is too different from the given one.
     """
+    some = _few_enough(fits, known)
+    if some is None:
+        return None
+    found = searched(Search(some, flat, known), least_gain)
+    return found if found is None or some is fits else _of_all_views(found, fits, known)
+
+
+def _few_enough(
+    fits: Sequence[tuple[Problem, Adjusted]], known: Target | None
+) -> Sequence[tuple[Problem, Adjusted]] | None:
+    """The fits, with some of their views if a dense system has no room for all; None if for none."""
     points = [problem.points if known is None else known.straightened(problem.points) for problem, _ in fits]
     n_points = len(distinct_points(points)[0])
     n_views = sum(problem.views.n_views for problem, _ in fits)
-    many = min(3 * n_points, 6 * n_views) > _DENSE
-    if many and min(3 * n_points, 6 * n_views) > _MOST_DENSE:
+    unknowns = min(3 * n_points, 6 * n_views)
+    if unknowns > _MOST_DENSE:
         return None
-    some = [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits] if many else fits
-    found = searched(Search(some, flat, known), least_gain)
-    return found if found is None or not many else _of_all_views(found, fits, known)
+    return fits if unknowns <= _DENSE else [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits]
 
 
 def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
-    """Logarithm of the evidence of the given target, comparable with that of a found one."""
-    return evidence_of_given(Search(fits, flat=False, known=None).information())
+    """Logarithm of the evidence of the given target, of the views from which a target would be estimated."""
+    return evidence_of_given(Search(_few_enough(fits, None) or fits, False, None).information())
 
 
 def searched(search: Search, least_gain: float) -> Found | None:

@@ -26,7 +26,8 @@ _NEAR = 0.02  # of the focal length: equal up to this
 # Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 % and 1.3 sigmas.
 _OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
 _SIGMAS = 2.0
-_TOO_SIMPLE = Limit(1.2, 4.0)  # rms error over that with all coefficients
+# Rms error over that with all coefficients; Zhang's views, usable without their lens, leave 3.3.
+_TOO_SIMPLE = Limit(1.2, 4.0)
 # Largest error, in units of the noise floor, that may remain without a cause; otherwise it is not the cause
 # or not the only one. Among the wrong inputs, true causes leave up to 1.04, and others 1.38 or more.
 _LEFT = 1.25
