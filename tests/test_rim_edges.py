@@ -63,15 +63,6 @@ def test_edges_to_the_rim_are_where_the_ids_say() -> None:
     assert 0.8 < rms < 1.2  # 120 errors
 
 
-def test_the_points_between_vertices_stay_as_they_are() -> None:
-    scene, found = seen(0)
-    inner = detect_points(rendered(scene, np.random.default_rng(0), 6).image, scene.board)
-    which = [found.ids.index(name) for name in inner.ids]
-    assert {is_at_rim(name) for name in inner.ids} == {False}
-    np.testing.assert_array_equal(found.pixels[which], inner.pixels)
-    np.testing.assert_array_equal(found.covariance[which], inner.covariance)
-
-
 @pytest.mark.parametrize("reach", [0.4, 0.7])
 def test_cut_outer_squares_are_left_out(reach: float) -> None:
     _, found = seen(1, reach=reach)

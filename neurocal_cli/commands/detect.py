@@ -107,8 +107,9 @@ def detect(
     says so.
 
     The command writes the points as CSV, each with its covariance. A mid-point is measured only in
-    the direction (nu,nv) across its edge. Images in which no board is detected are listed on standard
-    error with the reason.
+    the direction (nu,nv) across its edge. If the board is flat, the outermost ones are measured along
+    their edges too, and have the direction (0,0). Images in which no board is detected are listed on
+    standard error with the reason.
 
     A video (mp4, avi, mov, mkv and other formats that OpenCV decodes) is reduced to frames that are sharp and
     differ from each other; each becomes a view VIDEO_NUMBER.

@@ -3,18 +3,20 @@
 In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Each
 edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
 curvature of the edges and the position of each mid-point along its edge. The position across the edge comes
-from that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the light side: an
+from that edge alone. The outermost mid-points may be measured along their edges as well (`crossing_edges`). Gamma, ink spread and blooming displace all edges towards the dark or the light side: an
 alternating shift between edges and map, which is estimated and removed.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.fitting.crossing_edges import AlongEdges, positions_along_edges
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response
 from neurocal_cli.detection.fitting.grid_fit import (
@@ -78,8 +80,11 @@ def measure(
         return _vertices(grid_image, fitted, vertices)
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
     if points == "midpoints":
-        return inner
-    return inner.joined_with(_midpoints(*fit_rim(grid_image, fitted), fitted.unevenness, vertices))
+        along = positions_along_edges(grid_image, fitted)
+        return (inner if along is None else _measured_both_ways(inner, along)).only(fitted.good)
+    rim, fitted_rim = fit_rim(grid_image, fitted)
+    outer = _midpoints(rim, fitted_rim, fitted.unevenness, vertices)
+    return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
 
 
 def _nothing(grid: Grid) -> Measured:
@@ -121,7 +126,25 @@ def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: A
         vertices=vertices,
         rejected=0,
         polarity=_polarity(fitted),
-    ).only(fitted.good)
+    )
+
+
+def _measured_both_ways(midpoints: Measured, along: AlongEdges) -> Measured:
+    """Replace the positions of some mid-points along their edges by measured ones."""
+    rows, across = along.rows, midpoints.across
+    assert across is not None
+    n = across[rows]
+    suu, suv, svv = midpoints.covariance[rows].T
+    variance = suu * n[:, 0] ** 2 + 2 * suv * n[:, 0] * n[:, 1] + svv * n[:, 1] ** 2
+    # Intersection of two lines: n . p = value across the edge, direction . p = value along it.
+    inverse = np.linalg.inv(np.stack([n, along.direction], axis=1))
+    value = np.stack([(midpoints.pixels[rows] * n).sum(axis=1), along.value], axis=1)
+    pixels, covariance, directions = midpoints.pixels.copy(), midpoints.covariance.copy(), across.copy()
+    pixels[rows] = (inverse @ value[:, :, None])[:, :, 0]
+    spread = (inverse * np.stack([variance, along.variance], axis=1)[:, None]) @ inverse.swapaxes(1, 2)
+    covariance[rows] = spread.reshape(-1, 4)[:, [0, 1, 3]]
+    directions[rows] = 0.0
+    return replace(midpoints, pixels=pixels, covariance=covariance, across=directions)
 
 
 def _polarity(fitted: GridFit) -> float:

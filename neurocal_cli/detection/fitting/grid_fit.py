@@ -123,6 +123,11 @@ class GridEdges:
         """Map the edges to the image."""
         return grid_lines(at, self.centre, self.vertical, self.light)
 
+    def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
+        """Use the edges as observations of a map, with an unknown common shift towards the light side."""
+        value = (lines.middle * lines.normal).sum(axis=1) + offset
+        return Observations(self.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+
 
 @frozen_dataclass(eq=False)
 class GridImage:
@@ -168,9 +173,8 @@ class GridImage:
         return self.grid.pixels[self.grid.seen]
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
-        """Use edges as observations of a map, with an unknown common shift towards the light side."""
-        value = (lines.middle * lines.normal).sum(axis=1) + offset
-        edges = Observations(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        """Use edges as observations of a map; a few edges are joined with the found vertices as anchors."""
+        edges = self.edges.observations(lines, offset, variance)
         if len(offset) > _ENOUGH:
             return edges
         anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
@@ -198,6 +202,12 @@ class GridFit:
     shading: Shading
     noise: PixelNoise
     good: NDArray[np.bool_]
+
+    @property
+    def offset_variance(self) -> Array:
+        """(E,) variance of the fitted offsets [px^2], that of an anchor for edges that are not good."""
+        variance = np.maximum(self.fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
+        return np.where(self.good, variance, _ANCHOR**2)
 
     @property
     def unevenness(self) -> float:
@@ -233,7 +243,7 @@ def _wide_if_better(
     start = wide_start(found.map.frame, grid_image.vertices, grid_image.pixels, grid_image.size)
     if start is None:
         return found
-    wide = select_map(start, observations, found.shift, enough, most=start.richest_lens)
+    wide = select_map(start, observations, found.shift, enough, start.lens_models)
     costs = [
         loss_of(fit.residual / np.sqrt(observations.variance)) + _PARAMETER * len(fit.map.free)
         for fit in (found, wide)
@@ -280,12 +290,12 @@ def _first_fit(
     variance = np.where(good, variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
     # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
+    index = mapped.model_index
     chosen = select_map(
         mapped.map,
         observations,
         mapped.shift,
-        least=mapped.model_index,
-        most=max(mapped.model_index, mapped.map.richest_lens),
+        models=mapped.map.models[index : max(index, mapped.map.richest_lens) + 1],
     )
     if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
@@ -307,7 +317,8 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
     # More accurate edges may need a richer model.
-    mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
+    richer = first.map.map.models[first.map.model_index :]
+    mapped = select_map(first.map.map, observations, first.map.shift, models=richer)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges

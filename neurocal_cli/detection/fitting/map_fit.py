@@ -11,6 +11,7 @@ In: an initial map and observations. Out: the map with its covariance, residuals
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -137,8 +138,7 @@ def select_map(
     observations: Observations,
     shift: Array,
     enough: float = 0.0,
-    least: int = 0,
-    most: int | None = None,
+    models: Sequence[tuple[int, int]] | None = None,
 ) -> MapFit:
     """Fit the simplest model that the observations do not contradict.
 
@@ -150,14 +150,14 @@ def select_map(
     shift : (K,) array [px]
     enough : float
         Chi2 per observation below which no richer model is tried.
-    least, most : int
-        Indices of the simplest and the richest model that are tried; by default all are.
+    models : sequence of (radial, degree), optional
+        Models that are tried, the simplest first; by default all of the map's `models`.
     """
     best: _Solution | None = None
     now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
     informative, precision = observations.informative, 1 / np.sqrt(observations.variance)
     n_telling, scale = int(informative.sum()), 0.0
-    for radial, degree in start.models[least : None if most is None else most + 1]:
+    for radial, degree in start.models if models is None else models:
         if futile[degree > 0] >= _FUTILE:
             continue
         now = now.with_model(radial, degree)

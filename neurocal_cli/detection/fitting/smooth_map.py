@@ -4,11 +4,11 @@ It predicts the mid-points along their edges and the curvature of edges; `map_fi
 coordinates x, y scaled to [-1, 1], and pixels relative to the image centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
-    p = q + e (k1 rho + k2 rho^2) + sum_k a_k T_k(x, y),    e = q - c
+    p = q + e (k1 rho + k2 rho^2 + 2 tau . e) + tau rho + sum_k a_k T_k(x, y),    e = q - c
     rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
 
-m and n model pixels that are not square. T_k are products of Chebyshev polynomials with a total degree of at
-least 2.
+m and n model pixels that are not square, and tau is tangential distortion. T_k are products of Chebyshev
+polynomials with a total degree of at least 2.
 """
 
 from __future__ import annotations
@@ -23,9 +23,16 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_HOMOGRAPHY, _LENS = 8, 6
+_HOMOGRAPHY, _LENS = 8, 8
 _REST = _HOMOGRAPHY + _LENS
-_FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
+_TAU = slice(14, 16)
+_FREE_LENS: tuple[tuple[int, ...], ...] = (
+    (),
+    (10,),
+    (8, 9, 10, 11),
+    (8, 9, 10, 11, 12, 13),
+    tuple(range(_HOMOGRAPHY, _REST)),
+)
 # Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
 # [half diagonals]. Insensitive: they matter only for parameters that the data do not determine.
 _CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
@@ -94,9 +101,9 @@ class SmoothMap:
     ----------
     frame : Frame
     parameters : (P,) array
-        h0..h7, c_u, c_v, k1, k2, m, n, then a_k along u and along v.
+        h0..h7, c_u, c_v, k1, k2, m, n, tau_u, tau_v, then a_k along u and along v.
     radial : int
-        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n.
+        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n; all.
     degree : int
         Of the polynomial; 0 for none.
     covariance : (P, P) array
@@ -108,6 +115,8 @@ class SmoothMap:
         (0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6)
     )  # fmt: skip
     richest_lens: ClassVar[int] = 3  # index of the richest model without a polynomial
+    # Those of the lens alone, for places where a polynomial extrapolates badly.
+    lens_models: ClassVar[tuple[tuple[int, int], ...]] = tuple((k, 0) for k in range(len(_FREE_LENS)))
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _FREE_LENS  # positions of the free parameters of each set
     rest: ClassVar[int] = _REST  # position of the first coefficient of the polynomial
 
@@ -165,13 +174,23 @@ class SmoothMap:
         if self.radial:
             e, stretch = self._stretch(q)
             q += e * stretch
+            if self._tangential:
+                tau = self.parameters[_TAU]
+                q += e * (2 * tau @ e) + tau[:, None] * self._rho(e)
         return np.asarray(q)
+
+    @property
+    def _tangential(self) -> bool:
+        return _TAU.start in self.lenses[self.radial]
+
+    def _rho(self, e: Array) -> Array:
+        return np.asarray((e * (self._metric @ e)).sum(axis=0))
 
     def _stretch(self, q: Array) -> tuple[Array, Array]:
         """Points (2, N) relative to the centre of distortion, and their relative radial displacement (N,)."""
         values = self.parameters
         e = q - values[8:10, None]
-        rho = (e * (self._metric @ e)).sum(axis=0)
+        rho = self._rho(e)
         return e, rho * (values[10] + values[11] * rho)
 
     def bend(self, grid: Array) -> float:
@@ -240,6 +259,16 @@ class SmoothMap:
         growth += k1
         growth *= length
         turned = axis * stretch
+        further = length * stretch
+        if self._tangential:
+            tau = self.parameters[_TAU]
+            sideways, along = tau @ axis, tau @ e
+            turned += 2 * (tau[:, None] * length + along * axis)
+            growth += sideways
+            further += 2 * along * length + sideways * rho
+            out[6:] = 2 * e * length + rho * axis
+        else:
+            out[6:] = 0.0
         slope *= 2 * growth
         turned += slope
         np.negative(turned, out=out[:2])
@@ -248,7 +277,7 @@ class SmoothMap:
         e_u, e_v = e
         np.multiply(growth, e_u * e_u - e_v * e_v, out=out[4])
         np.multiply(growth, 2 * e_u * e_v, out=out[5])
-        return length * stretch, turned
+        return further, turned
 
     @property
     def _homography(self) -> Array:

@@ -1,0 +1,127 @@
+"""Measure where the outermost mid-points lie along their edges.
+
+An edge measures its mid-point across itself only. But at the ends of the outermost edges, the last pieces of
+two grid lines begin, which lead to the rim of the board. They are fitted as well, and have no mid-points of
+their own: what they measure is the position along the outermost edges.
+
+         |       |        the edges to the rim, measured across themselves
+    -----+---x---+-----   x: a mid-point in the outermost row
+         |       |
+
+Such an edge departs from a map of the lens, which all edges of the board determine, by its own error alone.
+This departure is added to the map at a mid-point beside it. So each edge to the rim serves one mid-point, and
+the errors of all mid-points stay independent of each other.
+
+The map must be accurate up to the rim. So it contains the lens, with tangential distortion, and no polynomial,
+which would extrapolate badly. If all edges do not agree with it within their noise, as on paper boards, the
+mid-points stay as they are.
+
+In: the fits of all edges. Out: `AlongEdges`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.edge_fit import OFFSET
+from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridFit, GridImage, fit_rim
+from neurocal_cli.detection.fitting.map_fit import select_map
+from neurocal_cli.detection.fitting.strips import grid_lines
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
+
+# Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
+# 0.7 to 1.6 in rendered images (tests/test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
+_AGREES = 3.0
+
+
+@frozen_dataclass(eq=False)
+class AlongEdges:
+    """Positions of mid-points along their edges: ``direction . p = value``.
+
+    Attributes
+    ----------
+    rows : (M,) int array
+        Of the mid-points among the edges of the grid.
+    direction : (M, 2) array
+        Unit normals of the grid lines that cross the edges.
+    value : (M,) array [px]
+    variance : (M,) array [px^2]
+    """
+
+    rows: NDArray[np.intp]
+    direction: Array
+    value: Array
+    variance: Array
+
+
+def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges | None:
+    """Measure the positions of the outermost mid-points along their edges; None if the map is not accurate.
+
+    Parameters
+    ----------
+    grid_image : GridImage
+    fitted : GridFit
+        The fits of the edges between the vertices of the grid.
+    """
+    if fitted.map.excess > _AGREES:
+        return None
+    rim, fit = fit_rim(grid_image, fitted)
+    edges, n = grid_image.edges, len(grid_image.edges.index)
+    serves = edges_served(grid_image.grid.shape, edges, rim, fitted.good)
+    used = fit.good & (serves >= 0)
+    if not used.any():
+        return None
+    between = grid_image.observations(fitted.lines, fitted.fit.values[:, OFFSET], fitted.offset_variance)
+    to_rim = rim.observations(fit.lines, fit.fit.values[:, OFFSET], fit.offset_variance)
+    lens = fitted.map.map.lens_models[fitted.map.map.radial :]
+    mapped = select_map(fitted.map.map, between.joined_with(to_rim), fitted.map.shift, models=lens)
+    if mapped.excess > _AGREES:
+        return None
+    variance = (fit.fit.covariance[:, OFFSET, OFFSET] * fit.fit.variance_growth)[used]
+    weight = 1 / (variance + fitted.unevenness)
+    departure = (mapped.residual[-len(rim.index) :] * rim.light)[used]
+    total = np.bincount(serves[used], weight, n)
+    mean = np.bincount(serves[used], weight * departure, n)
+    rows = np.flatnonzero(total)
+    crossing = grid_lines(mapped.map, edges.centre[rows], ~edges.vertical[rows], np.ones(len(rows)))
+    direction = crossing.normal / np.hypot(*crossing.normal.T)[:, None]
+    value = (crossing.middle * direction).sum(axis=1) + mean[rows] / total[rows]
+    return AlongEdges(rows, direction, value, 1 / total[rows])
+
+
+def edges_served(
+    shape: tuple[int, int], edges: GridEdges, rim: GridEdges, good: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Find the edge whose mid-point each edge to the rim serves.
+
+    Two edges between vertices cross the edge to the rim at its known vertex. The one towards the middle of the
+    board is preferred.
+
+    Parameters
+    ----------
+    shape : (cols, rows)
+        Number of the grid's vertices.
+    edges, rim : GridEdges
+        Edges between vertices, and edges to the rim.
+    good : (E,) bool array
+        Edges between vertices that have a mid-point.
+
+    Returns
+    -------
+    rows : (F,) int array
+        Among `edges`; -1 for none.
+    """
+    cols, rows = shape
+    row_of = np.full((2, cols + 2, rows + 2), -1, dtype=np.intp)  # one longer on each side
+    c, r = edges.index[good].T + 1
+    row_of[edges.vertical[good].astype(int), c, r] = np.flatnonzero(good)
+    along = np.where(rim.vertical[:, None], [0, 1], [1, 0])
+    vertex = rim.index + along * rim.known[:, 1:]
+    across = 1 - along
+    before_middle = (vertex * across).sum(axis=1) < 0.5 * ((np.array(shape) - 1) * across).sum(axis=1)
+    kind = 1 - rim.vertical.astype(int)
+    ahead, behind = (row_of[kind, *(vertex + 1 - step * across).T] for step in (0, 1))
+    first, second = np.where(before_middle, (ahead, behind), (behind, ahead))
+    return np.where(first >= 0, first, second)

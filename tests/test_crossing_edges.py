@@ -1,0 +1,103 @@
+"""The edges to the rim tell where the outermost mid-points lie along their edges."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.measured import found, take
+from support.real_data import RealFiles
+from support.rendered import condition, rendered
+from support.slow_cases import slow_but
+
+from neurocal_cli.board import Board
+from neurocal_cli.detection import Grid
+from neurocal_cli.detection.detect import Detection, detect_points
+from neurocal_cli.detection.fitting.crossing_edges import edges_served, positions_along_edges
+from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridImage, fit_grid
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.images import read_image
+from neurocal_cli.simulation.rendering import Scene
+
+
+def seen(seed: int, name: str) -> tuple[Scene, Detection]:
+    scene = condition(name, seed)
+    # The colour of its first square tells which end of the board is which.
+    scene = replace(scene, targets=tuple(replace(target, first_black=True) for target in scene.targets))
+    return scene, detect_points(rendered(scene, np.random.default_rng(seed), 6).image, scene.board)
+
+
+def outermost(one: Detection) -> Array:
+    """Rows of the mid-points that are measured in both directions."""
+    assert one.across is not None
+    return np.flatnonzero(~one.across.any(axis=1))
+
+
+def is_in_an_outer_row(name: str, cols: int, rows: int) -> bool:
+    kind, c, r = name.split("/")[-1].split(":")
+    return int(r) in (0, rows - 1) if kind == "h" else int(c) in (0, cols - 1)
+
+
+@pytest.mark.parametrize("name", slow_but(("base",), ("base", "k1 -0.3", "gamma 2.2")))
+def test_outermost_midpoints_are_measured_along_their_edges(name: str) -> None:
+    squares: list[Array] = []
+    for seed in range(4):
+        scene, one = seen(seed, name)
+        rows, (plane,) = outermost(one), scene.board.planes
+        assert len(rows) == 2 * (plane.cols - 1) + 2 * (plane.rows - 1)
+        assert all(is_in_an_outer_row(one.ids[row], plane.cols, plane.rows) for row in rows)
+        truth = scene.camera.project(scene.pose.to_camera(one.world[rows]))[0]
+        u, v = (one.pixels[rows] - truth).T
+        suu, suv, svv = one.covariance[rows].T
+        squares.append((svv * u * u - 2 * suv * u * v + suu * v * v) / (suu * svv - suv**2))
+    assert 0.7 < np.concatenate(squares).mean() / 2 < 1.4  # 104 points
+
+
+def test_they_stay_where_they_are_across_their_edges() -> None:
+    scene = condition("base", 0)
+    image = rendered(scene, np.random.default_rng(0), 6).image
+    one, rim = (detect_points(image, scene.board, kind) for kind in ("midpoints", "edges"))
+    assert rim.across is not None
+    rows = outermost(one)
+    same = np.array([rim.ids.index(name) for name in one.ids])
+    n = rim.across[same]
+    np.testing.assert_allclose((one.pixels * n).sum(axis=1), (rim.pixels[same] * n).sum(axis=1), atol=1e-9)
+    others = np.setdiff1d(np.arange(len(one.ids)), rows)
+    np.testing.assert_array_equal(one.pixels[others], rim.pixels[same][others])
+    assert not np.array_equal(one.pixels[rows], rim.pixels[same][rows])
+
+
+def test_each_edge_to_the_rim_serves_one_midpoint_beside_its_vertex() -> None:
+    seen = np.ones((5, 6), dtype=bool)
+    seen[2, 3] = seen[0, 0] = False
+    grid = Grid(np.where(seen[..., None], 0.0, np.nan) + np.zeros((5, 6, 2)), 0)
+    edges, rim = GridEdges.of(grid), GridEdges.to_rim(grid)
+    served = edges_served(grid.shape, edges, rim, np.ones(len(edges.index), dtype=bool))
+    assert (served >= 0).all()
+    ends = edges.index[:, None] + np.where(edges.vertical[:, None, None], [[0, 0], [0, 1]], [[0, 0], [1, 0]])
+    for row, vertical, first, known in zip(served, rim.vertical, rim.index, rim.known, strict=True):
+        vertex = first + (0 if known[0] else 1) * np.array([0, 1] if vertical else [1, 0])
+        assert edges.vertical[row] != vertical
+        assert (ends[row] == vertex).all(axis=1).any()
+    # Without the edges between vertices there is nothing to serve.
+    assert (edges_served(grid.shape, edges, rim, np.zeros(len(edges.index), dtype=bool)) == -1).all()
+
+
+def test_nothing_is_told_of_a_board_that_departs_from_the_map() -> None:
+    _, picture = take("base", 0)
+    grid, _ = found(picture.truth.planes[0], 1)
+    grid_image = GridImage.of(picture.image, grid, 1 / 12)
+    fitted = fit_grid(grid_image)
+    along = positions_along_edges(grid_image, fitted)
+    assert along is not None
+    assert len(along.rows) == len(along.value) > 20
+    uneven = replace(fitted, map=replace(fitted.map, excess=4.0))
+    assert positions_along_edges(grid_image, uneven) is None
+
+
+def test_paper_boards_are_measured_across_their_edges_only(real_files: RealFiles) -> None:
+    path = real_files("opencv_stereo/left01.jpg")[0]
+    one = detect_points(read_image(path).grey, Board.single(9, 6, 25.0))
+    assert len(one.ids) == 93
+    assert not len(outermost(one))
