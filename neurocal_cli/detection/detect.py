@@ -77,8 +77,8 @@ class Detection:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit normal of the edge of each mid-point, the direction in which it is measured; 0 for mid-points that
-        are measured in both directions; None for vertices.
+        Unit normal of the edge of each mid-point, the direction in which it is measured; 0 for mid-points
+        that are measured in both directions; None for vertices.
     image_size : (width, height) [px]
     rejected : int
         Number of points rejected by the quality tests of their fits.

@@ -74,8 +74,8 @@ class Measured:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit normals of the edges of mid-points, the direction in which each is measured; 0 for mid-points that
-        are measured in both directions; None for vertices.
+        Unit normals of the edges of mid-points, the direction in which each is measured; 0 for mid-points
+        that are measured in both directions; None for vertices.
     vertices : (rows, cols, 2) array [px]
         The grid's vertices after refinement, NaN where not found or not fitted.
     rejected : int

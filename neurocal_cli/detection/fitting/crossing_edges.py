@@ -12,9 +12,9 @@ Such an edge departs from a map of the lens, which all edges of the board determ
 This departure is added to the map at a mid-point beside it. So each edge to the rim serves one mid-point, and
 the errors of all mid-points stay independent of each other.
 
-The map must be accurate up to the rim. So it contains the lens, with tangential distortion, and no polynomial,
-which would extrapolate badly. If all edges do not agree with it within their noise, as on paper boards, the
-mid-points stay as they are.
+The map must be accurate up to the rim. So it contains the lens, with tangential distortion, and no
+polynomial, which would extrapolate badly. If the edges do not agree with it within their noise, as on paper
+boards, the mid-points stay as they are.
 
 In: the fits of all edges. Out: `AlongEdges`.
 """
@@ -96,8 +96,8 @@ def edges_served(
 ) -> NDArray[np.intp]:
     """Find the edge whose mid-point each edge to the rim serves.
 
-    Two edges between vertices cross the edge to the rim at its known vertex. The one towards the middle of the
-    board is preferred.
+    Two edges between vertices cross the edge to the rim at its known vertex. The one towards the middle of
+    the board is preferred.
 
     Parameters
     ----------
@@ -122,6 +122,7 @@ def edges_served(
     across = 1 - along
     before_middle = (vertex * across).sum(axis=1) < 0.5 * ((np.array(shape) - 1) * across).sum(axis=1)
     kind = 1 - rim.vertical.astype(int)
-    ahead, behind = (row_of[kind, *(vertex + 1 - step * across).T] for step in (0, 1))
+    begin, end = ((vertex + 1 - step * across).T for step in (0, 1))
+    ahead, behind = row_of[kind, begin[0], begin[1]], row_of[kind, end[0], end[1]]
     first, second = np.where(before_middle, (ahead, behind), (behind, ahead))
     return np.where(first >= 0, first, second)
