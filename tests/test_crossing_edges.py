@@ -16,6 +16,8 @@ from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.fitting.crossing_edges import edges_served, positions_along_edges
 from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridImage, fit_grid
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.fitting.wide_map import WideMap
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.images import read_image
 from neurocal_cli.simulation.rendering import Scene
@@ -82,6 +84,12 @@ def test_each_edge_to_the_rim_serves_one_midpoint_beside_its_vertex() -> None:
         assert (ends[row] == vertex).all(axis=1).any()
     # Without the edges between vertices there is nothing to serve.
     assert (edges_served(grid.shape, edges, rim, np.zeros(len(edges.index), dtype=bool)) == -1).all()
+
+
+@pytest.mark.parametrize("kind", [SmoothMap, WideMap])
+def test_each_lens_has_a_model_without_a_polynomial(kind: type[SmoothMap]) -> None:
+    assert kind.lens_models == tuple((k, 0) for k in range(len(kind.lenses)))
+    assert kind.models[: kind.richest_lens + 1] == kind.lens_models[: kind.richest_lens + 1]
 
 
 def test_nothing_is_told_of_a_board_that_departs_from_the_map() -> None:

@@ -61,6 +61,7 @@ class WideMap(SmoothMap):
         *((len(_LENSES) - 1, degree) for degree in (3, 4, 5, 6)),
     )
     richest_lens: ClassVar[int] = len(_LENSES) - 1
+    lens_models: ClassVar[tuple[tuple[int, int], ...]] = models[: len(_LENSES)]
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
     rest: ClassVar[int] = _REST
 
