@@ -189,7 +189,7 @@ def test_blurred_oblique_cross_is_as_modelled(angle: float) -> None:
     np.testing.assert_allclose(linear.x[0], exact, atol=0.006)
 
 
-@pytest.mark.parametrize("radial", [3, 4])
+@pytest.mark.parametrize("radial", [3, 4, 5])
 def test_map_has_the_derivatives_it_says(radial: int) -> None:
     now = some_map(radial=radial)
     grid = np.random.default_rng(5).uniform(0, 8, (20, 2))

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from support.maps import some_map
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     BatchFit,
@@ -132,6 +135,20 @@ def test_simplest_form_that_follows_is_chosen(radial: int, degree: int) -> None:
     assert degree <= chosen.map.degree <= degree + (degree > 0)
     assert np.abs(chosen.map.at(GRID) - true.at(GRID)).max() < 0.01
     assert chosen.excess == pytest.approx(1, abs=0.4)
+
+
+def test_the_richest_lens_follows_all_coefficients_behind_pixels_that_are_not_square() -> None:
+    camera = Camera(
+        Intrinsics(505.0, 495.0, 331.0, 235.0),
+        Distortion("plumb_bob", np.array([-0.2, 0.08, 0.012, -0.009, 0.02])),
+        (640, 480),
+    )
+    pose = Pose.from_euler(0.4, -0.3, 0.2, np.array([-4.5, -2.0, 9.0]))
+    pixels = camera.project(pose.to_camera(np.column_stack([GRID, np.zeros(len(GRID))])))[0]
+    frame = Frame.of(GRID, (640, 480))
+    lens = homography_start(frame, GRID, pixels).with_model(*SmoothMap.lens_models[-1])
+    fit = fit_map(lens, Observations.of_points(GRID, pixels, 1e-4), np.zeros(0))
+    assert np.abs(fit.map.at(GRID) - pixels).max() < 1e-3
 
 
 def straight(angle: float, size: float = 20.0) -> SmoothMap:

@@ -12,9 +12,9 @@ Such an edge departs from a map of the lens, which all edges of the board determ
 This departure is added to the map at a mid-point beside it. So each edge to the rim serves one mid-point, and
 the errors of all mid-points stay independent of each other.
 
-The map must be accurate up to the rim. So it contains the lens, with tangential distortion, and no
+The map must be accurate up to the rim. So it contains the lens, with tangential distortion and k3, and no
 polynomial, which would extrapolate badly. If the edges do not agree with it within their noise, as on paper
-boards, the mid-points stay as they are.
+boards, the mid-points stay as they are. So do those whose edges to the rim alone do not agree.
 
 In: the fits of all edges. Out: `AlongEdges`.
 """
@@ -33,7 +33,8 @@ from neurocal_cli.geometry import Array
 
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
 # 0.7 to 1.6 in rendered images (tests/test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
-_AGREES = 3.0
+_AGREES = 2.0
+_OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to the rim is not used
 
 
 @frozen_dataclass(eq=False)
@@ -70,18 +71,19 @@ def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges 
     rim, fit = fit_rim(grid_image, fitted)
     edges, n = grid_image.edges, len(grid_image.edges.index)
     serves = edges_served(grid_image.grid.shape, edges, rim, fitted.good)
-    used = fit.good & (serves >= 0)
-    if not used.any():
-        return None
     between = grid_image.observations(fitted.lines, fitted.fit.values[:, OFFSET], fitted.offset_variance)
     to_rim = rim.observations(fit.lines, fit.fit.values[:, OFFSET], fit.offset_variance)
     lens = fitted.map.map.lens_models[fitted.map.map.radial :]
     mapped = select_map(fitted.map.map, between.joined_with(to_rim), fitted.map.shift, models=lens)
     if mapped.excess > _AGREES:
         return None
-    variance = (fit.fit.covariance[:, OFFSET, OFFSET] * fit.fit.variance_growth)[used]
-    weight = 1 / (variance + fitted.unevenness)
-    departure = (mapped.residual[-len(rim.index) :] * rim.light)[used]
+    variance = fit.fit.covariance[:, OFFSET, OFFSET] * fit.fit.variance_growth + fitted.unevenness
+    variance *= max(mapped.excess, 1.0)
+    departure = mapped.residual[-len(rim.index) :] * rim.light
+    used = fit.good & (serves >= 0) & (departure**2 < _OUTLIER**2 * variance)
+    if not used.any():
+        return None
+    weight, departure = 1 / variance[used], departure[used]
     total = np.bincount(serves[used], weight, n)
     mean = np.bincount(serves[used], weight * departure, n)
     rows = np.flatnonzero(total)

@@ -4,11 +4,11 @@ It predicts the mid-points along their edges and the curvature of edges; `map_fi
 coordinates x, y scaled to [-1, 1], and pixels relative to the image centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
-    p = q + e (k1 rho + k2 rho^2 + 2 tau . e) + tau rho + sum_k a_k T_k(x, y),    e = q - c
-    rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
+    p = q + e (k1 rho + k2 rho^2 + k3 rho^3 + 2 tau . S e) + tau rho + sum_k a_k T_k(x, y),    e = q - c
+    rho = e . S e,    S = (1 + m, n; n, 1 - m)
 
-m and n model pixels that are not square, and tau is tangential distortion. T_k are products of Chebyshev
-polynomials with a total degree of at least 2.
+m and n model pixels that are not square, and tau is tangential distortion, the same as of a lens behind
+square pixels. T_k are products of Chebyshev polynomials with a total degree of at least 2.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_HOMOGRAPHY, _LENS = 8, 8
+_HOMOGRAPHY, _LENS = 8, 9
 _REST = _HOMOGRAPHY + _LENS
-_TAU = slice(14, 16)
+_TAU, _K3 = slice(14, 16), 16
 _FREE_LENS: tuple[tuple[int, ...], ...] = (
     (),
     (10,),
     (8, 9, 10, 11),
     (8, 9, 10, 11, 12, 13),
+    (8, 9, 10, 11, 12, 13, 14, 15),
     tuple(range(_HOMOGRAPHY, _REST)),
 )
-# Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
+# Prior standard deviations of the centre of distortion [half diagonals], of k1, k2 and k3, and of all others
 # [half diagonals]. Insensitive: they matter only for parameters that the data do not determine.
 _CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
@@ -101,9 +102,10 @@ class SmoothMap:
     ----------
     frame : Frame
     parameters : (P,) array
-        h0..h7, c_u, c_v, k1, k2, m, n, tau_u, tau_v, then a_k along u and along v.
+        h0..h7, c_u, c_v, k1, k2, m, n, tau_u, tau_v, k3, then a_k along u and along v.
     radial : int
-        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n; all.
+        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n; with
+        tau; all.
     degree : int
         Of the polynomial; 0 for none.
     covariance : (P, P) array
@@ -139,6 +141,7 @@ class SmoothMap:
         weights[8:10], weights[10:12], weights[12:] = 1 / np.square(
             [_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR]
         )
+        weights[_K3] = weights[10]
         return weights
 
     def with_model(self, radial: int, degree: int) -> SmoothMap:
@@ -176,7 +179,7 @@ class SmoothMap:
             q += e * stretch
             if self._tangential:
                 tau = self.parameters[_TAU]
-                q += e * (2 * tau @ e) + tau[:, None] * self._rho(e)
+                q += e * (2 * tau @ (self._metric @ e)) + tau[:, None] * self._rho(e)
         return np.asarray(q)
 
     @property
@@ -191,7 +194,7 @@ class SmoothMap:
         values = self.parameters
         e = q - values[8:10, None]
         rho = self._rho(e)
-        return e, rho * (values[10] + values[11] * rho)
+        return e, rho * (values[10] + rho * (values[11] + rho * values[_K3]))
 
     def bend(self, grid: Array) -> float:
         """Greatest relative radial displacement by the lens at grid points (N, 2)."""
@@ -247,36 +250,36 @@ class SmoothMap:
 
     def _lens(self, q: Array, axis: Array, out: Array) -> tuple[Array, Array]:
         """Contribution of the lens along axes (2, N) and its derivative by q; writes the others to `out`."""
-        (k1, k2), metric = self.parameters[10:12], self._metric
+        (k1, k2), k3, metric = self.parameters[10:12], self.parameters[_K3], self._metric
         e = q - self.parameters[8:10, None]
         slope = metric @ e
         rho = (e * slope).sum(axis=0)
         length = (axis * e).sum(axis=0)
-        stretch = rho * k2
-        growth = stretch * 2
-        stretch += k1
-        stretch *= rho
-        growth += k1
-        growth *= length
+        cubic = rho * k3
+        stretch = rho * (k1 + rho * (k2 + cubic))
+        growth = length * (k1 + rho * (2 * k2 + 3 * cubic))
         turned = axis * stretch
         further = length * stretch
+        np.multiply(length, rho, out=out[2])
+        np.multiply(out[2], rho, out=out[3])
+        np.multiply(out[3], rho, out=out[8])
+        e_u, e_v = e
         if self._tangential:
             tau = self.parameters[_TAU]
-            sideways, along = tau @ axis, tau @ e
-            turned += 2 * (tau[:, None] * length + along * axis)
+            sideways, along = tau @ axis, tau @ slope
+            turned += 2 * ((metric @ tau)[:, None] * length + along * axis)
             growth += sideways
             further += 2 * along * length + sideways * rho
-            out[6:] = 2 * e * length + rho * axis
+            out[6:8] = 2 * slope * length + rho * axis
+            out[4] = 2 * length * (tau[0] * e_u - tau[1] * e_v)
+            out[5] = 2 * length * (tau[0] * e_v + tau[1] * e_u)
         else:
-            out[6:] = 0.0
+            out[4:8] = 0.0
         slope *= 2 * growth
         turned += slope
         np.negative(turned, out=out[:2])
-        np.multiply(length, rho, out=out[2])
-        np.multiply(out[2], rho, out=out[3])
-        e_u, e_v = e
-        np.multiply(growth, e_u * e_u - e_v * e_v, out=out[4])
-        np.multiply(growth, 2 * e_u * e_v, out=out[5])
+        out[4] += growth * (e_u * e_u - e_v * e_v)
+        out[5] += growth * (2 * e_u * e_v)
         return further, turned
 
     @property
