@@ -66,6 +66,7 @@ class Errors:
     """
 
     both: Array
+    once: NDArray[np.bool_]
     normal: Array
     bound: Array
     squared: Array
@@ -80,8 +81,8 @@ class Errors:
 
     @property
     def rms(self) -> float:
-        """Per axis [px]."""
-        return float(np.sqrt((self.both**2).mean()))
+        """Per axis [px], of vertices, or of mid-points whose place along the edge comes from the map."""
+        return float(np.sqrt((self.both[self.once] ** 2).mean()))
 
     @property
     def normalised(self) -> float:
@@ -109,7 +110,7 @@ def errors_of(
     hidden: bool = False,
 ) -> Errors:
     """Errors of pictures, one for each seed."""
-    parts: list[tuple[Array, Array, Array, Array]] = []
+    parts: list[tuple[Array, ...]] = []
     visible, kept, polarity = 0, 0, []
     for seed in seeds:
         scene, picture = taken(seed)
@@ -129,9 +130,10 @@ def errors_of(
             u, v = error.T
             squared = (svv * u * u - 2 * suv * u * v + suu * v * v) / (suu * svv - suv**2)
             shown = seen[row]
-            parts.append((error[shown], normal[shown], least[shown], squared[shown]))
+            once = np.ones(len(row), bool) if measured.across is None else measured.across.any(axis=1)
+            parts.append(tuple(part[shown] for part in (error, once, normal, least, squared)))
             visible += int(seen.sum())
             kept += int((~shown).sum())
             polarity.append(measured.polarity)
-    both, normals, bounds, squares = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return Errors(both, normals, bounds, squares, visible, kept, polarity)
+    whole = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    return Errors(*whole, visible, kept, polarity)
