@@ -8,7 +8,7 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.preparation import check_outputs
 from neurocal_cli.commands.streams import print_summary
 
 

@@ -10,7 +10,7 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 

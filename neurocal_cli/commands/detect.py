@@ -10,12 +10,23 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.frames import videos_as_frames
-from neurocal_cli.commands.one_size import of_one_size
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import complain, note, one_line, print_summary, say, some_of, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.frames import of_one_size, videos_as_frames
+from neurocal_cli.commands.preparation import (
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
+from neurocal_cli.commands.streams import (
+    ProgressBar,
+    complain,
+    note,
+    one_line,
+    print_summary,
+    say,
+    some_of,
+    warn,
+)
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:

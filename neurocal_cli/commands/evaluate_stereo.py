@@ -10,9 +10,8 @@ import click
 from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import calibration_or_camera
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.streams import note, print_summary, warn
-from neurocal_cli.commands.tables import show
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import SPACE_PANELS
 

@@ -1,14 +1,19 @@
-"""Replace videos among the images of a command by selected frames."""
+"""The images of ``neurocal detect``: videos become frames, and images of another size are left out."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note
+from neurocal_cli.commands.streams import ProgressBar, note
+
+if TYPE_CHECKING:
+    from neurocal_cli.detection.batch import Outcome
 
 
 @contextmanager
@@ -56,3 +61,26 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
             save_frame(grey, saved[-1])
     note([f"{path}: {len(saved)} of {total} frames are sharp and differ from each other"])
     return saved
+
+
+def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
+    """Leave out boards in images whose size differs from the most common one; none if two sizes tie.
+
+    Parameters
+    ----------
+    outcomes : list of (name, Outcome)
+    """
+    sizes = Counter(outcome.detection.image_size for _, outcome in outcomes if outcome.detection is not None)
+    counts = [count for _, count in sizes.most_common(2)]
+    if len(counts) < 2 or counts[0] == counts[1]:
+        return outcomes
+    most = sizes.most_common(1)[0][0]
+    kept = []
+    for name, outcome in outcomes:
+        found = outcome.detection
+        if found is not None and found.image_size != most:
+            both = "{} x {} px and most have {} x {}".format(*found.image_size, *most)
+            problem = f"{name}: the image has {both}; run detect for each camera separately"
+            outcome = replace(outcome, detection=None, overlay=None, problem=problem)
+        kept.append((name, outcome))
+    return kept

@@ -8,10 +8,13 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.preparation import (
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary, say, warn
 
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:

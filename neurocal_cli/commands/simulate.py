@@ -10,10 +10,8 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, compute_in_one_thread
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
 if TYPE_CHECKING:

@@ -10,12 +10,21 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.pages import html_option, write_page
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.pictures import (
+    Plots,
+    check_plots,
+    html_option,
+    panels_option,
+    write_page,
+    write_plots,
+)
+from neurocal_cli.commands.preparation import (
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
 

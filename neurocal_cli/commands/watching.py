@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.one_size import of_one_size
+from neurocal_cli.commands.frames import of_one_size
 from neurocal_cli.commands.streams import complain, one_line, say
 from neurocal_cli.errors import FormatError, NeurocalError
 

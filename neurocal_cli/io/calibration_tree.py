@@ -12,13 +12,10 @@ from neurocal_cli.io.calibration_yaml import FORMATS
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.named_entries import read_named
 from neurocal_cli.io.observations_yaml import read_observations
-from neurocal_cli.io.rejected_yaml import read_rejected
-from neurocal_cli.io.target_yaml import read_target
-from neurocal_cli.io.text_columns import read_numbers
+from neurocal_cli.io.optional_blocks import read_rejected, read_target, read_verdict
+from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.verdict_yaml import read_verdict
 from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 

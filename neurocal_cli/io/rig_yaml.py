@@ -18,8 +18,8 @@ from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
+from neurocal_cli.io.optional_blocks import read_verdict, verdict_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
 from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig

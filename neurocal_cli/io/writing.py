@@ -15,8 +15,7 @@ from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
-from neurocal_cli.io.outputs import held_back
-from neurocal_cli.io.temporary_files import remove_stale, temporary_name
+from neurocal_cli.io.outputs import held_back, remove_stale, temporary_name
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,10 +9,16 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
-from neurocal_cli.plots.residuals import draw_learning, draw_residuals, draw_scatter, draw_views
+from neurocal_cli.plots.residuals import (
+    draw_coverage,
+    draw_learning,
+    draw_residuals,
+    draw_scatter,
+    draw_uncertainty,
+    draw_views,
+)
 from neurocal_cli.plots.space import draw_poses
 from neurocal_cli.plots.subject import Subject
-from neurocal_cli.plots.trust import draw_coverage, draw_uncertainty
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 

@@ -24,7 +24,7 @@ from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.exchange.rotations import from_vector, to_vector
-from neurocal_cli.io.file_storage_text import storage_text
+from neurocal_cli.io.file_storage import storage_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
