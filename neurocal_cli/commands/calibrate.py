@@ -23,10 +23,8 @@ from neurocal_cli.commands.preparation import (
     check_summary,
     compute_in_one_thread,
 )
-from neurocal_cli.commands.streams import ProgressBar, print_summary, say, warn
+from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 from neurocal_cli.plots import CAMERA_PANELS
-
-_NOT_CONVERGED = 3
 
 
 @click.command(cls=options.Command)
@@ -40,9 +38,7 @@ _NOT_CONVERGED = 3
 @options.lean
 @options.summary
 @options.output("CAMERA.yaml", "Write the calibration to this file.")
-@click.pass_context
 def calibrate(
-    ctx: click.Context,
     points: tuple[str, ...],
     estimation: Estimation,
     camera_name: str,
@@ -115,10 +111,4 @@ def calibrate(
         write_plots(plots, partial(draw_camera, Subject.of(calibration)))
     warn(write_result(calibration, output, lean=lean))
     write_page(html, calibration, *inputs)
-    if as_json:
-        print_summary(calibration_json(calibration))
-    else:
-        say(calibration_report(calibration))
-    warn(calibration.warnings)
-    if not calibration.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(calibration, as_json, calibration_json, calibration_report)

@@ -113,7 +113,7 @@ class Estimation:
         elif self.intrinsics is not None:
             points, arguments["intrinsics"] = given_camera(self.intrinsics, points)
         elif self.extrinsics is not None:
-            from neurocal_cli.io.camera_files import read_extrinsics
+            from neurocal_cli.io.calibration_tree import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics)
         return points, arguments

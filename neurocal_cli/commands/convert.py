@@ -152,7 +152,7 @@ def _write_cameras(
 ) -> dict[str, Any]:
     """Write cameras; what there is to say of them, for programs."""
     from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
-    from neurocal_cli.io.exchange.formats import FORMATS
+    from neurocal_cli.io.exchange.reading import FORMATS
 
     wanted = FORMATS[target]
     adapted = adapt_cameras(cameras, wanted, force, model)

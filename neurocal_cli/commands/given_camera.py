@@ -34,7 +34,7 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
     InputError
         The camera has another image size.
     """
-    from neurocal_cli.io.camera_files import read_intrinsics
+    from neurocal_cli.io.exchange.reading import read_intrinsics
 
     camera = read_intrinsics(path)
     if camera.image_size is not None:

@@ -14,9 +14,8 @@ from neurocal_cli.commands.preparation import (
     check_summary,
     compute_in_one_thread,
 )
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary, say, warn
+from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
-_NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
 _LENS = options.argument(
@@ -98,9 +97,7 @@ def lens() -> None:
 @options.plot("each parameter over the settings, with its uncertainty, and the errors")
 @options.summary
 @options.output("LENS.yaml", "Write the lens to this file.")
-@click.pass_context
 def fit(
-    ctx: click.Context,
     points: tuple[str, ...],
     distortion: str,
     training: str,
@@ -175,13 +172,7 @@ def fit(
 
         write_plot(plot, partial(draw_lens, learnt))
     write_lens(learnt, output)
-    if as_json:
-        print_summary(lens_json(learnt))
-    else:
-        say(lens_report(learnt))
-    warn(learnt.warnings)
-    if not learnt.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(learnt, as_json, lens_json, lens_report)
 
 
 @lens.command(cls=options.Command)

@@ -81,7 +81,7 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
     import hashlib
     import shlex
 
-    from neurocal_cli.html_report.origin import Origin, versions
+    from neurocal_cli.html_report.page import Origin, versions
     from neurocal_cli.html_report.reports import calibration_page, rig_page
     from neurocal_cli.io.files import read_bytes
     from neurocal_cli.io.writing import write_whole

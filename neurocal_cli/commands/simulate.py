@@ -219,7 +219,7 @@ def _scene(
         board = read_board(board_file)
     if camera_file is not None:
         from neurocal_cli.io.calibration_yaml import read_calibration
-        from neurocal_cli.io.camera_files import read_intrinsics
+        from neurocal_cli.io.exchange.reading import read_intrinsics
 
         if board_file is None and views is None and camera_file != "-":
             try:

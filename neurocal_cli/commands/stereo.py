@@ -24,11 +24,9 @@ from neurocal_cli.commands.preparation import (
     check_summary,
     compute_in_one_thread,
 )
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary, say, warn
+from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
-
-_NOT_CONVERGED = 3
 
 
 @click.command(cls=options.Command)
@@ -61,9 +59,7 @@ _NOT_CONVERGED = 3
 @options.lean
 @options.summary
 @options.output("RIG.yaml", "Write the rig to this file.")
-@click.pass_context
 def stereo(
-    ctx: click.Context,
     left: str,
     right: str,
     estimation: Estimation,
@@ -151,13 +147,7 @@ def stereo(
     warn(write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
     note(views_alone(rig.alone))
-    if as_json:
-        print_summary(rig_json(rig))
-    else:
-        say(rig_report(rig))
-    warn(rig.warnings)
-    if not rig.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(rig, as_json, rig_json, rig_report)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

@@ -22,6 +22,7 @@ TYPED = "neurocal.typed"  # key of the words of the command line in click's cont
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
+_NOT_CONVERGED = 3  # exit code
 T = TypeVar("T")
 _PATIENCE = 0.5  # seconds after which the bar appears
 _WIDEST = 10_000  # characters; no table is wider
@@ -71,6 +72,19 @@ def tell_more(text: str) -> None:
     """Report progress if the user gave --verbose."""
     if verbose():
         click.echo(one_line(text), err=True)
+
+
+def conclude(
+    result: Any, as_json: bool, in_json: Callable[[Any], dict[str, Any]], in_words: Callable[[Any], str]
+) -> None:
+    """Show the summary of a result and its warnings; exit if its training did not converge."""
+    if as_json:
+        print_summary(in_json(result))
+    else:
+        say(in_words(result))
+    warn(result.warnings)
+    if not result.converged:
+        click.get_current_context().exit(_NOT_CONVERGED)
 
 
 def is_terminal(stream: TextIO | None) -> bool:

@@ -105,7 +105,7 @@ def undistort(
     check_summary(as_json and bool(files), output)
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
-    from neurocal_cli.io.camera_files import read_intrinsics
+    from neurocal_cli.io.exchange.reading import read_intrinsics
     from neurocal_cli.io.image_paths import find_images
 
     paths = find_images(files) if files else ()

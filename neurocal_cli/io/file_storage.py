@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -169,4 +168,6 @@ def _xml(key: str, value: Any) -> str:
 
 def _xml_text(text: str) -> str:
     """Quote a string, so that it is not read as a number or as several words."""
+    from xml.sax.saxutils import escape  # imports what reading a calibration does not need
+
     return '"' + escape(text, {'"': "&quot;"}) + '"'

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.camera_files import read_intrinsics
+from neurocal_cli.io.exchange.reading import read_intrinsics
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.points_csv import POINTS, format_points
 from neurocal_cli.io.points_join import correspondences

@@ -164,9 +164,8 @@ def _tables_lines(lens: ZoomLens) -> Iterator[str]:
 
 def _lens(block: Field) -> ZoomLens:
     if block["format"].integer() != _FORMAT:
-        raise FormatError(
-            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
-            block.source,
+        block.refuse(
+            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again"
         )
     controls = tuple(block["controls"].texts())
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):

@@ -83,13 +83,11 @@ def arrays_of(data: bytes, source: str) -> dict[str, Any]:
             return {name: arrays[name].tolist() for name in arrays.files}
     except FormatError:
         raise
-    except ValueError as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         if "pickle" in str(error) or "Object arrays" in str(error):
             raise FormatError(
                 "holds Python objects, which are not read; save each view's corners as numbers", source
             ) from error
-        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
-    except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
 
 

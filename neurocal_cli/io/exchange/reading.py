@@ -1,4 +1,4 @@
-"""Read cameras from files of any program, which is recognised by the content, never by the file name."""
+"""Cameras of any program: files are recognised by their content, and written by the names of formats."""
 
 from __future__ import annotations
 
@@ -7,15 +7,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
-from neurocal_cli.io.exchange.camera_set import CameraSet
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import after, inverse
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes, value_failures
+from neurocal_cli.io.files import decode, one_line, read_bytes, value_failures
 from neurocal_cli.io.tree_fields import Field
 
+# Formats that `convert` writes, by the values of its option ``--to``.
+FORMATS: dict[str, Format] = {
+    "neurocal": neurocal.FORMAT,
+    "opencv": dictionary.OPENCV,
+    "ros": ros.FORMAT,
+    "kalibr": kalibr.FORMAT,
+    "colmap": colmap.FORMAT,
+    "mrcal": mrcal.FORMAT,
+    "matlab": matlab.FORMAT,
+    "json": dictionary.JSON,
+    "npz": dictionary.NPZ,
+}
 # Readers of binary files, by their first bytes.
 _BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
     (b"PK\x03\x04", dictionary.read_npz),
@@ -53,6 +66,26 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
             return dictionary.from_tree(merged)
     cameras = [_cameras(one, whole or len(names) > 1) for one in opened]
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
+
+
+def read_intrinsics(path: str | Path) -> Camera:
+    """Read a camera without its poses.
+
+    Parameters
+    ----------
+    path : str or Path
+        A neurocal calibration or the file of another program, see `read_cameras`; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        There is no valid camera matrix, or more than one camera.
+    """
+    found = read_cameras([path], whole=False)
+    if len(found.cameras) > 1:
+        source = "<stdin>" if str(path) == "-" else one_line(path)
+        raise FormatError("is a stereo rig; give the file of one camera", source)
+    return found.cameras[0]
 
 
 def _opened(name: str) -> CameraSet | Field:
