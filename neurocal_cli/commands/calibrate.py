@@ -7,22 +7,10 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.pictures import (
-    Plots,
-    check_plots,
-    html_option,
-    panels_option,
-    write_page,
-    write_plots,
-)
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
 from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -31,9 +19,7 @@ from neurocal_cli.plots import CAMERA_PANELS
 @options.points
 @estimation_options
 @options.camera_name
-@panels_option(
-    "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
-)
+@plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
 @options.lean
 @options.summary

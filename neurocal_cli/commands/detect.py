@@ -9,14 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.frames import of_one_size, videos_as_frames
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
+from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
@@ -215,13 +210,12 @@ def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
 ) -> list[tuple[str, Outcome]]:
     """Outcomes of the images that have arrived, with the names of their views."""
-    from neurocal_cli.commands.watching import watch
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
     check_outputs((output,), (board_file,))
-    outcomes = watch(lambda: find_images(words), wanted, seconds)
+    outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
     check_outputs((output,), tuple(path for path, _ in outcomes))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs
 from neurocal_cli.commands.evaluate_stereo import stereo
 from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
+from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
 from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -51,7 +51,7 @@ evaluate.add_command(stereo)
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
-@panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
+@plot_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.

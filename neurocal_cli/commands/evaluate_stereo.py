@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs
 from neurocal_cli.commands.given_camera import calibration_or_camera
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
+from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
 from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import SPACE_PANELS
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     "takes the middle between the two rays.",
     default="optimal",
 )
-@panels_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
+@plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
     cameras: tuple[str, ...],

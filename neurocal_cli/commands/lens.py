@@ -7,13 +7,8 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
+from neurocal_cli.commands.pages import write_plot
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
 _MOST_UNITS = 20

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
+from neurocal_cli.commands.before import check_one_stdin, check_outputs
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 

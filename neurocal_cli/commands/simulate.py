@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, compute_in_one_thread
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, compute_in_one_thread
+from neurocal_cli.commands.pages import write_plot
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 

@@ -9,21 +9,9 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.pictures import (
-    Plots,
-    check_plots,
-    html_option,
-    panels_option,
-    write_page,
-    write_plots,
-)
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
@@ -54,7 +42,7 @@ from neurocal_cli.plots import RIG_PANELS
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
+@plot_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @options.lean
 @options.summary

@@ -7,7 +7,7 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.commands.undistorted_places import check_distinct, places_of
 from neurocal_cli.errors import UsageError

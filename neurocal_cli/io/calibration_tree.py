@@ -11,8 +11,8 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
-from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.observations_yaml import read_observations

@@ -165,9 +165,7 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
         )
     corner = np.array([_EDGE + _RULER + _QUIET, _EDGE + _QUIET]) + 0.5 * (np.array(room) - size)
     origin = corner - low
-    lines = [
-        line for fold in folds for line in _beside(scale * fold.start + origin, scale * fold.end + origin)
-    ]
+    lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
     rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
     text = Text((_EDGE + _RULER + _QUIET, height - _EDGE), _caption(board), 2.8)

@@ -19,8 +19,8 @@ import numpy as np
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.camera_info import to_ros
 from neurocal_cli.io.camera_tree import camera_from_tree, has_matrix, matrix_data
-from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.exchange.rotations import from_vector, to_vector

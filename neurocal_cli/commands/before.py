@@ -34,12 +34,7 @@ def check_one_stdin(*names: str | None) -> None:
 
 
 def check_summary(as_json: bool, output: str) -> None:
-    """Refuse two results on one stream.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse two results on one stream, with a UsageError."""
     if as_json and output == "-":
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
 

@@ -19,7 +19,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
 
-def panels_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
+def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
 
     def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
