@@ -91,8 +91,8 @@ def calibrate(
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     if plots:
+        from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
-        from neurocal_cli.plots.subject import Subject
 
         write_plots(plots, partial(draw_camera, Subject.of(calibration)))
     warn(write_result(calibration, output, lean=lean))

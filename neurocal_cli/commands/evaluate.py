@@ -84,8 +84,8 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     given = None if points is None else given_points([points])
     evaluation, verdict, judged = _evaluate(calibration, given)
     if plots:
+        from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
-        from neurocal_cli.plots.subject import Subject
 
         write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
     _tell(evaluation)

@@ -1,14 +1,23 @@
-"""Panels of a camera's errors and reliability: residuals, their scatter, coverage, uncertainty, learning."""
+"""Panels of a camera: residuals, their scatter, coverage, uncertainty, errors by view, learning curve."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.evaluation import CameraEvaluation, evaluate_camera
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, plain, say, style
-from neurocal_cli.plots.subject import Subject
+from neurocal_cli.plots.space import draw_poses
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.verdict.evidence import Evidence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +30,51 @@ _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
 _CELLS = 6  # across and down, as in the verdict
 _MOST_DOTS = 5000
 _LEVELS = 12
+
+
+@frozen_dataclass
+class Subject:
+    """A camera, points and their errors.
+
+    Attributes
+    ----------
+    camera : Camera
+    points : Correspondences
+    evaluation : CameraEvaluation
+        Of the camera on these points.
+    calibration : Calibration or None
+        The calibration of the camera, if known.
+    """
+
+    camera: Camera
+    points: Correspondences
+    evaluation: CameraEvaluation
+    calibration: Calibration | None
+
+    @classmethod
+    def of(
+        cls,
+        camera: Calibration | Camera,
+        points: Correspondences | None = None,
+        evaluation: CameraEvaluation | None = None,
+    ) -> Subject:
+        """Evaluate a camera on points; by default on a calibration's own points."""
+        calibration = camera if isinstance(camera, Calibration) else None
+        if points is None:
+            points = Correspondences.none() if calibration is None else calibration.points
+        return cls(camera_of(camera), points, evaluation or evaluate_camera(camera, points), calibration)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) [px], if known."""
+        return self.points.image_size or self.camera.image_size
+
+    @cached_property
+    def evidence(self) -> Evidence | None:
+        """Evidence for the quality of the calibration from its points; None without a calibration."""
+        if self.calibration is None or not len(self.calibration.points):
+            return None
+        return gather_evidence(self.calibration)
 
 
 def set_image(axes: Axes, subject: Subject) -> Array:
@@ -168,3 +222,16 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     axes.plot(*pixels[:: max(1, len(pixels) // 1000)].T, ".", color="white", markersize=1, alpha=0.7)
     style(axes, f"Uncertainty of projected pixels, {projection.worst:.3g} px at most")
     axes.grid(False)
+
+
+def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
+    """Functions that draw the panels of a camera, by their names in `plots.CAMERA_PANELS`."""
+    return {
+        "residuals": lambda axes: draw_residuals(axes, subject),
+        "coverage": lambda axes: draw_coverage(axes, subject),
+        "uncertainty": lambda axes: draw_uncertainty(axes, subject),
+        "scatter": lambda axes: draw_scatter(axes, subject),
+        "poses": lambda axes: draw_poses(axes, subject.calibration),
+        "learning": lambda axes: draw_learning(axes, subject),
+        "views": lambda axes: draw_views(axes, subject),
+    }
