@@ -127,7 +127,7 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
     except (BrokenPipeError, NeurocalError):
         raise
     except (OSError, ValueError) as error:
-        raise NeurocalError(f"{one_line(path)}: {_write_failure(path, error)}") from error
+        raise NeurocalError(f"{one_line(path)}: {_write_failure(error)}") from error
 
 
 def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
@@ -211,7 +211,7 @@ def _take_over(temporary: str, former: os.stat_result) -> None:
     os.chmod(temporary, stat.S_IMODE(former.st_mode))
 
 
-def _write_failure(path: str | Path, error: Exception) -> str:
+def _write_failure(error: Exception) -> str:
     if isinstance(error, IsADirectoryError):
         return "is a folder; give the name of a file"
     if isinstance(error, FileNotFoundError):

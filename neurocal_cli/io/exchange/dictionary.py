@@ -62,19 +62,14 @@ def from_tree(root: Field) -> CameraSet:
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
 
-def read_npz(data: bytes, source: str) -> CameraSet:
-    """Read a file of ``numpy.savez``.
+def arrays_of(data: bytes, source: str) -> dict[str, Any]:
+    """Read the arrays of an ``.npz`` file as nested lists.
 
     Raises
     ------
     FormatError
         The data are not such a file, or contain Python objects.
     """
-    return from_tree(Field(arrays_of(data, source), source))
-
-
-def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """Read the arrays of an ``.npz`` file as nested lists."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:

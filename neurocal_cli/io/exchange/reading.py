@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,11 +29,6 @@ FORMATS: dict[str, Format] = {
     "json": dictionary.JSON,
     "npz": dictionary.NPZ,
 }
-# Readers of binary files, by their first bytes.
-_BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
-    (b"PK\x03\x04", dictionary.read_npz),
-    (b"MATLAB 5.0 MAT-file", matlab.read_mat),
-)
 _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 
 
@@ -96,9 +91,10 @@ def _opened(name: str) -> CameraSet | Field:
     if data.startswith(b"\x89HDF"):
         raise FormatError("is a MATLAB file of version 7.3; save it with -v7", source)
     with value_failures(source):
-        for mark, read in _BINARY:
-            if data.startswith(mark):
-                return read(data, source)
+        if data.startswith(b"PK\x03\x04"):
+            return dictionary.from_tree(Field(dictionary.arrays_of(data, source), source))
+        if data.startswith(b"MATLAB 5.0 MAT-file"):
+            return matlab.read_mat(data, source)
         text = decode(data, source, "a camera file")
         if _COLMAP(text):
             return colmap.parse(text, source)
