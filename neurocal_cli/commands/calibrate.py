@@ -77,10 +77,10 @@ def calibrate(
     compute_in_one_thread()
     estimation.check()
     check_summary(as_json, output)
-    check_one_stdin(*points, *estimation.stdin_candidates)
+    inputs = *points, estimation.intrinsics, estimation.extrinsics
+    check_one_stdin(*inputs)
     options.check_camera_name(camera_name)
     check_plots(plots, output)
-    inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_outputs((output, html, *(file for _, file in plots)), inputs)
     given, arguments = estimation.prepare(given_points(points))
 

@@ -41,11 +41,6 @@ class Estimation:
     outliers: str
     target: str
 
-    @property
-    def stdin_candidates(self) -> tuple[str | None, ...]:
-        """File names that may be ``-``."""
-        return self.intrinsics, self.extrinsics
-
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read.
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,8 +16,6 @@ from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from neurocal_cli.board import Board
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.points import Correspondences
@@ -182,8 +181,6 @@ def _points(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | None:
     """The points of the files; None if the files hold cameras."""
-    from dataclasses import replace
-
     from neurocal_cli.io.exchange.colmap import is_folder
     from neurocal_cli.io.exchange.corners import read_corners
 
@@ -219,8 +216,6 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
     InputError
         The file has another value.
     """
-    from dataclasses import replace
-
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")

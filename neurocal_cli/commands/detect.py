@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -25,8 +27,6 @@ from neurocal_cli.commands.streams import (
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.measuring import Points
@@ -225,8 +225,6 @@ def _watched(
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Warn of images of different sizes before any work, because one camera has one image size."""
-    from collections import Counter
-
     from neurocal_cli.io.image_headers import stated_sizes
 
     sizes = Counter(size for size in stated_sizes(paths) if size is not None)
@@ -293,8 +291,6 @@ def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
 
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
     """Suggest another board size that most images show: often squares were counted instead of vertices."""
-    from collections import Counter
-
     (size, count), *_ = Counter(shown).most_common(1)
     if size is None or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
         return []

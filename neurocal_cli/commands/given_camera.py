@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,8 +10,6 @@ from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import FormatError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,6 @@ from neurocal_cli.commands.streams import each_of, note, print_summary, say, war
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.distortion.remapping import Remapping
     from neurocal_cli.stereo.rectified_pair import RectifiedPair
     from neurocal_cli.stereo.rig import Rig
