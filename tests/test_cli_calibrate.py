@@ -14,7 +14,7 @@ from support.command_line import run
 from support.made_calibration import CAMERA, made_calibration, made_points
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
-from neurocal_cli.commands.progress import ProgressBar
+from neurocal_cli.commands.streams import ProgressBar
 from neurocal_cli.io.calibration_yaml import format_calibration
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
@@ -383,11 +383,11 @@ def test_calibrating_loads_nothing_that_it_does_not_use() -> None:
 def test_long_work_shows_a_bar_on_a_terminal_only(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("neurocal_cli.commands.progress._PATIENCE", 0.0)
+    monkeypatch.setattr("neurocal_cli.commands.streams._PATIENCE", 0.0)
     with ProgressBar() as bar:
         bar("training", 0.5)
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr("neurocal_cli.commands.progress.is_terminal", lambda stream: True)
+    monkeypatch.setattr("neurocal_cli.commands.streams.is_terminal", lambda stream: True)
     monkeypatch.setenv("FORCE_COLOR", "1")
     with ProgressBar() as bar:
         bar("training", 0.25)

@@ -12,7 +12,7 @@ import pytest
 from support.command_line import run
 from support.slow_cases import slow_but
 
-from neurocal_cli.commands import watching
+from neurocal_cli.commands import frames
 from neurocal_cli.detection import batch
 from neurocal_cli.detection.frames import choose_frames
 from neurocal_cli.io.points_csv import read_points
@@ -179,15 +179,15 @@ def test_a_folder_is_watched_until_no_more_images_come(
 ) -> None:
     coming, folder = list(IMAGES), tmp_path / "images"
     folder.mkdir()
-    monkeypatch.setattr(watching, "_PAUSE", 0.01)
-    pause = watching.time.sleep
+    monkeypatch.setattr(frames, "_PAUSE", 0.01)
+    pause = frames.time.sleep
 
     def copy_one(seconds: float) -> None:
         if coming:
             shutil.copy(coming.pop(0), folder)
         pause(seconds)
 
-    monkeypatch.setattr(watching.time, "sleep", copy_one)
+    monkeypatch.setattr(frames.time, "sleep", copy_one)
     result = run("detect", folder, *BOARD, "--watch", 0.5, "-o", tmp_path / "points.csv")
     assert result.exit_code == 0, result.stderr
     lines = result.stderr.splitlines()
@@ -210,7 +210,7 @@ def test_an_interrupt_ends_the_watch_and_the_points_are_written(
         if next(looks) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(watching.time, "sleep", interrupt)
+    monkeypatch.setattr(frames.time, "sleep", interrupt)
     result = run("detect", IMAGES[0], *BOARD, "--watch", 60, "-o", tmp_path / "points.csv")
     assert result.exit_code == 0, result.stderr
     assert read_points([tmp_path / "points.csv"]).n_points == 93

@@ -27,8 +27,8 @@ from neurocal_cli.calibration import Verdict
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.formats import FORMATS
 from neurocal_cli.io.exchange.neurocal import as_rig
+from neurocal_cli.io.exchange.reading import FORMATS
 from neurocal_cli.stereo.rectified_pair import rectified_pair, rectify_points, row_error
 from neurocal_cli.stereo.report import rig_report
 

@@ -17,8 +17,7 @@ from support.rigs import random_rig, sides
 
 from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration import Rejected, Verdict
-from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map
-from neurocal_cli.html_report.heat_map import heat_map
+from neurocal_cli.html_report.drawings import enlargement, error_bars, heat_map, residual_map
 from neurocal_cli.io.images import encode_png, parse_image
 from neurocal_cli.io.result_files import write_result
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo

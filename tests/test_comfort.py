@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.command_line import run
 
-from neurocal_cli.commands import tables
+from neurocal_cli.commands import streams
 from neurocal_cli.io.image_headers import stated_sizes
 from neurocal_cli.io.image_paths import find_images, natural_order
 
@@ -79,9 +79,9 @@ def test_the_shell_can_complete(shell: str) -> None:
 @pytest.mark.parametrize("width", [30, 60, 100])
 def test_tables_break_no_word_on_a_narrow_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.StringIO()
-    monkeypatch.setattr(tables, "is_terminal", lambda stream: True)
+    monkeypatch.setattr(streams, "is_terminal", lambda stream: True)
     monkeypatch.setattr("rich.console.Console", lambda: Console(file=shown, width=width))
     words = ["correspondence", "reprojection", "cross-validation"]
-    tables.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
+    streams.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
     for word in words:
         assert word in shown.getvalue()

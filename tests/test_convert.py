@@ -20,11 +20,9 @@ from neurocal_cli import Camera, Intrinsics, Pose, Rig, read_calibration, read_r
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.camera_files import read_intrinsics
 from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.formats import FORMATS
-from neurocal_cli.io.exchange.reading import read_cameras
+from neurocal_cli.io.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)
 HOLDS = {name: target.models for name, target in FORMATS.items()}

@@ -22,11 +22,9 @@ from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.commands.convert import convert
 from neurocal_cli.distortion.nearest_camera import nearest_camera, with_model
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.camera_files import read_intrinsics
 from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.formats import FORMATS
-from neurocal_cli.io.exchange.reading import read_cameras
+from neurocal_cli.io.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 KEPT = [(name, model) for name, target in FORMATS.items() for model in WIDE if model in target.models]
 

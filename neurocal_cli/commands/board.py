@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_outputs
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
 

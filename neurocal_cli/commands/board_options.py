@@ -13,8 +13,6 @@ from neurocal_cli.errors import UsageError
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
 
-_VERTICES = click.IntRange(2, 1000)
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 

@@ -7,33 +7,24 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.pages import html_option, write_page
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import print_summary, say, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 from neurocal_cli.plots import CAMERA_PANELS
-
-_NOT_CONVERGED = 3
 
 
 @click.command(cls=options.Command)
 @options.points
 @estimation_options
 @options.camera_name
-@panels_option(
-    "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
-)
+@plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
 @options.lean
 @options.summary
 @options.output("CAMERA.yaml", "Write the calibration to this file.")
-@click.pass_context
 def calibrate(
-    ctx: click.Context,
     points: tuple[str, ...],
     estimation: Estimation,
     camera_name: str,
@@ -86,10 +77,10 @@ def calibrate(
     compute_in_one_thread()
     estimation.check()
     check_summary(as_json, output)
-    check_one_stdin(*points, *estimation.stdin_candidates)
+    inputs = *points, estimation.intrinsics, estimation.extrinsics
+    check_one_stdin(*inputs)
     options.check_camera_name(camera_name)
     check_plots(plots, output)
-    inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_outputs((output, html, *(file for _, file in plots)), inputs)
     given, arguments = estimation.prepare(given_points(points))
 
@@ -100,16 +91,10 @@ def calibrate(
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     if plots:
+        from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
-        from neurocal_cli.plots.subject import Subject
 
         write_plots(plots, partial(draw_camera, Subject.of(calibration)))
     warn(write_result(calibration, output, lean=lean))
     write_page(html, calibration, *inputs)
-    if as_json:
-        print_summary(calibration_json(calibration))
-    else:
-        say(calibration_report(calibration))
-    warn(calibration.warnings)
-    if not calibration.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(calibration, as_json, calibration_json, calibration_report)

@@ -41,11 +41,6 @@ class Estimation:
     outliers: str
     target: str
 
-    @property
-    def stdin_candidates(self) -> tuple[str | None, ...]:
-        """File names that may be ``-``."""
-        return self.intrinsics, self.extrinsics
-
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read.
 
@@ -113,7 +108,7 @@ class Estimation:
         elif self.intrinsics is not None:
             points, arguments["intrinsics"] = given_camera(self.intrinsics, points)
         elif self.extrinsics is not None:
-            from neurocal_cli.io.camera_files import read_extrinsics
+            from neurocal_cli.io.calibration_tree import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics)
         return points, arguments

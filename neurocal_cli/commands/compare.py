@@ -7,11 +7,9 @@ from dataclasses import replace
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, compute_in_one_thread
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.places import check_one_stdin
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 
 
 @click.command(cls=options.Command)

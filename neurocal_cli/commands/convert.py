@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from neurocal_cli.board import Board
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.points import Correspondences
@@ -152,7 +151,7 @@ def _write_cameras(
 ) -> dict[str, Any]:
     """Write cameras; what there is to say of them, for programs."""
     from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
-    from neurocal_cli.io.exchange.formats import FORMATS
+    from neurocal_cli.io.exchange.reading import FORMATS
 
     wanted = FORMATS[target]
     adapted = adapt_cameras(cameras, wanted, force, model)
@@ -182,8 +181,6 @@ def _points(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | None:
     """The points of the files; None if the files hold cameras."""
-    from dataclasses import replace
-
     from neurocal_cli.io.exchange.colmap import is_folder
     from neurocal_cli.io.exchange.corners import read_corners
 
@@ -219,8 +216,6 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
     InputError
         The file has another value.
     """
-    from dataclasses import replace
-
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.frames import videos_as_frames
-from neurocal_cli.commands.one_size import of_one_size
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import complain, note, one_line, print_summary, say, some_of, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.streams import (
+    ProgressBar,
+    complain,
+    note,
+    one_line,
+    print_summary,
+    say,
+    some_of,
+    warn,
+)
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.measuring import Points
@@ -204,13 +210,12 @@ def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
 ) -> list[tuple[str, Outcome]]:
     """Outcomes of the images that have arrived, with the names of their views."""
-    from neurocal_cli.commands.watching import watch
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
     check_outputs((output,), (board_file,))
-    outcomes = watch(lambda: find_images(words), wanted, seconds)
+    outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
     check_outputs((output,), tuple(path for path, _ in outcomes))
@@ -220,8 +225,6 @@ def _watched(
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Warn of images of different sizes before any work, because one camera has one image size."""
-    from collections import Counter
-
     from neurocal_cli.io.image_headers import stated_sizes
 
     sizes = Counter(size for size in stated_sizes(paths) if size is not None)
@@ -288,8 +291,6 @@ def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
 
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
     """Suggest another board size that most images show: often squares were counted instead of vertices."""
-    from collections import Counter
-
     (size, count), *_ = Counter(shown).most_common(1)
     if size is None or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
         return []

@@ -1,4 +1,4 @@
-"""``neurocal evaluate``: how good a result is."""
+"""``neurocal evaluate``: how good a result is: a camera by reprojection, two cameras by triangulation."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.evaluate_stereo import stereo
+from neurocal_cli.commands.before import check_one_stdin, check_outputs
 from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.streams import note, print_summary, warn
-from neurocal_cli.commands.tables import show
-from neurocal_cli.plots import CAMERA_PANELS
+from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
+from neurocal_cli.commands.streams import note, print_summary, show, warn
+from neurocal_cli.errors import UsageError
+from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration, Verdict
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.evaluation import CameraEvaluation
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.stereo.evaluation import StereoEvaluation
+    from neurocal_cli.stereo.rig import Rig
 
 
 @click.group()
@@ -37,9 +38,6 @@ def evaluate() -> None:
     """  # noqa: D301 - as in the group
 
 
-evaluate.add_command(stereo)
-
-
 @evaluate.command(cls=options.Command)
 @options.argument(
     "calibration",
@@ -52,7 +50,7 @@ evaluate.add_command(stereo)
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
-@panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
+@plot_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
@@ -83,10 +81,10 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     check_plots(plots)
     check_outputs((file for _, file in plots), (calibration, points))
     given = None if points is None else given_points([points])
-    evaluation, verdict, judged = _evaluate(calibration, given)
+    evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
+        from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
-        from neurocal_cli.plots.subject import Subject
 
         write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
     _tell(evaluation)
@@ -99,7 +97,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
-def _evaluate(
+def _evaluate_camera(
     name: str, points: Correspondences | None
 ) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
     """Evaluate a calibration or, if points are given, any camera file, with all poses fitted."""
@@ -131,3 +129,133 @@ def _tell(evaluation: CameraEvaluation) -> None:
     if evaluation.on_target:
         note(["the points are taken where the calibration found them, not where their file has them"])
     warn(evaluation.warnings)
+
+
+@evaluate.command(cls=options.Command)
+@options.argument(
+    "cameras",
+    "LEFT.yaml RIGHT.yaml",
+    "The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
+    "or one RIG.yaml with both; - is standard input.",
+    nargs=-1,
+    required=True,
+)
+@options.path(
+    "--points",
+    "LEFT.csv RIGHT.csv",
+    "Points of both cameras to evaluate them on.",
+    without="the points of the calibrations",
+)
+@options.choice(
+    "--method",
+    "optimal linear midpoint",
+    "Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
+    "takes the middle between the two rays.",
+    default="optimal",
+)
+@plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
+@options.json
+def stereo(
+    cameras: tuple[str, ...],
+    points: tuple[str, str] | None,
+    method: str,
+    plots: Plots,
+    as_json: bool,
+) -> None:
+    """Measure the triangulation error of two calibrated cameras.
+
+    Every point that both cameras saw is triangulated and compared with its true position on the target.
+    The errors are in the frame of the left camera (X right, Y down, Z depth) and in the unit of the target.
+    NSCE is the normalised stereo calibration error of Weng, Cohen and Herniou; a value of 1 corresponds to
+    rounding to whole pixels. The epipolar error is the smallest shift of both pixels that makes their rays
+    meet.
+
+    Each point is triangulated twice: with the two poses of its view, and with one rig that is fitted to all
+    views. The error of the rig is what to expect for new points.
+
+    Two views are a pair if their names are equal, or equal without left, l, cam0 and right, r, cam1 (such
+    as left01 and right01). Points are paired by their ids, else by X, Y, Z.
+
+    Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
+    With --points the poses of views that are not in the calibrations are fitted.
+
+    The rig also gets a verdict, as in neurocal stereo. It uses the points of the calibrations.
+
+    \b
+    Examples:
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
+      neurocal evaluate stereo rig.yaml --plot space.png --plot depth=depth.svg
+      neurocal calibrate sample_data/stereo_left.csv -o left.yaml
+      neurocal calibrate sample_data/stereo_right.csv -o right.yaml
+      neurocal evaluate stereo left.yaml right.yaml --method linear --json
+      neurocal evaluate stereo left.yaml right.yaml \\
+          --points sample_data/stereo_left.csv sample_data/stereo_right.csv
+    """  # noqa: D301 - as in the group
+    if len(cameras) > 2:
+        raise UsageError(f"there are {len(cameras)} files; give two calibrations, or one rig")
+    check_one_stdin(*cameras, *(points or ()))
+    check_plots(plots)
+    check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    evaluation, rig = _evaluate_stereo(cameras, _read_points(points), method)
+    if plots:
+        from neurocal_cli.plots.pages import draw_points_in_space
+
+        write_plots(plots, partial(draw_points_in_space, evaluation, rig))
+    from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
+    from neurocal_cli.verdict.report import verdict_lines
+
+    note(views_alone(evaluation.alone))
+    if evaluation.fitted:
+        names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
+        note([f"{names}: not in the calibrations; the poses are fitted with the cameras fixed"])
+    warn(evaluation.warnings)
+    if as_json:
+        print_summary(stereo_evaluation_json(evaluation))
+    else:
+        verdict = evaluation.verdict
+        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+
+
+def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:
+    if names is None:
+        return None
+    from neurocal_cli.io.points_csv import read_points
+
+    notes: list[str] = []
+    left, right = (read_points([name], notes=notes) for name in names)
+    note(notes)
+    return left, right
+
+
+def _evaluate_stereo(
+    cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
+) -> tuple[StereoEvaluation, Rig | None]:
+    from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
+
+    if len(cameras) == 1:
+        from neurocal_cli.io.rig_yaml import read_rig
+
+        rig = read_rig(cameras[0])
+        return evaluate_rig(rig, points, method=method), rig
+    from neurocal_cli.io.calibration_yaml import read_calibration
+
+    if points is None:
+        left, right = (read_calibration(name) for name in cameras)
+    else:
+        left, right = (_with_poses(name, seen) for name, seen in zip(cameras, points, strict=True))
+    return evaluate_stereo(left, right, points, method=method), None
+
+
+def _with_poses(name: str, points: Correspondences) -> Calibration:
+    """Read a calibration, or any camera file; poses that the file does not hold are fitted to the points."""
+    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.methods import calibrate
+
+    camera, seen = calibration_or_camera(name, points, "; the poses are fitted")
+    if isinstance(camera, Calibration):
+        if camera.views:
+            return camera
+        note([f"{name}: holds no poses; they are fitted"])
+    assert seen is not None
+    return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

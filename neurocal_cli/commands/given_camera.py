@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,8 +10,6 @@ from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import FormatError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
@@ -34,7 +33,7 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
     InputError
         The camera has another image size.
     """
-    from neurocal_cli.io.camera_files import read_intrinsics
+    from neurocal_cli.io.exchange.reading import read_intrinsics
 
     camera = read_intrinsics(path)
     if camera.image_size is not None:

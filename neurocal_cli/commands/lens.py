@@ -7,13 +7,10 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
+from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
-_NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
 _LENS = options.argument(
@@ -95,9 +92,7 @@ def lens() -> None:
 @options.plot("each parameter over the settings, with its uncertainty, and the errors")
 @options.summary
 @options.output("LENS.yaml", "Write the lens to this file.")
-@click.pass_context
 def fit(
-    ctx: click.Context,
     points: tuple[str, ...],
     distortion: str,
     training: str,
@@ -172,13 +167,7 @@ def fit(
 
         write_plot(plot, partial(draw_lens, learnt))
     write_lens(learnt, output)
-    if as_json:
-        print_summary(lens_json(learnt))
-    else:
-        say(lens_report(learnt))
-    warn(learnt.warnings)
-    if not learnt.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(learnt, as_json, lens_json, lens_report)
 
 
 @lens.command(cls=options.Command)

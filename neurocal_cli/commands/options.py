@@ -179,12 +179,7 @@ camera_name = click.option(
 
 
 def check_camera_name(name: str) -> None:
-    """Refuse a name that cannot be stored in a file.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a name that cannot be stored in a file, with a UsageError."""
     if not name.strip() or not name.isprintable():
         raise UsageError("--camera-name must hold printable characters only; give another name")
 
@@ -200,12 +195,7 @@ def alpha(default: str) -> Callable[[F], F]:
 
 
 def check_alpha(alpha: float | None) -> None:
-    """Refuse an alpha outside 0 to 1.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse an alpha outside 0 to 1, with a UsageError."""
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
 

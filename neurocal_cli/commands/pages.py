@@ -1,8 +1,10 @@
-"""The option ``--html``: a page about the command's result."""
+"""The options ``--plot`` and ``--html``: pictures of a result, and a page about it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -12,6 +14,58 @@ from neurocal_cli.commands.streams import TYPED
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
+
+F = TypeVar("F", bound=Callable[..., Any])
+Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
+
+
+def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
+    """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
+
+    def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
+        return tuple(_parsed(word) for word in words)
+
+    def _parsed(word: str) -> tuple[str | None, str]:
+        panel, equals, file = word.partition("=")
+        return (panel, file) if equals and panel in panels else (None, word)
+
+    return click.option(
+        "--plot",
+        "plots",
+        metavar="[PANEL=]FILE.png",
+        multiple=True,
+        callback=parse,
+        show_default="none",
+        help=f"Plot {what} to this .png, .pdf or .svg file: all panels on one page, or one of them: "
+        f"{', '.join(panels)}. It can be repeated.",
+    )
+
+
+def check_plots(plots: Plots, output: str | None = None) -> None:
+    """Refuse pictures that cannot be drawn; see `options.check_plot`."""
+    for _, file in plots:
+        options.check_plot(file, output)
+
+
+def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
+    """Draw and write all pictures.
+
+    Parameters
+    ----------
+    plots : Plots
+    draw : callable
+        Gives a picture of a kind ("png") and of a panel.
+    """
+    for panel, file in plots:
+        write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
+
+
+def write_plot(file: str, draw: Callable[[str], bytes]) -> None:
+    """Draw and write a picture of the kind that its name ends in."""
+    from neurocal_cli.io.writing import write_whole
+
+    write_whole(file, draw(os.path.splitext(file)[1][1:].lower()))
+
 
 html_option = options.path(
     "--html",
@@ -27,7 +81,7 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
     import hashlib
     import shlex
 
-    from neurocal_cli.html_report.origin import Origin, versions
+    from neurocal_cli.html_report.page import Origin, versions
     from neurocal_cli.html_report.reports import calibration_page, rig_page
     from neurocal_cli.io.files import read_bytes
     from neurocal_cli.io.writing import write_whole

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.before import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from neurocal_cli.distortion.remapping import Remapping
     from neurocal_cli.stereo.rectified_pair import RectifiedPair
     from neurocal_cli.stereo.rig import Rig

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.before import check_outputs
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 
@@ -71,7 +71,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
-    from neurocal_cli.html_report.origin import Origin
+    from neurocal_cli.html_report.page import Origin
     from neurocal_cli.html_report.reports import calibration_page, lens_page, rig_page
 
     if "neurocal_lens" in root:

@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, compute_in_one_thread
+from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
 if TYPE_CHECKING:
@@ -221,7 +219,7 @@ def _scene(
         board = read_board(board_file)
     if camera_file is not None:
         from neurocal_cli.io.calibration_yaml import read_calibration
-        from neurocal_cli.io.camera_files import read_intrinsics
+        from neurocal_cli.io.exchange.reading import read_intrinsics
 
         if board_file is None and views is None and camera_file != "-":
             try:

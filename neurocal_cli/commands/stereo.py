@@ -9,17 +9,12 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.pages import html_option, write_page
-from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
-
-_NOT_CONVERGED = 3
 
 
 @click.command(cls=options.Command)
@@ -47,14 +42,12 @@ _NOT_CONVERGED = 3
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
+@plot_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @options.lean
 @options.summary
 @options.output("RIG.yaml", "Write the rig to this file.")
-@click.pass_context
 def stereo(
-    ctx: click.Context,
     left: str,
     right: str,
     estimation: Estimation,
@@ -142,13 +135,7 @@ def stereo(
     warn(write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
     note(views_alone(rig.alone))
-    if as_json:
-        print_summary(rig_json(rig))
-    else:
-        say(rig_report(rig))
-    warn(rig.warnings)
-    if not rig.converged:
-        ctx.exit(_NOT_CONVERGED)
+    conclude(rig, as_json, rig_json, rig_report)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

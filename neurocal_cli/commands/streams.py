@@ -1,18 +1,31 @@
-"""Messages of the commands, all on stderr, so that stdout holds only results."""
+"""What commands show: messages and progress on stderr, so that stdout holds only results."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
-from typing import Any, TextIO
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import click
+
+from neurocal_cli.errors import FormatError, InputError, NeurocalError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 TYPED = "neurocal.typed"  # key of the words of the command line in click's context
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
+_NOT_CONVERGED = 3  # exit code
+T = TypeVar("T")
+_PATIENCE = 0.5  # seconds after which the bar appears
+_WIDEST = 10_000  # characters; no table is wider
 
 
 def set_verbosity(level: int) -> None:
@@ -61,6 +74,19 @@ def tell_more(text: str) -> None:
         click.echo(one_line(text), err=True)
 
 
+def conclude(
+    result: Any, as_json: bool, in_json: Callable[[Any], dict[str, Any]], in_words: Callable[[Any], str]
+) -> None:
+    """Show the summary of a result and its warnings; exit if its training did not converge."""
+    if as_json:
+        print_summary(in_json(result))
+    else:
+        say(in_words(result))
+    warn(result.warnings)
+    if not result.converged:
+        click.get_current_context().exit(_NOT_CONVERGED)
+
+
 def is_terminal(stream: TextIO | None) -> bool:
     """Whether the stream is a terminal."""
     return stream is not None and not stream.closed and stream.isatty()
@@ -74,3 +100,114 @@ def some_of(names: Sequence[str]) -> str:
 def print_summary(tree: dict[str, Any]) -> None:
     """Print the summary of a result as JSON on stdout; None for numbers that do not exist."""
     click.echo(json.dumps(tree, indent=2, allow_nan=False))
+
+
+class ProgressBar(AbstractContextManager["ProgressBar"]):
+    """Draws a bar on stderr for long work; it is called with a stage and the completed fraction.
+
+    Without a terminal it does nothing, and rich is not imported. With --verbose, each stage is a line
+    instead.
+    """
+
+    def __init__(self) -> None:
+        self._visible = is_terminal(sys.stderr) and not verbose()
+        self._stage = ""
+        self._start = time.monotonic()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Show the progress of the work."""
+        if stage != self._stage:
+            self._stage = stage
+            tell_more(f"{time.monotonic() - self._start:7.2f} s  {stage}")
+        if not self._visible or time.monotonic() - self._start < _PATIENCE:
+            return
+        if self._bar is None:
+            self._open()
+        assert self._bar is not None
+        assert self._task is not None
+        self._bar.update(self._task, description=stage, completed=min(max(fraction, 0.0), 1.0))
+
+    def _open(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        self._task = self._bar.add_task("", total=1.0)
+        self._bar.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        tell_more(f"{time.monotonic() - self._start:7.2f} s  {'done' if kind is None else 'stopped'}")
+
+
+def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:
+    """Process each item; if there are several, those that fail are reported and left out.
+
+    Parameters
+    ----------
+    items : sequence
+    work : callable
+    what, done : str
+        Words for the items and for what is done to them, for messages.
+
+    Returns
+    -------
+    failed : dict of str by int
+        Reason of each failure, by the item's index.
+
+    Raises
+    ------
+    InputError, FormatError
+        The only item fails.
+    NeurocalError
+        All items fail.
+    """
+    failed: dict[int, str] = {}
+    with ProgressBar() as progress:
+        for k, item in enumerate(items):
+            try:
+                work(item)
+            except (InputError, FormatError) as error:
+                if len(items) == 1:
+                    raise
+                complain(str(error))
+                failed[k] = str(error)
+            progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
+    if len(failed) == len(items):
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; see the reasons above")
+    return failed
+
+
+def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
+    """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
+    from neurocal_cli.report import align
+
+    if not is_terminal(sys.stdout):
+        blocks = [*map(align, tables), *([below] if below else [])]
+        click.echo("\n\n".join("\n".join(block) for block in blocks))
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    for rows in tables:
+        table = Table()
+        for k, heading in enumerate(rows[0]):
+            table.add_column(Text(heading), justify="left" if k == 0 else "right")
+        for row in rows[1:]:
+            table.add_row(*(Text(cell) for cell in row))
+        wide = console.options.update(width=_WIDEST)
+        if console.measure(table, options=wide).maximum > console.width:
+            # Borders and padding take much of a narrow terminal, and words would be broken.
+            console.print(Text("\n".join(align(rows))), overflow="ignore", no_wrap=True, crop=False)
+        else:
+            console.print(table)
+    for line in below:
+        console.print(Text(line))

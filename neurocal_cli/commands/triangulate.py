@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.io.matches_csv import Matches
+    from neurocal_cli.io.triangulation_csv import Matches
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import Triangulated
 
@@ -88,8 +88,7 @@ def triangulate(
     check_summary(as_json, output)
     check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
-    from neurocal_cli.io.matches_csv import read_matches
-    from neurocal_cli.io.points_in_space_csv import format_space_points
+    from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 

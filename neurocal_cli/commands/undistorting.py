@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import note, say, some_of
+from neurocal_cli.commands.streams import each_of, note, say, some_of
 from neurocal_cli.distortion.panorama import Panorama
 from neurocal_cli.distortion.undistorted_view import Undistorted, field_of_view
 from neurocal_cli.errors import InputError

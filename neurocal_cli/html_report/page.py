@@ -1,12 +1,16 @@
-"""Elements of a page: style and script, sortable tables, drawings that can be enlarged, the verdict."""
+"""Elements of a page: style and script, sortable tables, enlargeable drawings, the verdict, the origin."""
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field
 from html import escape
+from importlib.metadata import PackageNotFoundError, version
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.report import facts
 
 _LONG = 40  # characters; longer cells are texts
@@ -135,3 +139,33 @@ def definitions(entries: Mapping[str, str]) -> str:
     """Make a list of names and descriptions."""
     lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in entries.items())
     return f"<dl>{lines}</dl>"
+
+
+@frozen_dataclass
+class Origin:
+    """The run that produced a result, as far as known.
+
+    Attributes
+    ----------
+    files : dict of str by name
+        SHA-256 of the input files; of the result's own file if the run is unknown.
+    command : str, optional
+        The command line.
+    versions : dict of str by name
+        Of the programs that computed the result.
+    """
+
+    files: Mapping[str, str]
+    command: str | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the running programs."""
+    found = {"neurocal": __version__, "Python": platform.python_version()}
+    for name in ("numpy", "scipy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # not installed as a package
+            continue
+    return found

@@ -10,10 +10,8 @@ import numpy as np
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map, scatter
-from neurocal_cli.html_report.heat_map import heat_map
-from neurocal_cli.html_report.origin import Origin
-from neurocal_cli.html_report.page import definitions, figure, page, section, table, verdict_block
+from neurocal_cli.html_report.drawings import enlargement, error_bars, heat_map, residual_map, scatter
+from neurocal_cli.html_report.page import Origin, definitions, figure, page, section, table, verdict_block
 from neurocal_cli.report import parameter_rows, printable
 from neurocal_cli.stereo.report import camera_rows, rig_rows
 from neurocal_cli.stereo.rig import Rig

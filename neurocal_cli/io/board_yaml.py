@@ -10,7 +10,6 @@ import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.distances import Distance
-from neurocal_cli.errors import FormatError
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
@@ -116,6 +115,4 @@ def _only(field: Field, known: tuple[str, ...]) -> None:
     for key in field.entries():
         if key not in known:
             where = f"{field.path}: " if field.path else ""
-            raise FormatError(
-                f"{where}the key {key[:60]!r} is not known; use one of {', '.join(known)}", field.source
-            )
+            field.refuse(f"{where}the key {key[:60]!r} is not known; use one of {', '.join(known)}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
@@ -9,16 +11,14 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
-from neurocal_cli.io.distortion_names import own_length
+from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.named_entries import read_named
 from neurocal_cli.io.observations_yaml import read_observations
-from neurocal_cli.io.rejected_yaml import read_rejected
-from neurocal_cli.io.target_yaml import read_target
-from neurocal_cli.io.text_columns import read_numbers
+from neurocal_cli.io.optional_blocks import read_rejected, read_target, read_verdict
+from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.verdict_yaml import read_verdict
 from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
@@ -44,10 +44,9 @@ def calibration_from_field(root: Field) -> Calibration:
     fit = block["fit"]
     points = _points(root, block, set(views), fit["n_points"].integer() == 0)
     if fit["n_points"].integer() != len(points):
-        raise FormatError(
+        root.refuse(
             f"fit.n_points is {fit['n_points'].integer()}, but there are {len(points)} observations: the "
-            "file is incomplete; calibrate again",
-            root.source,
+            "file is incomplete; calibrate again"
         )
     rejected = read_rejected(block.get("rejected"), points.unit)
     if fit["n_rejected"].integer() != len(rejected):
@@ -90,23 +89,21 @@ def calibration_from_field(root: Field) -> Calibration:
 def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
-        raise FormatError("is not a calibration; give a file that calibrate wrote", root.source)
+        root.refuse("is not a calibration; give a file that calibrate wrote")
     if "neurocal" not in root:
         if "stereo" in root and "left" in root:
-            raise FormatError("is a stereo rig; give the file of one camera", root.source)
+            root.refuse("is a stereo rig; give the file of one camera")
         if "camera_matrix" in root:
-            raise FormatError(
+            root.refuse(
                 "has no neurocal block, so the poses and points are missing; it can serve as --intrinsics, "
-                "here give a file that calibrate wrote",
-                root.source,
+                "here give a file that calibrate wrote"
             )
-        raise FormatError("has no neurocal block; give a file that calibrate wrote", root.source)
+        root.refuse("has no neurocal block; give a file that calibrate wrote")
     block = root["neurocal"]
     if block["format"].integer() not in FORMATS:
-        raise FormatError(
+        root.refuse(
             f"{block.path}.format is {block['format'].integer()}, not {' or '.join(map(str, FORMATS))}; "
-            "update neurocal",
-            root.source,
+            "update neurocal"
         )
     return block
 
@@ -130,15 +127,20 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     if "camera_matrix" in root:
         K = root["camera_matrix"]["data"].array(9).reshape(3, 3)
         if np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
-            raise FormatError(
-                f"camera_matrix and {parameters.path} disagree; correct the one that was edited", root.source
-            )
+            root.refuse(f"camera_matrix and {parameters.path} disagree; correct the one that was edited")
     return intrinsics, std, frozenset(fixed)
 
 
-def poses_from_field(root: Field) -> dict[str, Pose]:
-    """Read the pose of each view of a neurocal file."""
-    return {name: view.pose for name, view in read_views(neurocal_block(root)["views"]).items()}
+def read_extrinsics(path: str | Path) -> dict[str, Pose]:
+    """Read the pose of each view of a neurocal calibration; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read or has no poses.
+    """
+    views = read_views(neurocal_block(read_tree(path))["views"])
+    return {name: view.pose for name, view in views.items()}
 
 
 def _type(field: Field) -> int:
@@ -213,9 +215,8 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
     points = read_observations(observations, unit, image_size(root), center, none)
     strange = set() if points.view is None else set(points.view_names) - views
     if strange:
-        raise FormatError(
+        root.refuse(
             f"{observations.path}: the view {min(strange)[:60]!r} is not in {block.path}.views; "
-            "calibrate again or correct its name",
-            root.source,
+            "calibrate again or correct its name"
         )
     return points

@@ -21,12 +21,9 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_info import camera_info_lines
-from neurocal_cli.io.named_entries import named_lines
 from neurocal_cli.io.observations_yaml import observation_lines
-from neurocal_cli.io.rejected_yaml import rejected_lines
-from neurocal_cli.io.target_yaml import target_lines
-from neurocal_cli.io.text_columns import column_lines
-from neurocal_cli.io.verdict_yaml import verdict_lines
+from neurocal_cli.io.optional_blocks import rejected_lines, target_lines, verdict_lines
+from neurocal_cli.io.text_columns import column_lines, named_lines
 from neurocal_cli.io.views_yaml import have_same_std, view_lines
 from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
 

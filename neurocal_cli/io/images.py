@@ -62,7 +62,7 @@ class Image:
         return self.grey.shape[1], self.grey.shape[0]
 
 
-def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
+def read_image(path: str | Path) -> Image:
     """Read an image: PNG, JPEG, TIFF, BMP, PGM or PPM, grey or colour, of 8 or 16 bits.
 
     As in OpenCV's ``imread``, an image is turned upright according to its EXIF orientation; pixel coordinates
@@ -72,15 +72,13 @@ def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     ----------
     path : str or Path
         ``-`` is stdin.
-    most_pixels : int
-        Larger images are refused before they take memory.
 
     Raises
     ------
     FormatError
         The file cannot be read, is not an image, is damaged, or too large.
     """
-    return parse_image(*read_bytes(path), most_pixels)
+    return parse_image(*read_bytes(path))
 
 
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:

@@ -13,7 +13,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.target_yaml import read_target, target_lines
+from neurocal_cli.io.optional_blocks import read_target, target_lines
 from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
@@ -164,9 +164,8 @@ def _tables_lines(lens: ZoomLens) -> Iterator[str]:
 
 def _lens(block: Field) -> ZoomLens:
     if block["format"].integer() != _FORMAT:
-        raise FormatError(
-            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
-            block.source,
+        block.refuse(
+            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again"
         )
     controls = tuple(block["controls"].texts())
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):

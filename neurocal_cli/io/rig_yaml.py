@@ -18,8 +18,8 @@ from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
+from neurocal_cli.io.optional_blocks import read_verdict, verdict_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
 from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
@@ -132,19 +132,14 @@ def rig_from_field(root: Field) -> Rig:
     """Read a rig; see `read_rig`."""
     if not isinstance(root.value, dict) or "stereo" not in root:
         if "neurocal" in root:
-            raise FormatError(
-                "is the calibration of one camera; give a rig, or the calibrations of both cameras",
-                root.source,
-            )
-        raise FormatError("is not a rig; give a file that neurocal stereo wrote", root.source)
+            root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
+        root.refuse("is not a rig; give a file that neurocal stereo wrote")
     block = root["stereo"]
     if block["format"].integer() != FORMAT:
-        raise FormatError(
-            f"stereo.format is {block['format'].integer()}, not {FORMAT}; update neurocal", root.source
-        )
+        root.refuse(f"stereo.format is {block['format'].integer()}, not {FORMAT}; update neurocal")
     left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
     if left.unit != right.unit:
-        raise FormatError("left and right have different units; correct one", root.source)
+        root.refuse("left and right have different units; correct one")
     try:
         pose = Pose(block["R"].array(3, 3), block["t"].array(3))
     except InputError as error:
@@ -193,7 +188,6 @@ def _check_consistent(rig: Rig, block: Field) -> None:
     )
     for name, found, expected in stated:
         if np.abs(found - expected).max() > _SAME * np.abs(expected).max():
-            raise FormatError(
-                f"stereo.{name} and stereo.R, stereo.t or the cameras disagree; correct the one edited",
-                block.source,
+            block.refuse(
+                f"stereo.{name} and stereo.R, stereo.t or the cameras disagree; correct the one edited"
             )

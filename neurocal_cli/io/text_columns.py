@@ -4,13 +4,16 @@ PyYAML's pure-Python parser takes 50 us per number, but only 0.3 us per characte
 digits has 20 characters as a decimal, 11 in base64, and 4 packed: each of these is a character of Unicode's
 private use area that encodes two bytes of a float64. A text has at most 160 numbers, because OpenCV's
 FileStorage refuses texts of more than 4095 bytes.
+
+Values by view name are a mapping if all names are valid keys of FileStorage. Otherwise they are a list of
+pairs, because FileStorage cannot open a file with a key such as ``"01"``.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flows, quoted
+from neurocal_cli.io.yaml_text import flows, quoted, text
 
 LONGEST = 160  # numbers in a text, each with at most 24 characters
 
@@ -26,6 +29,7 @@ _PRIVATE = 0xF0000  # the first of 65536 characters of a private use area
 
 _NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
 _RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*").fullmatch
 
 
 def number_words(values: NDArray[Any]) -> list[str]:
@@ -173,3 +177,47 @@ def read_ranges(field: Field, below: int) -> list[int]:
             field.fail(f"numbers below {below}")
         numbers.extend(range(int(first), int(last or first) + 1))
     return numbers
+
+
+def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterator[str]:
+    """Lines of a key whose value has an entry for each name.
+
+    Parameters
+    ----------
+    key : str
+    names : iterable of str
+    values : iterable of str
+        As YAML flow text.
+    """
+    names = list(names)
+    pairs = zip(names, values, strict=True)
+    if not names:
+        yield f"{key}: {{}}"
+    elif all(_KEY(name) and text(name) == name for name in names):
+        yield f"{key}:"
+        yield from (f"  {name}: {value}" for name, value in pairs)
+    else:
+        yield f"{key}:"
+        yield from (f"  - [{quoted(name)}, {value}]" for name, value in pairs)
+
+
+def read_named(field: Field) -> dict[str, Field]:
+    """Read either form back.
+
+    Raises
+    ------
+    FormatError
+        The value has neither form, or a name appears twice.
+    """
+    if isinstance(field.value, dict):
+        return field.entries()
+    found: dict[str, Field] = {}
+    for entry in field.items():
+        parts = list(entry.items())
+        if len(parts) != 2:
+            entry.fail("a name and its value")
+        name = parts[0].text()
+        if name in found:
+            parts[0].fail("a name that no other entry has")
+        found[name] = parts[1]
+    return found

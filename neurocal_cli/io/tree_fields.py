@@ -38,12 +38,14 @@ class Field:
         self.source = source
         self.path = path
 
+    def refuse(self, problem: str) -> NoReturn:
+        """Raise a FormatError about the file."""
+        raise FormatError(problem, self.source)
+
     def fail(self, expected: str) -> NoReturn:
         """Raise a FormatError about an unexpected value."""
         found = _described(self.value)
-        raise FormatError(
-            f"{self.path or 'the file'} must be {expected}, found {found}; correct it", self.source
-        )
+        self.refuse(f"{self.path or 'the file'} must be {expected}, found {found}; correct it")
 
     def __contains__(self, key: str) -> bool:
         return isinstance(self.value, dict) and self.value.get(key) is not None
@@ -53,8 +55,7 @@ class Field:
         if not isinstance(self.value, dict):
             self.fail("a mapping (key: value)")
         if key not in self.value:
-            path = self._below(key)
-            raise FormatError(f"the key {path} is missing; add it or write the file again", self.source)
+            self.refuse(f"the key {self._below(key)} is missing; add it or write the file again")
         return Field(self.value[key], self.source, self._below(key))
 
     def get(self, key: str, default: Any = None) -> Field:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration import ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.io.text_columns import as_fields, column_lines, numbers_of, read_columns
 from neurocal_cli.io.tree_fields import Field
@@ -115,9 +114,7 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
     R = np.column_stack(list(numbers_of(columns, wanted[-9:]))).reshape(-1, 3, 3)
     std = numbers_of(columns, [f"std_{name}" for name in known], unknown=True).T
     if np.abs(R - np.stack([euler_to_rotation(*angles) for angles in pose[:, :3]])).max() > _SAME:
-        raise FormatError(
-            f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited", field.source
-        )
+        field.refuse(f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited")
     return {
         name: ViewResult(
             pose=Pose(R[k], pose[k, 3:]),
@@ -144,7 +141,7 @@ def _view(entry: Field) -> ViewResult:
     if "R" in entry:
         exact = entry["R"].array(3, 3)
         if np.abs(exact - R).max() > _SAME:
-            raise FormatError(f"{entry.path}: R and rotation disagree; correct the one edited", entry.source)
+            entry.refuse(f"{entry.path}: R and rotation disagree; correct the one edited")
         R = exact
     return ViewResult(
         pose=Pose(R, np.array(values[3:])),

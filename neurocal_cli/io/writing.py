@@ -15,8 +15,7 @@ from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
-from neurocal_cli.io.outputs import held_back
-from neurocal_cli.io.temporary_files import remove_stale, temporary_name
+from neurocal_cli.io.outputs import held_back, remove_stale, temporary_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -128,7 +127,7 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
     except (BrokenPipeError, NeurocalError):
         raise
     except (OSError, ValueError) as error:
-        raise NeurocalError(f"{one_line(path)}: {_write_failure(path, error)}") from error
+        raise NeurocalError(f"{one_line(path)}: {_write_failure(error)}") from error
 
 
 def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
@@ -212,7 +211,7 @@ def _take_over(temporary: str, former: os.stat_result) -> None:
     os.chmod(temporary, stat.S_IMODE(former.st_mode))
 
 
-def _write_failure(path: str | Path, error: Exception) -> str:
+def _write_failure(error: Exception) -> str:
     if isinstance(error, IsADirectoryError):
         return "is a folder; give the name of a file"
     if isinstance(error, FileNotFoundError):

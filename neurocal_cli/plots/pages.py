@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.plots.camera_panels import Subject, panels_of
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
-from neurocal_cli.plots.residuals import draw_learning, draw_residuals, draw_scatter, draw_views
 from neurocal_cli.plots.space import draw_poses
-from neurocal_cli.plots.subject import Subject
-from neurocal_cli.plots.trust import draw_coverage, draw_uncertainty
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 
@@ -48,7 +46,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
     NeurocalError
         matplotlib is not installed.
     """
-    panels = _camera_panels(subject)
+    panels = panels_of(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
     return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, _title(subject), _PAGE, kind)
@@ -66,7 +64,7 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
     panels: dict[str, Draw] = {
         f"{side} {name}": _with_side(side, draw)
         for side, subject in sides.items()
-        for name, draw in _camera_panels(subject).items()
+        for name, draw in panels_of(subject).items()
     }
     panels["poses"] = lambda axes: draw_poses(axes, rig.left, [(rig.right.camera, rig.pose)])
     if panel == "poses":
@@ -124,18 +122,6 @@ def draw_points_in_space(
         f"epipolar rms {found.epipolar_px:.3g} px"
     )
     return _page(rows, (1, 1), panels, title, (16.0, 9.0), kind)
-
-
-def _camera_panels(subject: Subject) -> dict[str, Draw]:
-    return {
-        "residuals": lambda axes: draw_residuals(axes, subject),
-        "coverage": lambda axes: draw_coverage(axes, subject),
-        "uncertainty": lambda axes: draw_uncertainty(axes, subject),
-        "scatter": lambda axes: draw_scatter(axes, subject),
-        "poses": lambda axes: draw_poses(axes, subject.calibration),
-        "learning": lambda axes: draw_learning(axes, subject),
-        "views": lambda axes: draw_views(axes, subject),
-    }
 
 
 def _title(subject: Subject) -> str:

@@ -165,13 +165,8 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
         )
     corner = np.array([_EDGE + _RULER + _QUIET, _EDGE + _QUIET]) + 0.5 * (np.array(room) - size)
     origin = corner - low
-    lines = [
-        Line(_pair(scale * fold.start + origin), _pair(scale * fold.end + origin), dashed=True)
-        for fold in folds
-    ]
-    # Dashes are drawn beside the pattern only, where they change no edge.
-    lines = [part for line in lines for part in _beside(line, corner, corner + size)]
-    rulers, numbers = _rulers(corner, size, width, height)
+    lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
+    rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
     text = Text((_EDGE + _RULER + _QUIET, height - _EDGE), _caption(board), 2.8)
     return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
@@ -195,17 +190,16 @@ def _black(laid: Laid) -> Array:
                              np.stack([a, y], -1)], axis=1))  # fmt: skip
 
 
-def _beside(line: Line, low: Array, high: Array) -> list[Line]:
-    """The parts of a fold outside the pattern: 4 mm at either end, within the quiet zone."""
-    start, end = np.array(line.start), np.array(line.end)
+def _beside(start: Array, end: Array) -> list[Line]:
+    """Dashes of a fold: 4 mm at either end, beside the pattern, where they change none of its edges."""
     along = (end - start) / np.linalg.norm(end - start)
-    parts = []
-    for place, way in ((start, -along), (end, along)):
-        parts.append(Line(_pair(place + 0.7 * way), _pair(place + (_QUIET - 0.5) * way), line.width, True))
-    return parts
+    return [
+        Line(_pair(place + 0.7 * way), _pair(place + (_QUIET - 0.5) * way), dashed=True)
+        for place, way in ((start, -along), (end, along))
+    ]
 
 
-def _rulers(corner: Array, size: Array, width: float, height: float) -> tuple[list[Line], list[Text]]:
+def _rulers(corner: Array, size: Array, height: float) -> tuple[list[Line], list[Text]]:
     """A ruler below the pattern and one beside it, of whole centimetres, from 0."""
     lines, texts = [], []
     below = height - _EDGE - 4.0 - _RULER + 3.0

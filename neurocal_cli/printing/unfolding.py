@@ -56,14 +56,6 @@ class Laid:
 
 
 @frozen_dataclass(eq=False)
-class Fold:
-    """A line along which the sheet is folded, from end to end of the pattern; (2,) arrays."""
-
-    start: Array
-    end: Array
-
-
-@frozen_dataclass(eq=False)
 class _Map:
     """Map from points of a plane to the sheet, ``B X + b``; B (2, 3), b (2,)."""
 
@@ -74,7 +66,7 @@ class _Map:
         return np.asarray(points @ self.B.T + self.b)
 
 
-def unfolded(board: Board) -> tuple[list[Laid], list[Fold]]:
+def unfolded(board: Board) -> tuple[list[Laid], list[Array]]:
     """Lay the planes of a board flat.
 
     Parameters
@@ -86,7 +78,8 @@ def unfolded(board: Board) -> tuple[list[Laid], list[Fold]]:
     -------
     laid : list of Laid
         In the order of the planes.
-    folds : list of Fold
+    folds : list of (2, 2) arrays
+        Ends of the lines along which the sheet is folded, from end to end of the pattern.
 
     Raises
     ------
@@ -116,7 +109,7 @@ def _first_map(planes: tuple[Plane, ...]) -> _Map:
     return _Map(B, -B @ np.array(plane.origin))
 
 
-def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[_Map, Fold]:
+def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[_Map, Array]:
     """A plane laid beside the first of those before it that it meets."""
     for other, place in zip(before, maps, strict=True):
         line = _meeting(plane, other)
@@ -128,8 +121,7 @@ def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[
         new = _Map(B, place(point) - B @ point)
         marks = np.concatenate([p.at(_corners(p)) for p in (plane, other)])
         lengths = (marks - point) @ along
-        ends = place(point + np.outer([lengths.min(), lengths.max()], along))
-        return new, Fold(ends[0], ends[1])
+        return new, place(point + np.outer([lengths.min(), lengths.max()], along))
     raise InputError(
         f"the plane {plane.name!r} meets none of the planes before it in a line beside both; print it alone"
     )

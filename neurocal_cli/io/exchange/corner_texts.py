@@ -11,7 +11,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.dictionary import json_text, npz_bytes
 from neurocal_cli.io.exchange.matlab import FIRST_PIXEL, saved
-from neurocal_cli.io.file_storage_text import storage_text
+from neurocal_cli.io.file_storage import storage_text
 from neurocal_cli.io.points_csv import format_points
 from neurocal_cli.io.yaml_text import number
 from neurocal_cli.points import Correspondences

@@ -152,17 +152,15 @@ def _corners(
 def _of_board(board: Board | None, count: int, field: Field, down: bool = False) -> tuple[Array, list[str]]:
     """Vertices (1, N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
     if board is None:
-        raise FormatError(
+        field.refuse(
             f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
-            "--rows and --square, or --board",
-            field.source,
+            "--rows and --square, or --board"
         )
     if len(board.planes) != 1 or board.planes[0].cols * board.planes[0].rows != count:
         sizes = " and ".join(f"{plane.cols} x {plane.rows}" for plane in board.planes)
-        raise FormatError(
+        field.refuse(
             f"there are {count} corners a view, and {sizes} vertices on the board; give the board that was "
-            "measured",
-            field.source,
+            "measured"
         )
     (plane,) = board.planes
     order = np.arange(count)

@@ -19,12 +19,12 @@ import numpy as np
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.camera_info import to_ros
 from neurocal_cli.io.camera_tree import camera_from_tree, has_matrix, matrix_data
-from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.exchange.rotations import from_vector, to_vector
-from neurocal_cli.io.file_storage_text import storage_text
+from neurocal_cli.io.file_storage import storage_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
@@ -62,19 +62,14 @@ def from_tree(root: Field) -> CameraSet:
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
 
-def read_npz(data: bytes, source: str) -> CameraSet:
-    """Read a file of ``numpy.savez``.
+def arrays_of(data: bytes, source: str) -> dict[str, Any]:
+    """Read the arrays of an ``.npz`` file as nested lists.
 
     Raises
     ------
     FormatError
         The data are not such a file, or contain Python objects.
     """
-    return from_tree(Field(arrays_of(data, source), source))
-
-
-def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """Read the arrays of an ``.npz`` file as nested lists."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
@@ -83,13 +78,11 @@ def arrays_of(data: bytes, source: str) -> dict[str, Any]:
             return {name: arrays[name].tolist() for name in arrays.files}
     except FormatError:
         raise
-    except ValueError as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         if "pickle" in str(error) or "Object arrays" in str(error):
             raise FormatError(
                 "holds Python objects, which are not read; save each view's corners as numbers", source
             ) from error
-        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
-    except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
 
 

@@ -8,7 +8,6 @@ from neurocal_cli.calibration import Calibration, ViewResult
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES
-from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_tree import (
     calibration_from_field,
     distortion_from_field,
@@ -35,7 +34,7 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
     """
     if "neurocal" not in root:
         if not whole:
-            raise FormatError("is a stereo rig; give the file of one camera", root.source)
+            root.refuse("is a stereo rig; give the file of one camera")
         return camera_set(rig_from_field(root))
     if not whole:
         intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)

@@ -1,26 +1,34 @@
-"""Read cameras from files of any program, which is recognised by the content, never by the file name."""
+"""Cameras of any program: files are recognised by their content, and written by the names of formats."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
-from neurocal_cli.io.exchange.camera_set import CameraSet
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import after, inverse
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes, value_failures
+from neurocal_cli.io.files import decode, one_line, read_bytes, value_failures
 from neurocal_cli.io.tree_fields import Field
 
-# Readers of binary files, by their first bytes.
-_BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
-    (b"PK\x03\x04", dictionary.read_npz),
-    (b"MATLAB 5.0 MAT-file", matlab.read_mat),
-)
+# Formats that `convert` writes, by the values of its option ``--to``.
+FORMATS: dict[str, Format] = {
+    "neurocal": neurocal.FORMAT,
+    "opencv": dictionary.OPENCV,
+    "ros": ros.FORMAT,
+    "kalibr": kalibr.FORMAT,
+    "colmap": colmap.FORMAT,
+    "mrcal": mrcal.FORMAT,
+    "matlab": matlab.FORMAT,
+    "json": dictionary.JSON,
+    "npz": dictionary.NPZ,
+}
 _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 
 
@@ -55,6 +63,26 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
 
+def read_intrinsics(path: str | Path) -> Camera:
+    """Read a camera without its poses.
+
+    Parameters
+    ----------
+    path : str or Path
+        A neurocal calibration or the file of another program, see `read_cameras`; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        There is no valid camera matrix, or more than one camera.
+    """
+    found = read_cameras([path], whole=False)
+    if len(found.cameras) > 1:
+        source = "<stdin>" if str(path) == "-" else one_line(path)
+        raise FormatError("is a stereo rig; give the file of one camera", source)
+    return found.cameras[0]
+
+
 def _opened(name: str) -> CameraSet | Field:
     """Read the cameras of a file, or its tree if it is YAML, XML or JSON."""
     if colmap.is_folder(name):
@@ -63,9 +91,10 @@ def _opened(name: str) -> CameraSet | Field:
     if data.startswith(b"\x89HDF"):
         raise FormatError("is a MATLAB file of version 7.3; save it with -v7", source)
     with value_failures(source):
-        for mark, read in _BINARY:
-            if data.startswith(mark):
-                return read(data, source)
+        if data.startswith(b"PK\x03\x04"):
+            return dictionary.from_tree(Field(dictionary.arrays_of(data, source), source))
+        if data.startswith(b"MATLAB 5.0 MAT-file"):
+            return matlab.read_mat(data, source)
         text = decode(data, source, "a camera file")
         if _COLMAP(text):
             return colmap.parse(text, source)

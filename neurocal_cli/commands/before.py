@@ -1,7 +1,8 @@
-"""Checks of a command's inputs and outputs before its work."""
+"""What a command does before its work: checks of its inputs and outputs, and the number of threads."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 
 from neurocal_cli.errors import UsageError
@@ -33,11 +34,16 @@ def check_one_stdin(*names: str | None) -> None:
 
 
 def check_summary(as_json: bool, output: str) -> None:
-    """Refuse two results on one stream.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse two results on one stream, with a UsageError."""
     if as_json and output == "-":
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
+
+
+def compute_in_one_thread() -> None:
+    """Limit the linear algebra to one thread, for this process and those it starts.
+
+    The matrices are small: threads cost three times the time that they save, and their number would change
+    the last digits. It must be set before numpy is loaded. The user's own setting takes precedence.
+    """
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        os.environ.setdefault(name, "1")

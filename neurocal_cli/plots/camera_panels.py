@@ -1,14 +1,23 @@
-"""Panels of reprojection errors: residuals in the image, their scatter, errors by view, learning curve."""
+"""Panels of a camera: residuals, their scatter, coverage, uncertainty, errors by view, learning curve."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.evaluation import CameraEvaluation, evaluate_camera
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, plain, say, style
-from neurocal_cli.plots.subject import Subject
+from neurocal_cli.plots.space import draw_poses
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.verdict.evidence import Evidence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +27,54 @@ _MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
 _MOST_BARS = 40  # greatest number of views with room for their names
 _LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the image width
 _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
+_CELLS = 6  # across and down, as in the verdict
+_MOST_DOTS = 5000
+_LEVELS = 12
+
+
+@frozen_dataclass
+class Subject:
+    """A camera, points and their errors.
+
+    Attributes
+    ----------
+    camera : Camera
+    points : Correspondences
+    evaluation : CameraEvaluation
+        Of the camera on these points.
+    calibration : Calibration or None
+        The calibration of the camera, if known.
+    """
+
+    camera: Camera
+    points: Correspondences
+    evaluation: CameraEvaluation
+    calibration: Calibration | None
+
+    @classmethod
+    def of(
+        cls,
+        camera: Calibration | Camera,
+        points: Correspondences | None = None,
+        evaluation: CameraEvaluation | None = None,
+    ) -> Subject:
+        """Evaluate a camera on points; by default on a calibration's own points."""
+        calibration = camera if isinstance(camera, Calibration) else None
+        if points is None:
+            points = Correspondences.none() if calibration is None else calibration.points
+        return cls(camera_of(camera), points, evaluation or evaluate_camera(camera, points), calibration)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) [px], if known."""
+        return self.points.image_size or self.camera.image_size
+
+    @cached_property
+    def evidence(self) -> Evidence | None:
+        """Evidence for the quality of the calibration from its points; None without a calibration."""
+        if self.calibration is None or not len(self.calibration.points):
+            return None
+        return gather_evidence(self.calibration)
 
 
 def set_image(axes: Axes, subject: Subject) -> Array:
@@ -125,3 +182,56 @@ def draw_learning(axes: Axes, subject: Subject) -> None:
     )
     axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
     axes.legend(loc="upper right", frameon=False)
+
+
+def draw_coverage(axes: Axes, subject: Subject) -> None:
+    """Draw the number of points in each part of the image; parts without points are marked."""
+    left, right, top, bottom = set_image(axes, subject)
+    u, v = subject.points.pixels.T
+    across, down = np.linspace(left, right, _CELLS + 1), np.linspace(top, bottom, _CELLS + 1)
+    counts = np.histogram2d(v, u, (down, across))[0]
+    drawn = axes.pcolormesh(across, down, counts, cmap="Blues", vmin=0, vmax=max(1.0, 1.3 * counts.max()))
+    axes.figure.colorbar(drawn, ax=axes, label="points", shrink=0.7)
+    for row, column in np.argwhere(counts == 0).tolist():
+        middle = across[column : column + 2].mean(), down[row : row + 2].mean()
+        axes.plot(*middle, "x", color=ACCENT, markersize=8)
+    some = np.random.default_rng(0).permutation(len(u))[:_MOST_DOTS]
+    axes.plot(u[some], v[some], ".", color=INK, markersize=1.5, rasterized=len(u) > 2000)
+    style(axes, f"Coverage: {np.mean(counts > 0):.0%} of the parts of the image hold points")
+    axes.grid(False)
+
+
+def draw_uncertainty(axes: Axes, subject: Subject) -> None:
+    """Draw the standard deviation of projected pixels over the image, at the points' median distance."""
+    projection = None if subject.evidence is None else subject.evidence.projection
+    if projection is None or not np.isfinite(projection.std[1]).any():
+        style(axes, "Uncertainty of projected pixels")
+        say(axes, "known only of a calibration whose image size is known")
+        return
+    from matplotlib.colors import BoundaryNorm
+
+    set_image(axes, subject)
+    u, v = (np.unique(axis) for axis in projection.pixels.T)
+    std = np.ma.masked_invalid(projection.std[1].reshape(len(v), len(u)))
+    # Levels differ by equal factors, because corners can be 100 times as uncertain as the middle.
+    least = max(float(std.min()), 1e-12)
+    levels = np.geomspace(least, max(float(std.max()), 1.01 * least), _LEVELS)
+    drawn = axes.contourf(u, v, std, levels=levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))
+    axes.figure.colorbar(drawn, ax=axes, label="std [px]", format="%.2g", ticks=levels[::2], shrink=0.7)
+    pixels = subject.points.pixels
+    axes.plot(*pixels[:: max(1, len(pixels) // 1000)].T, ".", color="white", markersize=1, alpha=0.7)
+    style(axes, f"Uncertainty of projected pixels, {projection.worst:.3g} px at most")
+    axes.grid(False)
+
+
+def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
+    """Functions that draw the panels of a camera, by their names in `plots.CAMERA_PANELS`."""
+    return {
+        "residuals": lambda axes: draw_residuals(axes, subject),
+        "coverage": lambda axes: draw_coverage(axes, subject),
+        "uncertainty": lambda axes: draw_uncertainty(axes, subject),
+        "scatter": lambda axes: draw_scatter(axes, subject),
+        "poses": lambda axes: draw_poses(axes, subject.calibration),
+        "learning": lambda axes: draw_learning(axes, subject),
+        "views": lambda axes: draw_views(axes, subject),
+    }
