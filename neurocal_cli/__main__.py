@@ -23,7 +23,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         from neurocal_cli.commands import neurocal
+        from neurocal_cli.commands.streams import stand_in_for_closed_stdout
 
+        stand_in_for_closed_stdout()
         neurocal(prog_name="neurocal")
     except KeyboardInterrupt:  # pressed while modules are still being loaded
         sys.exit(130)

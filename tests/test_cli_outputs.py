@@ -96,6 +96,25 @@ def test_closed_standard_output_is_said_to_be_closed(made: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "Error: stdout is closed; give a file\n")
 
 
+@pytest.mark.parametrize(
+    "words", ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"]
+)
+def test_nor_is_what_is_only_printed_lost_without_a_word(made: Path, words: str) -> None:
+    shell = f"{sys.executable} -m neurocal_cli {words} >&-"
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, cwd=made, check=False)
+    assert (done.returncode, done.stderr) == (1, "Error: stdout is closed; give a file\n")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_error_does_not_cost_the_result(made: Path) -> None:
+    words = [sys.executable, "-m", "neurocal_cli", "convert", "camera.yaml", "--to", "json"]
+    whole = subprocess.run(words, capture_output=True, cwd=made, check=True)
+    assert whole.stderr  # there is something to say
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(words, stdout=subprocess.PIPE, stderr=full, cwd=made, check=False)
+    assert (done.returncode, done.stdout) == (0, whole.stdout)
+
+
 INCOMPLETE = {
     "undistort": ("undistort", "camera.yaml", "flat.csv", "-o", "us.csv", "--camera", "zz/c.yaml"),
     "calibrate": ("calibrate", "flat.csv", "--plot", "p.png", "-o", "zz/x.yaml"),

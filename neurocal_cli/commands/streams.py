@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from contextvars import ContextVar
 from typing import Any, TextIO
 
 import click
 
+from neurocal_cli.errors import NeurocalError
+
 TYPED = "neurocal.typed"  # key of the words of the command line in click's context
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
+
+
+class _ClosedOutput(io.RawIOBase):
+    """A standard output that the shell has closed: nothing can be written to it."""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object) -> int:
+        raise NeurocalError("stdout is closed; give a file")
+
+
+def stand_in_for_closed_stdout() -> None:
+    """Make it an error to print when the shell has closed standard output (``>&-``).
+
+    Python then has no such stream, and click prints nothing without a word.
+    """
+    if sys.stdout is None:
+        sys.stdout = io.TextIOWrapper(_ClosedOutput(), encoding="utf-8", write_through=True)
 
 
 def set_verbosity(level: int) -> None:
@@ -31,16 +55,22 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
+def tell(text: str) -> None:
+    """Show a text on stderr. A full or closed stderr must not cost the user the result."""
+    with suppress(OSError):
+        click.echo(text, err=True)
+
+
 def say(text: str) -> None:
     """Show a text that is not a result, unless the user gave --quiet."""
     if _VERBOSITY.get() >= 0:
-        click.echo(text, err=True)
+        tell(text)
 
 
 def complain(text: str) -> None:
     """Report on one line what is wrong with a part of the input."""
     if _VERBOSITY.get() >= -1:
-        click.echo(one_line(text), err=True)
+        tell(one_line(text))
 
 
 def note(texts: Iterable[str]) -> None:
@@ -58,7 +88,7 @@ def warn(texts: Iterable[str]) -> None:
 def tell_more(text: str) -> None:
     """Report progress if the user gave --verbose."""
     if verbose():
-        click.echo(one_line(text), err=True)
+        tell(one_line(text))
 
 
 def is_terminal(stream: TextIO | None) -> bool:
