@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.board_options import board_options, check_unit, given_board
 from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
@@ -125,6 +125,7 @@ def convert(
     """  # noqa: D301 - as in the group
     check_one_stdin(*files, board)
     check_summary(as_json, output)
+    check_unit(unit)
     check_outputs((None if os.path.isdir(output) else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)

@@ -19,9 +19,21 @@ _PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Whether a file can be read or written is checked by the code that does so: exit code 1, not wrong usage.
-PATH = click.Path(readable=False, allow_dash=True)
 
+class _Place(click.Path):
+    """A file or folder, whose name is not empty, as that of a variable is that the shell does not know.
+
+    Whether it can be read or written is checked by the code that does so: exit code 1, not wrong usage.
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Take a name, or fail as click does."""
+        if not value:
+            self.fail("the name is empty.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _Place(readable=False, allow_dash=True)
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `comparison.by_method`, which a test compares."""
