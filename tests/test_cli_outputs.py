@@ -1,12 +1,15 @@
 """No command writes over what it reads, and of several outputs all are written or none."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from support.command_line import run
+
+from neurocal_cli.io.outputs import Outputs
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 
@@ -161,6 +164,49 @@ def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
     result = run("stereo", left, right, *quick, "-o", rig, "--ros", ros, tmp_path / "right.yaml")
     assert result.exit_code == 1
     assert contents(tmp_path) == {"left.yaml": b"former"}
+
+
+FOLDERS = {
+    "simulate": ("simulate", "--trials", 1, "--random-starts", 0, "--jobs", 1, "--save", "new/made"),
+    "undistort": ("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", "new/made"),
+    "rectify": ("rectify", "rig.yaml", "stereo_left.csv", "stereo_right.csv", "-o", "new/../new/made"),
+    "detect": ("detect", "board01.png", *BOARD, "--overlay", "new/made", "-o", "p.csv"),
+    "convert": ("convert", "rig.yaml", "--to", "colmap", "-o", "new"),
+}
+
+
+@pytest.mark.parametrize("words", FOLDERS.values(), ids=FOLDERS.keys())
+def test_an_interrupt_leaves_no_new_folder(
+    made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    def interrupt(outputs: Outputs) -> list[bytes]:
+        assert (made / "new").is_dir()
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(made)
+    before = sorted(made.rglob("*"))
+    monkeypatch.setattr(Outputs, "commit", interrupt)
+    result = run(*words)
+    assert result.exit_code == 130
+    assert result.stderr.endswith("Error: interrupted\n")
+    assert sorted(made.rglob("*")) == before
+
+
+def test_an_interrupt_while_results_get_their_names_comes_too_late(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move = os.replace
+
+    def interrupted_move(temporary: str, target: str) -> None:
+        move(temporary, target)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("os.replace", interrupted_move)
+    monkeypatch.chdir(made)
+    result = run("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", tmp_path / "new")
+    assert result.exit_code == 0
+    assert len(list((tmp_path / "new").iterdir())) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_two_outputs_in_one_place_are_refused(made: Path, tmp_path: Path) -> None:

@@ -238,14 +238,14 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
-    from neurocal_cli.io.writing import check_places, write_whole
+    from neurocal_cli.io.writing import check_places, make_folder, write_whole
 
     if set(contents) == {""}:
         write_whole(output, contents[""])
         return
     if output == "-" or (os.path.exists(output) and not os.path.isdir(output)):
         raise UsageError(f"--to {target} writes {len(contents)} files here; give a folder, -o DIR")
-    os.makedirs(output, exist_ok=True)
+    make_folder(output)
     places = {os.path.join(output, name): text for name, text in contents.items()}
     check_places(*places)
     for place, text in places.items():

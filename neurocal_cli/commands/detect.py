@@ -303,12 +303,12 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
 def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import write_whole
+    from neurocal_cli.io.writing import make_folder, write_whole
 
     found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
     text = format_points(replace(gather(found, board.unit), distances=board.distances))
     if overlay is not None:
-        os.makedirs(overlay, exist_ok=True)
+        make_folder(overlay)
         for name, outcome in outcomes:
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)

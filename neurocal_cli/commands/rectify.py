@@ -270,8 +270,8 @@ class _Work:
             say(text)
 
     def _write(self, name: str, content: str | bytes) -> None:
-        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.io.writing import make_folder, write_whole
 
         place = os.path.join(self.output, name)
-        os.makedirs(os.path.dirname(place), exist_ok=True)
+        make_folder(os.path.dirname(place))
         write_whole(place, content)

@@ -257,9 +257,10 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.points_csv import write_points
+    from neurocal_cli.io.writing import make_folder, write_whole
     from neurocal_cli.simulation.scenes import true_calibration
 
-    os.makedirs(folder, exist_ok=True)
+    make_folder(folder)
     write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))
     write_points(scene.points(), os.path.join(folder, "exact.csv"))
     for k, level in enumerate(sorted(set(sigma))):
@@ -269,7 +270,6 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
         write_board(scene.board, os.path.join(folder, "board.yaml"))
     if images:
         from neurocal_cli.io.images import encode_png
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.simulation.pictures import pictures, visible_points
 
         drawn = list(pictures(scene, seed))

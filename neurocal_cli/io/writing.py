@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
-from neurocal_cli.io.outputs import held_back
+from neurocal_cli.io.outputs import Outputs, held_back
 from neurocal_cli.io.temporary_files import remove_stale, temporary_name
 
 if TYPE_CHECKING:
@@ -77,6 +77,24 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
             outputs.stage(temporary, target)
         else:
             os.replace(temporary, target)
+
+
+def make_folder(folder: str) -> None:
+    """Make a folder for outputs, and the folders that it is in; it may exist.
+
+    While a command holds its outputs back, new folders are removed again if it fails.
+
+    Raises
+    ------
+    NeurocalError
+        It cannot be made.
+    """
+    try:
+        (held_back() or Outputs()).make_folder(folder)
+    except (OSError, ValueError) as error:
+        raise NeurocalError(
+            f"{one_line(folder)}: the folder cannot be made ({reason(error)}); give another place"
+        ) from error
 
 
 def check_places(*paths: str | None) -> None:
