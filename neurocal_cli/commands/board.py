@@ -72,6 +72,8 @@ def board(
     ending = os.path.splitext(output)[1].lower()
     if ending not in _ENDINGS:
         raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
+    if ending != ".png":
+        options.refuse_unused(f"on a {ending} file, which has no pixels", "dpi")
     beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
     check_outputs((output, beside), (board,))
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size

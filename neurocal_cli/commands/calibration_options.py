@@ -75,6 +75,10 @@ class Estimation:
                 f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
                 "--trainer"
             )
+        if self.method != "neuro":
+            options.refuse_unused(f"with --method {self.method}, which has no random starts", "starts")
+            unused = options.typed("seed", *(["outliers"] if self.outliers == "reject" else []))
+            note(f"{option} has no effect with --method {self.method}" for option in unused)
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
                 raise UsageError(

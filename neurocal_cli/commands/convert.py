@@ -141,6 +141,7 @@ def convert(
     else:
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
+        options.refuse_unused("on points", "force")
         told = _write_points(points, target, output)
         if not as_json:
             say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")

@@ -128,6 +128,8 @@ def detect(
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
     check_summary(as_json, output)
+    if watch is not None:
+        options.refuse_unused("with --watch, which waits for single images", "jobs", "frames")
     compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:

@@ -16,6 +16,8 @@ from neurocal_cli.commands.threads import compute_in_one_thread
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
+_OF_POINTS = ("distortion", "training", "camera", "outliers", "no_skew", "target")
+
 _LENS = options.argument(
     "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
 )
@@ -153,6 +155,7 @@ def fit(
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
+            options.refuse_unused("on known cameras", *_OF_POINTS)
             learnt = fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
         else:
             learnt = fit_lens(

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 from click.types import FloatParamType
 
 from neurocal_cli.errors import UsageError
@@ -166,6 +167,33 @@ def _option(
 def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names an input."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
+
+
+def typed(*names: str) -> list[str]:
+    """Those of these parameters that stand on the command line, as ``--name``, their defaults included."""
+    context = click.get_current_context()
+    return [
+        option.opts[0]
+        for option in context.command.params
+        if option.name in names and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    ]
+
+
+def refuse_unused(why: str, *names: str) -> None:
+    """Refuse parameters on the command line that change nothing.
+
+    Parameters
+    ----------
+    why : str
+        The rest of the sentence "--name has no effect".
+    *names : str
+
+    Raises
+    ------
+    UsageError
+    """
+    for option in typed(*names):
+        raise UsageError(f"{option} has no effect {why}; leave it out")
 
 
 points = argument(

@@ -92,13 +92,16 @@ def rectify(
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
+    images = bool(files) and is_image(sides[0][0])
+    if not images:
+        options.refuse_unused("without images", "interpolation", "side_by_side")
     _check_folders(sides, output)
     found = _read_rig(rig)
     work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
-    if files and is_image(sides[0][0]):
+    if images:
         work.rectify_images(sides)
     elif files:
         work.rectify_points(sides)

@@ -153,6 +153,10 @@ def simulate(
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, board)
+    if rates:
+        options.refuse_unused("with --rates", "sigma", "trials", "methods", "random_starts")
+    else:
+        options.refuse_unused("without --rates", "data_sets")
     _check(rates, save, images, (camera, board, views))
     options.check_plot(plot, "-")
     check_outputs((plot,), (camera, board))

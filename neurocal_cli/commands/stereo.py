@@ -111,6 +111,9 @@ def stereo(
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
+    if left_intrinsics is not None and right_intrinsics is not None:
+        known = ("no_skew", "distortion", "image_center", *(["type"] if estimation.type == "2" else []))
+        options.refuse_unused("on cameras that are known", *known)
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
     check_plots(plots, output)
     _check_outputs(output, ros)

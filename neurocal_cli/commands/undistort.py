@@ -106,9 +106,11 @@ def undistort(
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.camera_files import read_intrinsics
-    from neurocal_cli.io.image_paths import find_images
+    from neurocal_cli.io.image_paths import find_images, is_image
 
     paths = find_images(files) if files else ()
+    if not any(map(is_image, paths)):
+        options.refuse_unused("without images", "interpolation")
     folder, outputs = places_of(paths, output)
     check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
     check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
