@@ -166,6 +166,39 @@ def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
     assert contents(tmp_path) == {"left.yaml": b"former"}
 
 
+IN_THE_WAY = {
+    "two results": ("calibrate", "flat.csv", "--html", "-"),
+    "two files of ROS": ("stereo", "stereo_left.csv", "stereo_right.csv", "-o", "x", "--ros", "-", "-"),
+    "a summary and a page": ("calibrate", "flat.csv", "--html", "-", "-o", "x.yaml", "--json"),
+    "a summary and a result": ("calibrate", "flat.csv", "-o", "/dev/stdout", "--json"),
+    "a summary and a camera": (
+        "undistort", "camera.yaml", "flat.csv", "-o", "x.csv", "--camera", "-", "--json",
+    ),
+    "overlays": ("detect", "board01.png", *BOARD, "--overlay", "-"),
+    "rectified points": ("rectify", "rig.yaml", "stereo_left.csv", "stereo_right.csv", "-o", "-"),
+    "simulated points": ("simulate", "--save", "-"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", IN_THE_WAY.values(), ids=IN_THE_WAY.keys())
+def test_standard_output_takes_one_result(
+    made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    monkeypatch.chdir(made)
+    before = contents(made)
+    result = run(*words)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "standard output" in result.stderr
+    assert contents(made) == before
+
+
+def test_a_name_that_ends_like_that_of_a_folder_is_no_file(made: Path, tmp_path: Path) -> None:
+    result = run("convert", made / "camera.yaml", "--to", "json", "-o", f"{tmp_path}/new/")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("new/: is a folder; give the name of a file\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 FOLDERS = {
     "simulate": ("simulate", "--trials", 1, "--random-starts", 0, "--jobs", 1, "--save", "new/made"),
     "undistort": ("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", "new/made"),

@@ -85,7 +85,7 @@ def calibrate(
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     estimation.check()
-    check_summary(as_json, output)
+    check_summary(as_json, output, html)
     check_one_stdin(*points, *estimation.stdin_candidates)
     options.check_camera_name(camera_name)
     check_plots(plots, output)

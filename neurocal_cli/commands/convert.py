@@ -126,7 +126,8 @@ def convert(
     check_one_stdin(*files, board)
     check_summary(as_json, output)
     check_unit(unit)
-    check_outputs((None if os.path.isdir(output) else output,), (*files, board))
+    folder = os.path.isdir(output) or output.endswith(os.sep)
+    check_outputs((None if folder else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)
     if points is None:

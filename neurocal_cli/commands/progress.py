@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
-from neurocal_cli.commands.streams import complain, is_terminal, tell_more, verbose
+from neurocal_cli.commands.streams import complain, is_terminal, refer_to, tell_more, verbose
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
 if TYPE_CHECKING:
@@ -98,5 +98,5 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
                 failed[k] = str(error)
             progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
     if len(failed) == len(items):
-        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; see the reasons above")
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {refer_to('reasons')}")
     return failed

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.places import check_folder, check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import each_of
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
@@ -87,8 +87,7 @@ def rectify(
     options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
-    if os.path.exists(output) and not os.path.isdir(output):
-        raise UsageError(f"-o {output} is a file; give a folder")
+    check_folder("-o", output)
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)

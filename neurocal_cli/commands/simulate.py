@@ -10,7 +10,7 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.places import check_folder, check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
@@ -203,8 +203,8 @@ def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...
         raise UsageError("--images needs a place to write to; give --save DIR")
     if rates and (save is not None or any(part is not None for part in scene)):
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
-    if save is not None and os.path.exists(save) and not os.path.isdir(save):
-        raise UsageError(f"--save {save} is a file; give a folder")
+    if save is not None:
+        check_folder("--save", save)
 
 
 def _scene(

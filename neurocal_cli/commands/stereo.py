@@ -107,7 +107,7 @@ def stereo(
           -o rig.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
-    check_summary(as_json, output)
+    check_summary(as_json, output, html, *(ros or ()))
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()

@@ -73,6 +73,11 @@ def complain(text: str) -> None:
         tell(one_line(text))
 
 
+def refer_to(what: str) -> str:
+    """Tell where the lines of `complain` are, which -qq leaves out."""
+    return f"see the {what} above" if _VERBOSITY.get() >= -1 else f"the {what} are shown without -qq"
+
+
 def note(texts: Iterable[str]) -> None:
     """Report how the input was treated, if the user may not expect it."""
     for text in texts:
