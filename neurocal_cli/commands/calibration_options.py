@@ -222,7 +222,7 @@ _OPTIONS = [
     options.count(
         "--starts",
         "N",
-        "Maximum number of random starts. Training ends when two of them agree.",
+        "With --method neuro: maximum number of random starts. Training ends when two of them agree.",
         default=20,
         least=2,
     ),

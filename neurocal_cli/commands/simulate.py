@@ -269,7 +269,8 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     write_points(scene.points(), os.path.join(folder, "exact.csv"))
     for k, level in enumerate(sorted(set(sigma))):
         points = scene.points(level, np.random.default_rng((seed, k, 0)))
-        write_points(points, os.path.join(folder, f"sigma_{level:g}.csv"))
+        name = str(level).removesuffix(".0")  # all digits, so that no two levels share a file
+        write_points(points, os.path.join(folder, f"sigma_{name}.csv"))
     if scene.board is not None:
         write_board(scene.board, os.path.join(folder, "board.yaml"))
     if images:
