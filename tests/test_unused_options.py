@@ -31,6 +31,7 @@ UNUSED = {
     "rectify --side-by-side": ("rectify", "rig.yaml", LEFT, RIGHT, "-o", "new", "--side-by-side"),
     "rectify --interpolation": ("rectify", "rig.yaml", "--maps", "-o", "new", "--interpolation", "linear"),
     "undistort --interpolation": ("undistort", "camera.yaml", FLAT, "--interpolation", "linear"),
+    "undistort -o": ("undistort", "camera.yaml", "--camera", "new.yaml", "-o", "new.csv"),
     "board --dpi": ("board", "-o", "new.pdf", "--dpi", 100),
     "convert --force": ("convert", FLAT, "--to", "npz", "--force"),
     "lens fit --target": ("lens", "fit", "settings.csv", "--target", "free"),
@@ -52,6 +53,15 @@ def test_an_option_that_changes_nothing_is_refused(
     assert result.exit_code == 2
     assert f"Error: {name.split()[-1]} has no effect " in result.stderr
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_board_for_points_that_have_their_places_is_said_not_to_be_used() -> None:
+    board = ("--cols", 9, "--rows", 6, "--square", 30)
+    result = run("convert", FLAT, "--to", "neurocal", *board)
+    assert result.exit_code == 0
+    assert f"note: {FLAT}: has the places of its points, so the board is not used\n" in result.stderr
+    result = run("convert", FLAT, "--to", "neurocal", "--unit", "m")
+    assert f"note: {FLAT}: is in mm, and m is not used\n" in result.stderr
 
 
 @pytest.mark.parametrize("method", ["linear", "nonlinear", "tsai"])

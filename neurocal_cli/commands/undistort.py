@@ -102,6 +102,8 @@ def undistort(
     _check_view(shape, fov, size, alpha)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
+    if not files:
+        options.refuse_unused("without FILE", "output")
     check_summary(as_json, new_camera, maps, output if files else None)
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
