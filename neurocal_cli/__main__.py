@@ -23,10 +23,25 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         from neurocal_cli.commands import neurocal
+        from neurocal_cli.commands.streams import stand_in_for_closed_stdout
 
+        stand_in_for_closed_stdout()
         neurocal(prog_name="neurocal")
     except KeyboardInterrupt:  # pressed while modules are still being loaded
-        sys.exit(130)
+        sys.exit(_interrupted())
+    finally:
+        # Python takes some ms to end, in which an interrupt would kill it whatever its exit code is.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # It also kills itself at its end if an interrupt came while a text was evaluated, as some modules do
+        # when they are loaded, even if the interrupt was handled. The next evaluation makes it forget that.
+        eval("0")
+
+
+def _interrupted() -> int:
+    """Say so where the commands cannot, and return the exit code."""
+    if sys.stderr is not None:
+        sys.stderr.write("Error: interrupted\n")
+    return 130
 
 
 if __name__ == "__main__":

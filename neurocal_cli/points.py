@@ -202,6 +202,9 @@ class Correspondences:
                     f"{', '.join(f'{x:g}' for x in values[row])}; correct or remove the row"
                 )
 
+        if 0 < max(-self.world.min(), self.world.max()) < 1 / _LARGEST:
+            raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
+
     def _check_covariance(self, covariance: Array) -> None:
         suu, suv, svv = covariance.T
         with np.errstate(over="ignore", invalid="ignore"):

@@ -246,7 +246,8 @@ def test_a_board_that_looks_the_same_turned_round_is_named(tmp_path: Path) -> No
     [
         (["-o", "target.jpg"], 2, "give a name that ends in .svg, .pdf, .png"),
         (["--cols", "9", "-o", "a.pdf"], 2, "the size of the board is missing"),
-        (["--paper", "B7", "-o", "a.pdf"], 1, "the paper 'B7' is not known"),
+        (["--unit", "inch", "-o", "a.pdf"], 2, "the size of the board is missing"),
+        (["--paper", "B7", "-o", "a.pdf"], 2, "the paper 'B7' is not known"),
         (["--cols", "9", "--rows", "6", "--square", "40", "-o", "a.pdf"], 1, "the board is 400 x 280 mm"),
         (["--cols", "9", "--rows", "6", "--square", "4", "--unit", "px", "-o", "a.pdf"], 1, "the unit 'px'"),
         (["--paper", "50x50", "-o", "a.pdf"], 1, "the paper is too small"),

@@ -171,7 +171,7 @@ def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: 
     assert len(lines) == 3
     assert all("detected 9 x 6 inner vertices, but the board has 6 x 4" in line for line in lines)
     assert told.startswith("warning: most images show 9 x 6 inner vertices, and 6 x 4 were asked for")
-    assert last == "Error: none of the 3 images shows the board; see the reason above"
+    assert last == "Error: none of the 3 images shows the board; see the reasons above"
     assert not (tmp_path / "p.csv").exists()
     assert not (tmp_path / "o").exists()
 
@@ -270,6 +270,13 @@ def test_an_image_of_another_size_is_left_out_and_two_sizes_alike_are_refused(
     assert result.exit_code == 1
     assert "the image large has 420 x 310 px but board01 has 400 x 300 px" in result.stderr
     assert not (tmp_path / "q.csv").exists()
+
+
+@pytest.mark.parametrize("quiet", [[], ["-q"], ["-qq"]])
+def test_the_reason_of_a_single_image_is_the_error(tmp_path: Path, quiet: list[str]) -> None:
+    result = run(*quiet, "detect", tmp_path / "none.png", *BOARD)
+    assert result.exit_code == 1
+    assert result.stderr == f"Error: {tmp_path}/none.png: there is no such file; check the path\n"
 
 
 def test_an_image_comes_from_stdin(folder: Path) -> None:

@@ -1,12 +1,15 @@
 """No command writes over what it reads, and of several outputs all are written or none."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from support.command_line import run
+
+from neurocal_cli.io.outputs import Outputs
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 
@@ -96,6 +99,25 @@ def test_closed_standard_output_is_said_to_be_closed(made: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "Error: stdout is closed; give a file\n")
 
 
+@pytest.mark.parametrize(
+    "words", ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"]
+)
+def test_nor_is_what_is_only_printed_lost_without_a_word(made: Path, words: str) -> None:
+    shell = f"{sys.executable} -m neurocal_cli {words} >&-"
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, cwd=made, check=False)
+    assert (done.returncode, done.stderr) == (1, "Error: stdout is closed; give a file\n")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_error_does_not_cost_the_result(made: Path) -> None:
+    words = [sys.executable, "-m", "neurocal_cli", "convert", "camera.yaml", "--to", "json"]
+    whole = subprocess.run(words, capture_output=True, cwd=made, check=True)
+    assert whole.stderr  # there is something to say
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(words, stdout=subprocess.PIPE, stderr=full, cwd=made, check=False)
+    assert (done.returncode, done.stdout) == (0, whole.stdout)
+
+
 INCOMPLETE = {
     "undistort": ("undistort", "camera.yaml", "flat.csv", "-o", "us.csv", "--camera", "zz/c.yaml"),
     "calibrate": ("calibrate", "flat.csv", "--plot", "p.png", "-o", "zz/x.yaml"),
@@ -142,6 +164,82 @@ def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
     result = run("stereo", left, right, *quick, "-o", rig, "--ros", ros, tmp_path / "right.yaml")
     assert result.exit_code == 1
     assert contents(tmp_path) == {"left.yaml": b"former"}
+
+
+IN_THE_WAY = {
+    "two results": ("calibrate", "flat.csv", "--html", "-"),
+    "two files of ROS": ("stereo", "stereo_left.csv", "stereo_right.csv", "-o", "x", "--ros", "-", "-"),
+    "a summary and a page": ("calibrate", "flat.csv", "--html", "-", "-o", "x.yaml", "--json"),
+    "a summary and a result": ("calibrate", "flat.csv", "-o", "/dev/stdout", "--json"),
+    "a summary and a camera": (
+        "undistort", "camera.yaml", "flat.csv", "-o", "x.csv", "--camera", "-", "--json",
+    ),
+    "overlays": ("detect", "board01.png", *BOARD, "--overlay", "-"),
+    "rectified points": ("rectify", "rig.yaml", "stereo_left.csv", "stereo_right.csv", "-o", "-"),
+    "simulated points": ("simulate", "--save", "-"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", IN_THE_WAY.values(), ids=IN_THE_WAY.keys())
+def test_standard_output_takes_one_result(
+    made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    monkeypatch.chdir(made)
+    before = contents(made)
+    result = run(*words)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "standard output" in result.stderr
+    assert contents(made) == before
+
+
+def test_a_name_that_ends_like_that_of_a_folder_is_no_file(made: Path, tmp_path: Path) -> None:
+    result = run("convert", made / "camera.yaml", "--to", "json", "-o", f"{tmp_path}/new/")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("new/: is a folder; give the name of a file\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+FOLDERS = {
+    "simulate": ("simulate", "--trials", 1, "--random-starts", 0, "--jobs", 1, "--save", "new/made"),
+    "undistort": ("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", "new/made"),
+    "rectify": ("rectify", "rig.yaml", "stereo_left.csv", "stereo_right.csv", "-o", "new/../new/made"),
+    "detect": ("detect", "board01.png", *BOARD, "--overlay", "new/made", "-o", "p.csv"),
+    "convert": ("convert", "rig.yaml", "--to", "colmap", "-o", "new"),
+}
+
+
+@pytest.mark.parametrize("words", FOLDERS.values(), ids=FOLDERS.keys())
+def test_an_interrupt_leaves_no_new_folder(
+    made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    def interrupt(outputs: Outputs) -> list[bytes]:
+        assert (made / "new").is_dir()
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(made)
+    before = sorted(made.rglob("*"))
+    monkeypatch.setattr(Outputs, "commit", interrupt)
+    result = run(*words)
+    assert result.exit_code == 130
+    assert result.stderr.endswith("Error: interrupted\n")
+    assert sorted(made.rglob("*")) == before
+
+
+def test_an_interrupt_while_results_get_their_names_comes_too_late(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move = os.replace
+
+    def interrupted_move(temporary: str, target: str) -> None:
+        move(temporary, target)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("os.replace", interrupted_move)
+    monkeypatch.chdir(made)
+    result = run("undistort", "camera.yaml", "flat.csv", "stereo_left.csv", "-o", tmp_path / "new")
+    assert result.exit_code == 0
+    assert len(list((tmp_path / "new").iterdir())) == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_two_outputs_in_one_place_are_refused(made: Path, tmp_path: Path) -> None:

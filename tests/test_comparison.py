@@ -136,6 +136,14 @@ def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: 
     assert "as printed" in text.stdout
 
 
+def test_levels_of_noise_that_are_nearly_alike_are_saved_apart(tmp_path: Path) -> None:
+    words = ("--trials", 1, "--random-starts", 0, "--methods", "linear", "--sigma", 1, 0.1, 0.1000001)
+    assert run("simulate", *words, "--save", tmp_path).exit_code == 0
+    assert {path.name for path in tmp_path.glob("sigma*")} == {
+        "sigma_1.csv", "sigma_0.1.csv", "sigma_0.1000001.csv"
+    }  # fmt: skip
+
+
 def test_what_simulate_saves_can_be_calibrated_and_detected(tmp_path: Path) -> None:
     folder = tmp_path / "made"
     words = ["--trials", "1", "--sigma", "0.2", "--random-starts", "0", "--jobs", "1", "--methods", "linear"]

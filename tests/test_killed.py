@@ -61,7 +61,7 @@ def test_workers_end_with_a_detection_that_is_killed(tmp_path: Path, how: signal
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no /proc to see processes in")
 def test_an_interrupt_while_workers_start_is_told_in_one_line(tmp_path: Path) -> None:
     picture = (SAMPLES / "board01.png").read_bytes()
-    for k in range(20):
+    for k in range(200):  # so many that the work is not done before the interrupt, however late it comes
         (tmp_path / f"{k}.png").write_bytes(picture)
     words = ["detect", str(tmp_path), "--cols", "9", "--rows", "6", "--square", "25", "--jobs", "2"]
     command = [sys.executable, "-m", "neurocal_cli", "-qq", *words, "-o", os.devnull]
@@ -75,3 +75,26 @@ def test_an_interrupt_while_workers_start_is_told_in_one_line(tmp_path: Path) ->
         _, told = process.communicate(timeout=60)
     assert process.returncode == 130
     assert told == b"Error: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "told"),
+    [
+        ("raise KeyboardInterrupt", 130, "Error: interrupted\n"),
+        ("eval('[].pop(*map(signal.raise_signal, [signal.SIGINT]))')", 130, "Error: interrupted\n"),
+        ("atexit.register(signal.raise_signal, signal.SIGINT)", 0, ""),
+    ],
+    ids=["while modules are loaded", "while a module evaluates a text", "while Python ends"],
+)
+def test_an_interrupt_is_no_death_by_signal(command: str, code: int, told: str) -> None:
+    lines = (
+        "import atexit, signal",
+        "from neurocal_cli import __main__, commands",
+        f"def neurocal(prog_name): {command}",
+        "commands.neurocal = neurocal",
+        "__main__.main()",
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (code, told)

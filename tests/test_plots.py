@@ -125,3 +125,12 @@ def test_the_commands_draw_a_page_and_single_panels(tmp_path: Path) -> None:
     same = ["--plot", tmp_path / "a.png", "--plot", f"views={tmp_path / 'a.png'}"]
     assert run("calibrate", tmp_path / "points.csv", *same).exit_code == 2
     assert not (tmp_path / "a.png").exists()
+
+
+def test_a_panel_that_does_not_exist_is_no_part_of_a_file_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run("evaluate", "camera", "camera.yaml", "--plot", "pose=x.png")
+    assert result.exit_code == 2
+    assert "there is no panel 'pose'; choose from residuals, " in result.stderr

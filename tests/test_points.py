@@ -63,6 +63,7 @@ def test_lists_are_taken_and_arrays_are_copied_and_read_only() -> None:
         ({"point": ["a"] * 7}, "point needs one entry"),
         ({"world": with_value(WORLD, np.nan)}, "row 4: X,Y,Z must be finite numbers .* nan"),
         ({"world": with_value(WORLD, -np.inf)}, "row 4: X,Y,Z"),
+        ({"world": 1e-300 * WORLD}, "X,Y,Z are too small"),
         ({"pixels": with_value(PIXELS, 1e308)}, "row 4: u,v must be .* of a sensible size"),
         ({"pixels": with_value(PIXELS, np.nan)}, "row 4: u,v"),
         ({"image_size": (0, 480)}, "positive whole"),

@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.streams import TYPED, one_line, set_verbosity
+from neurocal_cli.commands.streams import TYPED, one_line, set_verbosity, tell
 from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
@@ -111,7 +111,7 @@ def _one_line_errors() -> Iterator[None]:
         if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
             raise
         message, exit_code = _explain(error), 1
-    click.echo(f"Error: {one_line(message)}", err=True)
+    tell(f"Error: {one_line(message)}")
     raise click.exceptions.Exit(exit_code)
 
 

@@ -58,12 +58,13 @@ def given_board(
     Raises
     ------
     UsageError
-        A file and numbers are given, or only some of the numbers.
+        A file and numbers are given, or only some of the numbers, or a unit that no file can hold.
     FormatError
         The file is not a board file.
     """
     from neurocal_cli.board import Board
 
+    check_unit(unit)
     numbers = (cols, rows, square)
     if path is not None:
         if numbers != (None, None, None) or unit is not None:
@@ -73,10 +74,21 @@ def given_board(
         from neurocal_cli.io.board_yaml import read_board
 
         return read_board(path)
-    if numbers == (None, None, None):
+    if numbers == (None, None, None) and unit is None:
         return None
     if cols is None or rows is None or square is None:
         raise UsageError(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
     return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+
+def check_unit(unit: str | None) -> None:
+    """Refuse a unit that cannot be stored in a file.
+
+    Raises
+    ------
+    UsageError
+    """
+    if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+        raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")

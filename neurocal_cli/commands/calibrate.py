@@ -7,10 +7,15 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.preparation import (
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
 from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -76,7 +81,7 @@ def calibrate(
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     estimation.check()
-    check_summary(as_json, output)
+    check_summary(as_json, output, html)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_one_stdin(*inputs)
     options.check_camera_name(camera_name)

@@ -70,6 +70,9 @@ class Estimation:
                 f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
                 "--trainer"
             )
+        if self.method != "neuro":
+            unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
+            options.note_unused(f"with --method {self.method}", *unused)
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
                 raise UsageError(
@@ -213,7 +216,7 @@ _OPTIONS = [
     options.count(
         "--starts",
         "N",
-        "Maximum number of random starts. Training ends when two of them agree.",
+        "With --method neuro: maximum number of random starts. Training ends when two of them agree.",
         default=20,
         least=2,
     ),

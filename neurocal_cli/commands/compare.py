@@ -7,8 +7,8 @@ from dataclasses import replace
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, compute_in_one_thread
 from neurocal_cli.commands.given_camera import given_points
+from neurocal_cli.commands.preparation import check_one_stdin, compute_in_one_thread
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 
 

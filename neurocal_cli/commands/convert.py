@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary
-from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.board_options import board_options, check_unit, given_board
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
@@ -124,7 +124,9 @@ def convert(
     """  # noqa: D301 - as in the group
     check_one_stdin(*files, board)
     check_summary(as_json, output)
-    check_outputs((None if os.path.isdir(output) else output,), (*files, board))
+    check_unit(unit)
+    folder = os.path.isdir(output) or output.endswith(os.sep)
+    check_outputs((None if folder else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)
     if points is None:
@@ -139,6 +141,7 @@ def convert(
     else:
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
+        options.note_unused("on points", "force")
         told = _write_points(points, target, output)
         if not as_json:
             say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
@@ -232,14 +235,14 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
-    from neurocal_cli.io.writing import check_places, write_whole
+    from neurocal_cli.io.writing import check_places, make_folder, write_whole
 
     if set(contents) == {""}:
         write_whole(output, contents[""])
         return
     if output == "-" or (os.path.exists(output) and not os.path.isdir(output)):
         raise UsageError(f"--to {target} writes {len(contents)} files here; give a folder, -o DIR")
-    os.makedirs(output, exist_ok=True)
+    make_folder(output)
     places = {os.path.join(output, name): text for name, text in contents.items()}
     check_places(*places)
     for place, text in places.items():

@@ -11,15 +11,22 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.preparation import (
+    check_folder,
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
     note,
     one_line,
     print_summary,
+    refer_to,
     say,
     some_of,
     warn,
@@ -134,6 +141,8 @@ def detect(
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
     check_summary(as_json, output)
+    if watch is not None:
+        options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:
@@ -171,7 +180,7 @@ def _wanted(
     kind = cast("Points", points)
     known = None
     if cache is not None:
-        _check_folder("--cache", cache)
+        check_folder("--cache", cache)
         known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
@@ -234,26 +243,17 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
 
 
-def _check_folder(option: str, folder: str) -> None:
-    if os.path.exists(folder) and not os.path.isdir(folder):
-        raise UsageError(f"{option} {folder} is a file; give a folder")
-    parent = os.path.realpath(folder)
-    while not os.path.exists(parent):
-        parent = os.path.dirname(parent)
-    if not (os.path.isdir(parent) and os.access(parent, os.W_OK)):
-        raise NeurocalError(f"{option} {folder}: the folder cannot be made; give another place")
-
-
 def _check_overlay(folder: str, paths: Sequence[str]) -> None:
-    _check_folder("--overlay", folder)
+    check_folder("--overlay", folder)
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
 def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
     """Report failed images with the reason, and remarks common to several images once."""
+    single = len(outcomes) == 1
     for _, outcome in outcomes:
-        if outcome.problem:
+        if outcome.problem and not single:
             complain(outcome.problem)
     remarks: dict[str, list[str]] = {}
     for name, outcome in outcomes:
@@ -264,10 +264,11 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
     warn(_another_board([outcome.shown for _, outcome in outcomes], board))
     if not found:
-        what = (
-            "the image does not show" if len(outcomes) == 1 else f"none of the {len(outcomes)} images shows"
+        raise NeurocalError(
+            outcomes[0][1].problem
+            if single
+            else f"none of the {len(outcomes)} images shows the board; {refer_to('reasons')}"
         )
-        raise NeurocalError(f"{what} the board; see the reason above")
     if as_json:
         print_summary(_summary(outcomes))
         return
@@ -304,12 +305,12 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
 def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import write_whole
+    from neurocal_cli.io.writing import make_folder, write_whole
 
     found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
     text = format_points(replace(gather(found, board.unit), distances=board.distances))
     if overlay is not None:
-        os.makedirs(overlay, exist_ok=True)
+        make_folder(overlay)
         for name, outcome in outcomes:
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs
 from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
 from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS

@@ -7,11 +7,18 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary, compute_in_one_thread
 from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.preparation import (
+    check_one_stdin,
+    check_outputs,
+    check_summary,
+    compute_in_one_thread,
+)
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
 _MOST_UNITS = 20
+
+_OF_POINTS = ("distortion", "training", "camera", "outliers", "no_skew", "target")
 
 _LENS = options.argument(
     "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
@@ -148,6 +155,7 @@ def fit(
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
+            options.note_unused("on known cameras", *_OF_POINTS)
             learnt = fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
         else:
             learnt = fit_lens(

@@ -67,9 +67,9 @@ def man(ctx: click.Context, directory: str) -> None:
     Examples:
       neurocal man man
     """  # noqa: D301 - as in the group
-    from neurocal_cli.io.writing import write_whole
+    from neurocal_cli.io.writing import make_folder, write_whole
 
-    os.makedirs(directory, exist_ok=True)
+    make_folder(directory)
     for name, page in man_pages(ctx.find_root().command).items():
         write_whole(os.path.join(directory, name), page)
 

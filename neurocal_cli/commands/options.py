@@ -11,17 +11,31 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 from click.types import FloatParamType
 
+from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 
 _PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Whether a file can be read or written is checked by the code that does so: exit code 1, not wrong usage.
-PATH = click.Path(readable=False, allow_dash=True)
 
+class _Place(click.Path):
+    """A file or folder, whose name is not empty, as that of a variable is that the shell does not know.
+
+    Whether it can be read or written is checked by the code that does so: exit code 1, not wrong usage.
+    """
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Take a name, or fail as click does."""
+        if not value:
+            self.fail("the name is empty.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _Place(readable=False, allow_dash=True)
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `comparison.by_method`, which a test compares."""
@@ -154,6 +168,28 @@ def _option(
 def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names an input."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
+
+
+def typed(*names: str) -> list[str]:
+    """Those of these parameters that stand on the command line, as ``--name``, their defaults included."""
+    context = click.get_current_context()
+    return [
+        option.opts[0]
+        for option in context.command.params
+        if option.name in names and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE
+    ]
+
+
+def note_unused(why: str, *names: str) -> None:
+    """Say which parameters on the command line change nothing.
+
+    Parameters
+    ----------
+    why : str
+        The rest of the sentence "--name has no effect".
+    *names : str
+    """
+    note(f"{option} has no effect {why}" for option in typed(*names))
 
 
 points = argument(

@@ -27,6 +27,11 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
 
     def _parsed(word: str) -> tuple[str | None, str]:
         panel, equals, file = word.partition("=")
+        if equals and panel.isalpha() and panel not in panels:
+            raise click.BadParameter(
+                f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a file "
+                "of this name"
+            )
         return (panel, file) if equals and panel in panels else (None, word)
 
     return click.option(

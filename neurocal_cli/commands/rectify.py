@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs
+from neurocal_cli.commands.preparation import check_folder, check_one_stdin, check_outputs
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
@@ -85,18 +85,20 @@ def rectify(
     options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
-    if os.path.exists(output) and not os.path.isdir(output):
-        raise UsageError(f"-o {output} is a file; give a folder")
+    check_folder("-o", output)
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
+    images = bool(files) and is_image(sides[0][0])
+    if not images:
+        options.note_unused("without images", "interpolation", "side_by_side")
     _check_folders(sides, output)
     found = _read_rig(rig)
     work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
-    if files and is_image(sides[0][0]):
+    if images:
         work.rectify_images(sides)
     elif files:
         work.rectify_points(sides)
@@ -268,8 +270,8 @@ class _Work:
             say(text)
 
     def _write(self, name: str, content: str | bytes) -> None:
-        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.io.writing import make_folder, write_whole
 
         place = os.path.join(self.output, name)
-        os.makedirs(os.path.dirname(place), exist_ok=True)
+        make_folder(os.path.dirname(place))
         write_whole(place, content)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_outputs
+from neurocal_cli.commands.preparation import check_outputs
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 

@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, compute_in_one_thread
 from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.preparation import (
+    check_folder,
+    check_one_stdin,
+    check_outputs,
+    compute_in_one_thread,
+)
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -151,6 +156,10 @@ def simulate(
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, board)
+    if rates:
+        options.note_unused("with --rates", "sigma", "trials", "methods", "random_starts")
+    else:
+        options.note_unused("without --rates", "data_sets")
     _check(rates, save, images, (camera, board, views))
     options.check_plot(plot, "-")
     check_outputs((plot,), (camera, board))
@@ -197,8 +206,8 @@ def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...
         raise UsageError("--images needs a place to write to; give --save DIR")
     if rates and (save is not None or any(part is not None for part in scene)):
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
-    if save is not None and os.path.exists(save) and not os.path.isdir(save):
-        raise UsageError(f"--save {save} is a file; give a folder")
+    if save is not None:
+        check_folder("--save", save)
 
 
 def _scene(
@@ -255,19 +264,20 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.points_csv import write_points
+    from neurocal_cli.io.writing import make_folder, write_whole
     from neurocal_cli.simulation.scenes import true_calibration
 
-    os.makedirs(folder, exist_ok=True)
+    make_folder(folder)
     write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))
     write_points(scene.points(), os.path.join(folder, "exact.csv"))
     for k, level in enumerate(sorted(set(sigma))):
         points = scene.points(level, np.random.default_rng((seed, k, 0)))
-        write_points(points, os.path.join(folder, f"sigma_{level:g}.csv"))
+        name = str(level).removesuffix(".0")  # all digits, so that no two levels share a file
+        write_points(points, os.path.join(folder, f"sigma_{name}.csv"))
     if scene.board is not None:
         write_board(scene.board, os.path.join(folder, "board.yaml"))
     if images:
         from neurocal_cli.io.images import encode_png
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.simulation.pictures import pictures, visible_points
 
         drawn = list(pictures(scene, seed))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -28,6 +29,25 @@ _PATIENCE = 0.5  # seconds after which the bar appears
 _WIDEST = 10_000  # characters; no table is wider
 
 
+class _ClosedOutput(io.RawIOBase):
+    """A standard output that the shell has closed: nothing can be written to it."""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object) -> int:
+        raise NeurocalError("stdout is closed; give a file")
+
+
+def stand_in_for_closed_stdout() -> None:
+    """Make it an error to print when the shell has closed standard output (``>&-``).
+
+    Python then has no such stream, and click prints nothing without a word.
+    """
+    if sys.stdout is None:
+        sys.stdout = io.TextIOWrapper(_ClosedOutput(), encoding="utf-8", write_through=True)
+
+
 def set_verbosity(level: int) -> None:
     """Set the verbosity until the end of this command."""
     _VERBOSITY.set(level)
@@ -44,16 +64,27 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
+def tell(text: str) -> None:
+    """Show a text on stderr. A full or closed stderr must not cost the user the result."""
+    with suppress(OSError):
+        click.echo(text, err=True)
+
+
 def say(text: str) -> None:
     """Show a text that is not a result, unless the user gave --quiet."""
     if _VERBOSITY.get() >= 0:
-        click.echo(text, err=True)
+        tell(text)
 
 
 def complain(text: str) -> None:
     """Report on one line what is wrong with a part of the input."""
     if _VERBOSITY.get() >= -1:
-        click.echo(one_line(text), err=True)
+        tell(one_line(text))
+
+
+def refer_to(what: str) -> str:
+    """Tell where the lines of `complain` are, which -qq leaves out."""
+    return f"see the {what} above" if _VERBOSITY.get() >= -1 else f"the {what} are shown without -qq"
 
 
 def note(texts: Iterable[str]) -> None:
@@ -71,7 +102,7 @@ def warn(texts: Iterable[str]) -> None:
 def tell_more(text: str) -> None:
     """Report progress if the user gave --verbose."""
     if verbose():
-        click.echo(one_line(text), err=True)
+        tell(one_line(text))
 
 
 def conclude(
@@ -180,7 +211,7 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
                 failed[k] = str(error)
             progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
     if len(failed) == len(items):
-        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; see the reasons above")
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {refer_to('reasons')}")
     return failed
 
 

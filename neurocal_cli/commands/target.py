@@ -7,8 +7,8 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_outputs, check_summary
 from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.preparation import check_outputs, check_summary
 from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.errors import InputError
 

@@ -10,7 +10,7 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.before import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import is_terminal, print_summary, say
 from neurocal_cli.errors import UsageError
 
@@ -104,13 +104,17 @@ def undistort(
     _check_view(shape, fov, size, alpha)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
-    check_summary(as_json and bool(files), output)
+    if not files and options.typed("output"):
+        raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
+    check_summary(as_json, new_camera, maps, output if files else None)
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.exchange.reading import read_intrinsics
-    from neurocal_cli.io.image_paths import find_images
+    from neurocal_cli.io.image_paths import find_images, is_image
 
     paths = find_images(files) if files else ()
+    if not any(map(is_image, paths)):
+        options.note_unused("without images", "interpolation")
     folder, outputs = _places_of(paths, output)
     _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
     check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))

@@ -13,7 +13,7 @@ from neurocal_cli.distortion.panorama import Panorama
 from neurocal_cli.distortion.undistorted_view import Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
@@ -142,7 +142,7 @@ class Undistorting:
         path, output = place
         content = self._image(path, output) if is_image(path) else self._points(path)
         if self.folder is not None:
-            os.makedirs(self.folder, exist_ok=True)
+            make_folder(self.folder)
         write_whole(output, content)
 
     def _image(self, path: str, output: str) -> bytes:

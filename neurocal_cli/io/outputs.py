@@ -1,9 +1,10 @@
 """Write either all outputs of a command or none, and never overwrite a file that it reads.
 
 Within `all_or_none` every file is written to a temporary file in its folder, and all are moved to their
-places at the end. Files are identified by device and inode, not by name, because links lead to the same file.
-The name of a temporary file contains the computer and the process that created it. If that process of this
-computer has ended, the next process that writes to the same folder removes the file.
+places at the end. Folders that are made for them are removed if the command fails. Files are identified by
+device and inode, not by name, because links lead to the same file. The name of a temporary file contains the
+computer and the process that created it. If that process of this computer has ended, the next process that
+writes to the same folder removes the file.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import signal
 import sys
 from binascii import crc32
 from collections.abc import Iterable, Iterator
@@ -30,6 +32,7 @@ class Outputs:
     def __init__(self) -> None:
         self._inputs: set[_Identity] = set()
         self._staged: list[tuple[str, str]] = []
+        self._folders: list[str] = []
         self._stdout: list[bytes] = []
 
     def protect(self, *paths: str | None) -> None:
@@ -58,25 +61,44 @@ class Outputs:
         """Move a temporary file to its target at the end."""
         self._staged.append((temporary, target))
 
+    def make_folder(self, folder: str) -> None:
+        """Make a folder, and the folders that it is in; those that are new are removed again by `discard`."""
+        folder = os.path.realpath(folder)
+        if os.path.isdir(folder):
+            return
+        if not os.path.exists(os.path.dirname(folder)):
+            self.make_folder(os.path.dirname(folder))
+        self._folders.append(folder)
+        try:
+            os.mkdir(folder)
+        except FileExistsError:
+            if not os.path.isdir(folder):  # another process may have made it meanwhile
+                raise
+
     def hold(self, data: bytes) -> None:
         """Write data to stdout at the end."""
         self._stdout.append(data)
 
     def commit(self) -> list[bytes]:
         """Move all files to their targets, and return the data for stdout."""
-        while self._staged:
-            temporary, target = self._staged[0]
-            os.replace(temporary, target)
-            del self._staged[0]
+        with _undisturbed():
+            while self._staged:
+                temporary, target = self._staged[0]
+                os.replace(temporary, target)
+                del self._staged[0]
+        self._folders = []
         held, self._stdout = self._stdout, []
         return held
 
     def discard(self) -> None:
-        """Remove the temporary files, and leave the targets unchanged."""
+        """Remove the temporary files and the new folders, and leave the targets unchanged."""
         for temporary, _ in self._staged:
             with suppress(OSError):
                 os.unlink(temporary)
-        self._staged, self._stdout = [], []
+        for folder in reversed(self._folders):
+            with suppress(OSError):  # another program has put something into it
+                os.rmdir(folder)
+        self._staged, self._folders, self._stdout = [], [], []
 
 
 _CURRENT: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
@@ -116,6 +138,20 @@ def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outpu
         _finish(outputs)
     finally:
         _CURRENT.reset(token)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore interrupts for the moment in which the results get their names."""
+    former = {}
+    try:
+        with suppress(ValueError):  # in a thread, which interrupts do not reach
+            for number in (signal.SIGINT, signal.SIGTERM):
+                former[number] = signal.signal(number, signal.SIG_IGN)
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 def _finish(outputs: Outputs) -> None:

@@ -15,13 +15,13 @@ from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
-from neurocal_cli.io.outputs import held_back, remove_stale, temporary_name
+from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_name
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
-_STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
+STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
@@ -45,7 +45,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         commands then end quietly.
     """
     data, outputs = _encode(content), held_back()
-    if outputs is not None and str(path) in _STDOUT_NAMES:
+    if outputs is not None and str(path) in STDOUT_NAMES:
         outputs.hold(data)
     else:
         write_chunks(path, [data])
@@ -56,7 +56,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
 
     Data already written to stdout or a pipe cannot be taken back.
     """
-    if str(path) in _STDOUT_NAMES:
+    if str(path) in STDOUT_NAMES:
         for chunk in chunks:
             write_stdout(_encode(chunk))
         return
@@ -78,24 +78,47 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
             os.replace(temporary, target)
 
 
+def make_folder(folder: str) -> None:
+    """Make a folder for outputs, and the folders that it is in; it may exist.
+
+    While a command holds its outputs back, new folders are removed again if it fails.
+
+    Raises
+    ------
+    NeurocalError
+        It cannot be made.
+    """
+    try:
+        (held_back() or Outputs()).make_folder(folder)
+    except (OSError, ValueError) as error:
+        raise NeurocalError(
+            f"{one_line(folder)}: the folder cannot be made ({reason(error)}); give another place"
+        ) from error
+
+
 def check_places(*paths: str | None) -> None:
     """Refuse outputs that cannot be written, before any work is done.
 
     Parameters
     ----------
     paths : str or None
-        None and ``-`` are not checked.
+        None is left out.
 
     Raises
     ------
     UsageError
-        An output is an input of the command (`Outputs.protect`), or two outputs are the same file.
+        An output is an input of the command (`Outputs.protect`), or two outputs are the same file or stdout.
     NeurocalError
         A folder does not exist or may not be written to.
     """
     outputs, taken = held_back(), set[str]()
     for path in paths:
-        if path is None or path in _STDOUT_NAMES:
+        if path is None:
+            continue
+        if path in STDOUT_NAMES:
+            if "-" in taken:
+                raise UsageError("two results would go to standard output; give files")
+            taken.add("-")
             continue
         with _writing_failures(path):
             former, target = _status(path), os.path.realpath(path)
@@ -111,7 +134,7 @@ def check_places(*paths: str | None) -> None:
 
 def _check_place(path: str | Path, former: os.stat_result | None) -> None:
     folder = os.path.dirname(os.path.realpath(path))
-    if former is not None and stat.S_ISDIR(former.st_mode):
+    if str(path).endswith(os.sep) or (former is not None and stat.S_ISDIR(former.st_mode)):
         raise IsADirectoryError(errno.EISDIR, "is a folder")
     if not os.path.isdir(folder):
         raise FileNotFoundError(errno.ENOENT, "no such folder")

@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from neurocal_cli.board import Board
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.printing.unfolding import Laid, unfolded
@@ -104,7 +104,7 @@ def paper_size(name: str) -> tuple[float, float]:
 
     Raises
     ------
-    InputError
+    UsageError
         No such paper.
     """
     for known, size in PAPERS.items():
@@ -113,7 +113,7 @@ def paper_size(name: str) -> tuple[float, float]:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", name)
     if match and all(20 <= float(side) <= 5000 for side in match.groups()):
         return float(match[1]), float(match[2])
-    raise InputError(
+    raise UsageError(
         f"the paper {name[:20]!r} is not known; use {', '.join(PAPERS)}, or its size in mm such as 420x297"
     )
 

@@ -96,7 +96,12 @@ def read_corners(
     if _NUMBERS.match(text):
         return _separate(names, board, unit)
     if _TABLE.match(text):
-        return read_points(names, notes=notes)
+        points = read_points(names, notes=notes)
+        if board is not None:
+            notes.append(f"{source}: has the places of its points, so the board is not used")
+        elif unit not in (None, points.unit):
+            notes.append(f"{source}: is in {points.unit}, and {unit} is not used")
+        return points
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
     if named or text.lstrip()[:1] in ("{", "<", "%"):
         return _dictionary(parse_tree(text, source), board, unit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import NeurocalError, UsageError
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
@@ -27,15 +27,43 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     check_places(*outputs)
 
 
+def check_folder(option: str, folder: str) -> None:
+    """Refuse a folder that cannot be made or written to.
+
+    Raises
+    ------
+    UsageError
+        It is standard output or a file.
+    NeurocalError
+        It cannot be made.
+    """
+    if folder == "-":
+        raise UsageError(f"{option} writes files, which cannot go to standard output; give a folder")
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise UsageError(f"{option} {folder} is a file; give a folder")
+    parent = os.path.realpath(folder)
+    while not os.path.exists(parent):
+        parent = os.path.dirname(parent)
+    if not (os.path.isdir(parent) and os.access(parent, os.W_OK)):
+        raise NeurocalError(f"{option} {folder}: the folder cannot be made; give another place")
+
+
 def check_one_stdin(*names: str | None) -> None:
     """Refuse a request to read standard input twice."""
     if names.count("-") > 1:
         raise UsageError("standard input (-) can be read only once; give the other inputs as files")
 
 
-def check_summary(as_json: bool, output: str) -> None:
-    """Refuse two results on one stream, with a UsageError."""
-    if as_json and output == "-":
+def check_summary(as_json: bool, *outputs: str | None) -> None:
+    """Refuse a summary and a result on one stream.
+
+    Raises
+    ------
+    UsageError
+    """
+    from neurocal_cli.io.writing import STDOUT_NAMES
+
+    if as_json and not STDOUT_NAMES.isdisjoint(outputs):
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
 
 
