@@ -23,7 +23,7 @@ from neurocal_cli.stereo.depth_uncertainty import depth_std
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.pair_covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
-from neurocal_cli.stereo.problem import estimated_parameters, rig_problem
+from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.rules import reach_rig_verdict
@@ -54,9 +54,8 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
     """
     pairs = (*rig.pairs, *rig.left_out)
     problem = rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ()))
-    free = estimated_parameters(rig.left), estimated_parameters(rig.right)
     cameras = assess(rig.left), assess(rig.right)
-    poses = relative_poses(problem, free, rig.pose)
+    poses = relative_poses(problem, rig.pose)
     nan = float("nan")
     if poses is None:
         return RigEvidence(cameras, pairs, np.zeros(0), None, None, nan, nan, nan, nan)

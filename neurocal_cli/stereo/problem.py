@@ -37,6 +37,8 @@ class RigProblem:
 
     Attributes
     ----------
+    calibrations : two of Calibration
+        Each camera alone.
     names : two tuples of str
         Views of each camera, in the order of its observations.
     frames : Frames
@@ -58,6 +60,7 @@ class RigProblem:
     flat : (P,) bool array
     """
 
+    calibrations: tuple[Calibration, Calibration]
     names: tuple[tuple[str, ...], tuple[str, ...]]
     frames: Frames
     observations: tuple[Observations, Observations]
@@ -68,6 +71,12 @@ class RigProblem:
     spread: Array
     axes: Array
     flat: NDArray[np.bool_]
+
+    @property
+    def estimated(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """`estimated_parameters` of the left and of the right camera."""
+        left, right = self.calibrations
+        return estimated_parameters(left), estimated_parameters(right)
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -144,7 +153,7 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     paired_right = np.flatnonzero(through[frame] & (frame < n_left))
     paired = frame[paired_right]
     return RigProblem(
-        names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]),
+        (left, right), names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]),
         (normals[0], normals[1]), paired, paired_right, _spread(arranged[0], paired),
         arranged[0].basis[paired], arranged[0].nearly_flat[paired],
     )  # fmt: skip

@@ -115,17 +115,13 @@ class RelativePoses:
         return np.asarray(solve_scaled(S, g[:, None])[:, 0])
 
 
-def relative_poses(
-    problem: RigProblem, free: tuple[NDArray[np.bool_], NDArray[np.bool_]], reference: Pose
-) -> RelativePoses | None:
+def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None:
     """Relative poses of all pairs of a problem.
 
     Parameters
     ----------
     problem : RigProblem
         The cameras need not be at their own minimum; one step leads there.
-    free : two of (5 + K,) bool array
-        Which of A's entries and the distortion coefficients were estimated from the points.
     reference : Pose
         A rig near those of most pairs.
 
@@ -134,6 +130,7 @@ def relative_poses(
     RelativePoses or None
         None if a view does not determine its pose.
     """
+    free = problem.estimated
     sides = [_Alone(problem, side, free[side]) for side in (0, 1)]
     if not all(side.determined for side in sides):
         return None
