@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,13 +11,12 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.evaluation import StereoEvaluation, evaluate_stereo
 
 _FOLDS = 5
-
-Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)

@@ -20,13 +20,12 @@ from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
 from neurocal_cli.stereo.depth_uncertainty import depth_std
-from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.pair_covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.rules import reach_rig_verdict
+from neurocal_cli.stereo.rules import RigEvidence, reach_rig_verdict
 from neurocal_cli.stereo.sound_pairs import MOVED
 from neurocal_cli.verdict.assessment import assess
 

@@ -57,15 +57,14 @@ from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
-from neurocal_cli.verdict.noise_shape import noise_shape
+from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
+from neurocal_cli.verdict.pixel_values import repeated_views
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
     projection_uncertainty,
 )
-from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import reach_verdict
-from neurocal_cli.verdict.stated_noise import stated_noise, stated_survey
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 

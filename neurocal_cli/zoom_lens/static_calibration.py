@@ -7,8 +7,6 @@ smallest error that any model of the local parameters can reach at the settings.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +14,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
 from neurocal_cli.methods import calibrate
@@ -51,9 +50,7 @@ class StaticFit:
     reasons: dict[int, str]
 
 
-def calibrate_each(
-    lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Callable[[str, float], None]
-) -> StaticFit:
+def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
     """Calibrate each setting alone, from random weights.
 
     Raises
@@ -136,7 +133,7 @@ def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
 
 
 def common_tables(
-    data: PixelData, local: Array, constants: Constants, progress: Callable[[str, float], None] | None = None
+    data: PixelData, local: Array, constants: Constants, progress: Progress | None = None
 ) -> Tables:
     """Minimise the reprojection error over the local parameters and the constants."""
     return _minimise(_CommonTables(data, local, constants, True, progress))
@@ -168,7 +165,7 @@ class _CommonTables:
         local: Array,
         constants: Constants,
         shared: bool,
-        progress: Callable[[str, float], None] | None,
+        progress: Progress | None,
     ) -> None:
         self.data, self.local, self.shared, self.progress = data, local, shared, progress
         self.normal, self.constants = data.linearise(local, constants)
