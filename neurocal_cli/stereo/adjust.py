@@ -11,10 +11,11 @@ from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import minimise
-from neurocal_cli.least_squares.schur_complement import schur_step
+from neurocal_cli.least_squares.schur_complement import SharedAndOwn
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import RigState, rig_normal_blocks
 
+_Linearised = tuple[RigState, Array]  # a state and its normal matrices
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 
 
@@ -65,49 +66,23 @@ def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) ->
     free : (n_shared,) bool array
         Which parameters of the cameras and the rig are free; the poses always are.
     """
-    error = _RigReprojection(problem, start, free)
-    options = replace(OPTIONS, damping=_DAMPING)
-    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in problem.observations)
-    outcome = minimise(error, options, floor)
-    state, iterations = error.state.orthonormalised(), int(outcome.iterations[0])
-    return RigFit(problem, free, state, error.normal, iterations, bool(outcome.settled[0]))
+    shared, columns = np.flatnonzero(free), start.columns
 
+    def blocks(state: RigState) -> tuple[Array, bool]:
+        return rig_normal_blocks(problem.frames, problem.observations, state)
 
-_Step = tuple[Array, Array]  # of the shared parameters (n_shared,) and of the poses (V, 6)
-_Trial = tuple[RigState, Array]  # a state and its normal matrices
-
-
-class _RigReprojection:
-    """The reprojection error of both cameras as a problem of `least_squares` with one group."""
-
-    def __init__(self, problem: RigProblem, start: RigState, free: NDArray[np.bool_]) -> None:
-        self.problem, self.state, self.shared = problem, start, np.flatnonzero(free)
-        self.normal, _ = self._blocks(start)
-
-    def _blocks(self, state: RigState) -> tuple[Array, bool]:
-        return rig_normal_blocks(self.problem.frames, self.problem.observations, state)
-
-    @property
-    def cost(self) -> Array:
-        """(1,) sum of squares."""
-        return self.normal[:, -1, -1].sum(keepdims=True)
-
-    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of the shared parameters and of the poses, and the predicted gain."""
-        columns = self.state.columns
-        by_shared, by_own, promised = schur_step(self.normal, self.shared, columns.pose, float(damping[0]))
+    def moved(before: _Linearised, by_shared: Array, by_own: Array) -> tuple[_Linearised, bool]:
+        # Valid if all points are in front of their cameras and the distortions are monotonic.
         step = np.zeros(columns.n_shared)
-        step[self.shared] = by_shared
-        return (step, by_own), np.array([promised])
+        step[shared] = by_shared
+        state = before[0].moved(step, by_own)
+        normal, sensible = blocks(state)
+        positive = all(camera.entries[0, [0, 2]].min() > 0 for camera in state.cameras)
+        return (state, normal), sensible and positive
 
-    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The state after a step; valid if all points are in front and the distortion is monotonic."""
-        trial = self.state.moved(*step)
-        normal, sensible = self._blocks(trial)
-        sensible = sensible and all(camera.entries[0, [0, 2]].min() > 0 for camera in trial.cameras)
-        return (trial, normal), normal[:, -1, -1].sum(keepdims=True), np.array([sensible])
-
-    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Accept the trial."""
-        if better[0]:
-            self.state, self.normal = trial
+    error = SharedAndOwn((start, blocks(start)[0]), lambda at: at[1], moved, shared, columns.pose)
+    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in problem.observations)
+    outcome = minimise(error, replace(OPTIONS, damping=_DAMPING), floor)
+    state, normal = error.state
+    iterations, settled = int(outcome.iterations[0]), bool(outcome.settled[0])
+    return RigFit(problem, free, state.orthonormalised(), normal, iterations, settled)

@@ -52,16 +52,15 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
         With the points of both cameras.
     """
     pairs = (*rig.pairs, *rig.left_out)
-    problem = rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ()))
     cameras = assess(rig.left), assess(rig.right)
-    poses = relative_poses(problem, rig.pose)
+    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ())), rig.pose)
     nan = float("nan")
     if poses is None:
         return RigEvidence(cameras, pairs, np.zeros(0), None, None, nan, nan, nan, nan)
     used = np.array([pair not in rig.left_out for pair in poses.names])
     found = contradiction(poses, used, seek_odd=False)
     covariance = rig_covariance(poses, used, found)
-    depth, std = depth_std(rig, problem, poses, covariance, _some_points(rig))
+    depth, std = depth_std(rig, poses, covariance, _some_points(rig))
     return RigEvidence(
         cameras=cameras,
         names=poses.names,
