@@ -9,6 +9,8 @@ is that of model averaging over all four models, around the reported parameters 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -126,8 +128,25 @@ def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Ar
     by : (2, 3, 3) array
         From `stretches`.
     """
+    return displaced_blocks(batches, state, 2, lambda chunk: by @ batches.local[chunk][:, None])
+
+
+def displaced_blocks(
+    batches: PointBatches, state: CameraState, m: int, displaced: Callable[[slice], Array]
+) -> Array:
+    """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
+
+    Parameters
+    ----------
+    batches, state
+        As for `reprojection.normal_blocks`.
+    m : int
+        Number of ways in which the target may be displaced.
+    displaced : callable
+        Displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
+    """
     width, n = 12 + len(state.k), batches.local.shape[2]
-    by_batch = np.empty((len(batches.view), width + 2, width + 2))
+    by_batch = np.empty((len(batches.view), width + m, width + m))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
@@ -135,7 +154,7 @@ def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Ar
         derivatives(batches, chunk, state, part)
         by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
         by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
-        by_stretch = np.einsum("tipn,tsin->tspn", by_local, by @ batches.local[chunk][:, None])
-        J = np.concatenate([part[:, :-1], by_stretch, part[:, -1:]], axis=1).reshape(len(view), width + 2, -1)
+        more = np.einsum("tipn,tsin->tspn", by_local, displaced(chunk))
+        J = np.concatenate([part[:, :-1], more, part[:, -1:]], axis=1).reshape(len(view), width + m, -1)
         np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
     return batches.sum_by_view(by_batch)

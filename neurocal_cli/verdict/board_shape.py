@@ -15,18 +15,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.reprojection import (
-    POSE,
-    CameraState,
-    camera_columns,
-    derivatives,
-)
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.target_shape.open_stretch import displaced_blocks
 
 # Powers of x and y of a smooth bend; lower ones describe the plane.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
@@ -196,29 +192,17 @@ def _powers(x: Array, y: Array) -> Array:
 
 def _with_shape(views: Views, state: CameraState, frame: _Frame) -> Array:
     """Normal matrices (V, 12 + K + 9, 12 + K + 9) with the shape's columns before the residual's."""
-    batches, n = views.batches, len(_BENT) + len(_STRETCHED)
-    width = 12 + len(state.k)
-    found = np.empty((len(batches.view), width + n, width + n))
-    for chunk in batches.chunks():
+    batches = views.batches
+
+    def displaced(chunk: slice) -> Array:
         view = batches.view[chunk]
-        J = np.zeros((len(view), width, 2, batches.local.shape[2]))
-        derivatives(batches, chunk, state, J)
-        scale = views.scale[view]
-        world = batches.local[chunk] * scale[:, None, None] + views.centre[view][:, :, None]
-        x, y = (
-            np.moveaxis(np.swapaxes(frame.axes[:, :2], 0, 1) @ (world - frame.centre[:, None]), 1, 0)
-            / frame.size
-        )
-        # The derivative by tau is that by the point in front of the camera.
-        along, _, normal = np.moveaxis(state.R[view] @ frame.axes * (frame.size / scale)[:, None, None], 2, 0)
-        drawn, lifted = (
-            np.einsum("ti,tiun->tun", axis, J[:, POSE.start + 3 : POSE.stop])[:, None]
-            for axis in (along, normal)
-        )
-        bent = np.moveaxis(_powers(x, y), 0, 1)[:, :, None] * lifted
-        stretched = np.stack([x, y], axis=1)[:, :, None] * drawn
-        whole = np.concatenate([J[:, :-1], bent, stretched, J[:, -1:]], axis=1).reshape(
-            len(view), width + n, -1
-        )
-        found[chunk] = whole @ np.swapaxes(whole, 1, 2)
-    return batches.sum_by_view(found)
+        scale = views.scale[view][:, None, None]
+        world = batches.local[chunk] * scale + views.centre[view][:, :, None]
+        on_board = frame.axes[:, :2].T @ (world - frame.centre[:, None]) / frame.size  # (T, 2, n)
+        height = np.moveaxis(_powers(*np.moveaxis(on_board, 1, 0)), 0, 1)  # (T, 7, n)
+        axes = (frame.axes * frame.size / scale)[:, None]
+        bent = height[:, :, None] * axes[..., 2:]
+        stretched = on_board[:, :, None] * axes[..., :1]
+        return np.concatenate([bent, stretched], axis=1)
+
+    return displaced_blocks(batches, state, len(_BENT) + len(_STRETCHED), displaced)

@@ -8,6 +8,8 @@ cameras are adjusted to their views. If hardly more than noise remains, there ar
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -176,13 +178,13 @@ def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
 def _adjusted(
     views: Views, state: CameraState, which: NDArray[np.intp], free: NDArray[np.bool_]
 ) -> CameraState:
-    start = CameraState(state.entries, state.R[which], state.t[which], state.model, state.k)
+    start = replace(state, R=state.R[which], t=state.t[which])
     return adjust(views.subset(which).batches, start, free, True, _STEPS).state
 
 
 def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Array:
     """(V,) squared error of each view with a given camera and its best pose."""
-    start = CameraState(camera.entries, state.R, state.t, camera.model, camera.k)
+    start = replace(camera, R=state.R, t=state.t)
     return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
 
 
