@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -143,8 +144,7 @@ def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed
 def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
     """(N, 2) predicted minus observed pixels."""
     poses = [calibration.views[name].pose for name in points.view_names]
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    inside = (R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]
+    inside = in_cameras(poses, points.world, points.view_index)
     return calibration.camera.project(inside)[0] - points.pixels
 
 

@@ -238,8 +238,7 @@ class _Fold:
 
     def rms(self, errors: Array) -> Array:
         """Rms over views and trials with an answer; (S, T, ...) to (S, P)."""
-        camera, poses = self._split(errors)
-        return np.sqrt(np.concatenate([_mean(camera**2, (1,)), _mean(poses**2, (1, 2))], axis=-1))
+        return np.sqrt(self.mean(errors**2))
 
     def mean(self, errors: Array) -> Array:
         """Mean over views and trials with an answer; (S, T, ...) to (S, P)."""

@@ -45,7 +45,7 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
@@ -122,10 +122,8 @@ def _views_behind(calibration: Calibration) -> int:
     points = calibration.points
     poses = [calibration.views[name].pose for name in points.view_names]
     if calibration.camera.distortion.wide:
-        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        world, index = points.world, points.view_index
-        seen = calibration.camera.sees((R[index] @ world[..., None])[..., 0] + t[index])
-        return int(np.count_nonzero(np.bincount(index[~seen])))
+        seen = calibration.camera.sees(in_cameras(poses, points.world, points.view_index))
+        return int(np.count_nonzero(np.bincount(points.view_index[~seen])))
     axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
     depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
     behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
