@@ -9,15 +9,13 @@ is that of model averaging over all four models, around the reported parameters 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
-from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -129,32 +127,3 @@ def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Ar
         From `stretches`.
     """
     return displaced_blocks(batches, state, 2, lambda chunk: by @ batches.local[chunk][:, None])
-
-
-def displaced_blocks(
-    batches: PointBatches, state: CameraState, m: int, displaced: Callable[[slice], Array]
-) -> Array:
-    """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
-
-    Parameters
-    ----------
-    batches, state
-        As for `reprojection.normal_blocks`.
-    m : int
-        Number of ways in which the target may be displaced.
-    displaced : callable
-        Displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
-    """
-    width, n = 12 + len(state.k), batches.local.shape[2]
-    by_batch = np.empty((len(batches.view), width + m, width + m))
-    buffer = batches.memory(width)
-    for chunk in batches.chunks():
-        view = batches.view[chunk]
-        part = buffer[: len(view), :-1]
-        derivatives(batches, chunk, state, part)
-        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
-        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
-        more = np.einsum("tipn,tsin->tspn", by_local, displaced(chunk))
-        J = np.concatenate([part[:, :-1], more, part[:, -1:]], axis=1).reshape(len(view), width + m, -1)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
-    return batches.sum_by_view(by_batch)

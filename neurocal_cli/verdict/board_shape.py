@@ -15,14 +15,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.target_shape.open_stretch import displaced_blocks
 
 # Powers of x and y of a smooth bend; lower ones describe the plane.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
