@@ -73,6 +73,10 @@ class CameraState:
         k = self.k if self.k.ndim == 1 else self.k[view]
         return replace(self, entries=entries, R=self.R[own], t=self.t[own], k=k)
 
+    def of_views(self, which: NDArray[np.intp]) -> CameraState:
+        """The state of some views, which share one camera."""
+        return replace(self, R=self.R[which], t=self.t[which])
+
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]

@@ -10,8 +10,6 @@ in-plane displacements.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,7 +97,7 @@ def board_shape(
     seen = views.n_views
     if seen > _ENOUGH:
         some = np.linspace(0, seen - 1, _ENOUGH).astype(np.intp)
-        views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
+        views, state = views.subset(some), state.of_views(some)
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     N = _with_shape(views, state, frame)
     f, n = len(shared), len(_BENT) + len(_STRETCHED)

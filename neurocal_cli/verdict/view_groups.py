@@ -143,7 +143,11 @@ def _two_cameras(
     for _ in range(_ADJUSTED):
         if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < _FEWEST:
             return found
-        both = [_adjusted(views, state, np.flatnonzero(group), free) for group in (member, ~member)]
+        groups = np.flatnonzero(member), np.flatnonzero(~member)
+        both = [
+            adjust(views.subset(which).batches, state.of_views(which), free, True, _STEPS).state
+            for which in groups
+        ]
         cost = np.stack([_cost_of_each(views, state, camera) for camera in both])
         cameras = np.stack([camera.entries[0] for camera in both])
         found = _Split(member, cameras, float(cost[0][member].sum() + cost[1][~member].sum()))
@@ -173,13 +177,6 @@ def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
                 break
             member = nearer
     return division
-
-
-def _adjusted(
-    views: Views, state: CameraState, which: NDArray[np.intp], free: NDArray[np.bool_]
-) -> CameraState:
-    start = replace(state, R=state.R[which], t=state.t[which])
-    return adjust(views.subset(which).batches, start, free, True, _STEPS).state
 
 
 def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Array:
