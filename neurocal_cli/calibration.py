@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import field
 from enum import Enum
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WITH_XI
-from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
+
+_ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # what A11, A12, A22, A13, A23 determine
 
 
 class StopReason(str, Enum):
@@ -282,6 +286,22 @@ class Calibration:
     def projections(self) -> dict[str, Array]:
         """(3, 4) matrix P = A [R | t] of each view, paper eq. (1)."""
         return {name: self.K @ view.pose.D for name, view in self.views.items()}
+
+
+def free_entries(calibration: Calibration, held: Collection[str] = ()) -> NDArray[np.bool_]:
+    """(5 + K,) which of A11, A12, A22, A13, A23 and the coefficients are neither given nor held."""
+    names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
+    return np.array([name not in calibration.fixed and name not in held for name in names])
+
+
+def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and the distortion coefficients the views' points alone determined.
+
+    Coefficients from straight lines are not among them, nor a rich lens's nodes, which need their prior.
+    """
+    from_lines = calibration.straight_lines is not None
+    names = coefficient_names(calibration.distortion_model) if from_lines else NODES
+    return free_entries(calibration, names)
 
 
 def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:

@@ -19,11 +19,11 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.stereo import stretch_covariance
-from neurocal_cli.stereo.adjust import RigFit, adjust_rig
+from neurocal_cli.stereo import open_covariance
+from neurocal_cli.stereo.adjust import adjust_rig
+from neurocal_cli.stereo.open_covariance import covariance_of_stretch
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
-from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.target_shape import open_stretch as open_stretch_module
 from neurocal_cli.target_shape.open_stretch import open_stretch, spread_of_stretch, stretches
 
@@ -83,19 +83,20 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     scene = random_rig(rng, "verging", 4)
     left, right = (calibrate(scene.points(side, 1e-4, rng), skew=False, target="given") for side in (0, 1))
     problem = rig_problem(left, right, pair_views(left.points.view_names, right.points.view_names))
-    free = np.concatenate([stretch_covariance.estimated_parameters(c) for c in (left, right)] + [[True] * 6])
-    adjusted = adjust_rig(problem.frames, problem.observations, problem.start(scene.rig), free)
-    only(0, monkeypatch, stretch_covariance)
-    found = stretched_rig(RigFit(problem, (left, right), adjusted, free))
+    free = np.concatenate([*problem.estimated, [True] * 6])
+    adjusted = adjust_rig(problem, problem.start(scene.rig), free)
+    only(0, monkeypatch, open_covariance)
+    found = covariance_of_stretch(adjusted)
     assert found is not None
     stretch = np.eye(3) + EPS * stretches(left.points.world)[0]
     observations = [
         replace(seen, batches=replace(seen.batches, local=stretch @ seen.batches.local))
         for seen in problem.observations
     ]
-    new = adjust_rig(problem.frames, (observations[0], observations[1]), adjusted.state, free).state
+    problem = replace(problem, observations=(observations[0], observations[1]))
+    new = adjust_rig(problem, adjusted.state, free).state
     moved = (new.t - adjusted.state.t) / EPS
-    assert np.sqrt(np.diagonal(found.added))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+    assert np.sqrt(np.diagonal(found[1]))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
 
 
 def test_the_spread_is_that_of_all_four_models() -> None:

@@ -17,7 +17,7 @@ from neurocal_cli.stereo.contradiction import Contradiction, contradiction
 from neurocal_cli.stereo.odd_pairs import odd_pairs
 from neurocal_cli.stereo.pair_covariance import not_smaller
 from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
+from neurocal_cli.stereo.problem import RigProblem, rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.stereo.rig import Rig
 
@@ -27,8 +27,7 @@ Points = tuple[Correspondences, Correspondences]
 def made(points: Points, distortion: str = "none", skew: bool = False) -> tuple[RigProblem, RelativePoses]:
     cameras = [calibrate(side, distortion=distortion, skew=skew) for side in points]
     problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
-    free = estimated_parameters(cameras[0]), estimated_parameters(cameras[1])
-    poses = relative_poses(problem, free, find_consensus(problem).rig)
+    poses = relative_poses(problem, find_consensus(problem).rig)
     assert poses is not None
     return problem, poses
 
@@ -61,7 +60,7 @@ def test_the_sum_of_squares_is_that_of_the_common_adjustment(degrees: float) -> 
     told = contradiction(poses)
     start = problem.start(find_consensus(problem).rig)
     free = np.concatenate([[True, False, True, True, True] * 2, [True] * 6])
-    adjusted = adjust_rig(problem.frames, problem.observations, start, free.astype(bool))
+    adjusted = adjust_rig(problem, start, free.astype(bool))
     alone = sum(float(normal[:, -1, -1].sum()) for normal in problem.own_normal)
     assert told.scatter**2 * told.degrees == pytest.approx(adjusted.cost - alone, rel=0.02)
 

@@ -213,26 +213,22 @@ def test_errors_are_at_the_bound_over_two_hundred_rigs() -> None:
 
 def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     """At the truth, from the residuals' own finite differences."""
-    from neurocal_cli.stereo.reprojection import Columns
-
     scene = flat("wide", 4, 7)
     points = sides(scene, 1e-5)
     cameras = [calibrate(p, skew=False) for p in points]
     problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
     state = problem.start(scene.rig)
-    columns = Columns.of(state)
+    columns = state.columns
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, 6]] = False
-    state = adjust_rig(problem.frames, problem.observations, state, free).state
+    state = adjust_rig(problem, state, free).state
     V, step = len(problem.frames.scale), 1e-7
     rows = []
     for n in np.flatnonzero(np.concatenate([free, np.ones(6 * V, dtype=bool)])):
         change = np.zeros(columns.n_shared + 6 * V)
         change[n] = step
         moves = [
-            all_residuals(
-                problem, state.moved(columns, s[: columns.n_shared], s[columns.n_shared :].reshape(V, 6))
-            )
+            all_residuals(problem, state.moved(s[: columns.n_shared], s[columns.n_shared :].reshape(V, 6)))
             for s in (change, -change)
         ]
         rows.append((moves[0] - moves[1]) / (2 * step))

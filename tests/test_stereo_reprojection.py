@@ -10,7 +10,7 @@ from neurocal_cli.stereo.adjust import adjust_rig
 from neurocal_cli.stereo.consensus import find_consensus
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import RigProblem, rig_problem
-from neurocal_cli.stereo.reprojection import Columns, RigState, rig_normal_blocks
+from neurocal_cli.stereo.reprojection import RigState, rig_normal_blocks
 
 
 def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigProblem, RigState]:
@@ -29,15 +29,15 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
 @pytest.mark.parametrize("lens", ["none", "k1k2"])
 def test_derivatives_are_those_of_finite_differences(lens: str) -> None:
     _, problem, state = made_problem(lens)
-    columns = Columns.of(state)
-    normal, sensible = rig_normal_blocks(problem.frames, problem.observations, state, columns)
+    columns = state.columns
+    normal, sensible = rig_normal_blocks(problem.frames, problem.observations, state)
     assert sensible
     V = len(problem.frames.scale)
     r = all_residuals(problem, state)
     assert normal[:, -1, -1].sum() == pytest.approx((r**2).sum(), rel=1e-12)
 
     def moved(shared: Array, own: Array) -> Array:
-        return all_residuals(problem, state.moved(columns, shared, own))
+        return all_residuals(problem, state.moved(shared, own))
 
     step = 1e-6
     J = np.zeros((len(r), columns.n_shared + 6 * V))
@@ -74,17 +74,17 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
     from scipy.optimize import least_squares
 
     _, problem, state = made_problem(lens)
-    columns = Columns.of(state)
+    columns = state.columns
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, columns.right[1]]] = False  # no skew
-    adjusted = adjust_rig(problem.frames, problem.observations, state, free)
+    adjusted = adjust_rig(problem, state, free)
     assert adjusted.converged
     V, places = len(problem.frames.scale), np.flatnonzero(free)
 
     def errors(x: Array) -> Array:
         shared = np.zeros(columns.n_shared)
         shared[places] = x[: len(places)]
-        return all_residuals(problem, state.moved(columns, shared, x[len(places) :].reshape(V, 6)))
+        return all_residuals(problem, state.moved(shared, x[len(places) :].reshape(V, 6)))
 
     fit = least_squares(errors, np.zeros(len(places) + 6 * V), x_scale="jac", xtol=1e-12, ftol=1e-14)
     assert adjusted.cost == pytest.approx(2 * fit.cost, rel=1e-9)
@@ -92,8 +92,8 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
 
 def test_without_noise_the_truth_is_found_exactly() -> None:
     scene, problem, state = made_problem(sigma=0.0)
-    free = np.ones(Columns.of(state).n_shared, dtype=bool)
+    free = np.ones(state.columns.n_shared, dtype=bool)
     free[[1, 6]] = False
-    found = adjust_rig(problem.frames, problem.observations, state, free).state
+    found = adjust_rig(problem, state, free).state
     assert pytest.approx(scene.rig.R, abs=1e-10) == found.R
     assert found.t * problem.frames.unit == pytest.approx(scene.rig.t, abs=1e-7)

@@ -15,19 +15,19 @@ from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, se
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.baseline_models import baselines_of
-from neurocal_cli.zoom_lens.camera_at import camera_at
-from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.evaluation import _baseline_error, _rms, _squares, evaluate_lens
-from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
-from neurocal_cli.zoom_lens.fit_points import fit_lens
-from neurocal_cli.zoom_lens.interpolation import (
+from neurocal_cli.zoom_lens.baseline_models import (
+    baselines_of,
     grid_axes,
     monomials,
     powers_up_to,
     spline_matrix,
     thin_plate_matrix,
 )
+from neurocal_cli.zoom_lens.camera_at import camera_at
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
+from neurocal_cli.zoom_lens.evaluation import _baseline_error, _rms, _squares, evaluate_lens
+from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
+from neurocal_cli.zoom_lens.fit_points import fit_lens
 from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens

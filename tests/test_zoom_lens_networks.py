@@ -12,9 +12,8 @@ from support.zoom_laws import grid, seen
 
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.alternating_training import take_turns
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.joint_training import JointLearner, train_joint
+from neurocal_cli.zoom_lens.joint_training import JointLearner, take_turns, train_joint
 from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
 from neurocal_cli.zoom_lens.network_training import Schedule, train
 from neurocal_cli.zoom_lens.parameter_networks import (

@@ -9,8 +9,6 @@ points are left out instead.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -171,7 +169,7 @@ def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
     whitening = None if views.whitening is None else views.whitening[order]
     batches = batches_of(views.local[order], views.pixels[order], whitening, group, len(present))
     view = present // FOLDS
-    found, _ = normal_blocks(batches, replace(state, R=state.R[view], t=state.t[view]))
+    found, _ = normal_blocks(batches, state.of_views(view))
     blocks = np.zeros((views.n_views * FOLDS, *found.shape[1:]))
     blocks[present] = found
     return blocks.reshape(views.n_views, FOLDS, *found.shape[1:])

@@ -28,6 +28,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
@@ -247,8 +248,7 @@ def open_of_calibration(
     """
     points, camera = calibration.points, calibration.camera
     poses = [calibration.views[name].pose for name in points.view_names]
-    R, t = (np.stack(parts)[points.view_index] for parts in zip(*((p.R, p.t) for p in poses), strict=True))
-    reach = _farthest((R @ points.world[..., None])[..., 0] + t)
+    reach = _farthest(in_cameras(poses, points.world, points.view_index))
     corner = corner_radius(np.array(camera.entries), np.zeros(2), 1.0, points.image_size)
     k = camera.distortion.coefficients if k is None else k
     return open_coefficients(camera.distortion.model, k, free, tuple(calibration.lens_choice), reach, corner)

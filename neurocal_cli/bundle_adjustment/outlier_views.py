@@ -62,7 +62,7 @@ def find_outlier_view(solution: Solution) -> str | None:
         return None
     rest = np.delete(np.arange(V), view)
     others = adjust(
-        views.subset(rest).batches, _of(adjusted.state, rest), problem.free_of_prior, True, _STEPS
+        views.subset(rest).batches, adjusted.state.of_views(rest), problem.free_of_prior, True, _STEPS
     )
     left = reduced(others.normal, problem.free_of_prior, True)
     among = float(median(_contradictions(left, own[rest], conditions[rest]))) / variance
@@ -83,10 +83,6 @@ def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> 
     with np.errstate(invalid="ignore"):
         spared = q.cost.sum() - q.cost_without_each() - own
     return np.asarray(np.where(np.isfinite(spared), spared, 0.0) / conditions)
-
-
-def _of(state: CameraState, views: NDArray[np.intp]) -> CameraState:
-    return CameraState(state.entries, state.R[views], state.t[views], state.model, state.k)
 
 
 def conditions_on_views(views: Views, state: CameraState) -> NDArray[np.intp]:

@@ -7,7 +7,7 @@ and the residual, in this order.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import field, replace
 from typing import Any
 
@@ -73,6 +73,10 @@ class CameraState:
         k = self.k if self.k.ndim == 1 else self.k[view]
         return replace(self, entries=entries, R=self.R[own], t=self.t[own], k=k)
 
+    def of_views(self, which: NDArray[np.intp]) -> CameraState:
+        """The state of some views, which share one camera."""
+        return replace(self, R=self.R[which], t=self.t[which])
+
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
@@ -125,6 +129,35 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
     if n_batches == batches.n_views:
         return by_batch, sensible
     return batches.sum_by_view(by_batch), np.logical_and.reduceat(sensible, batches.first)
+
+
+def displaced_blocks(
+    batches: PointBatches, state: CameraState, m: int, displaced: Callable[[slice], Array]
+) -> Array:
+    """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
+
+    Parameters
+    ----------
+    batches, state
+        As for `normal_blocks`.
+    m : int
+        Number of ways in which the target may be displaced.
+    displaced : callable
+        Displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
+    """
+    width, n = 12 + len(state.k), batches.local.shape[2]
+    by_batch = np.empty((len(batches.view), width + m, width + m))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view), :-1]
+        derivatives(batches, chunk, state, part)
+        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
+        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
+        more = np.einsum("tipn,tsin->tspn", by_local, displaced(chunk))
+        J = np.concatenate([part[:, :-1], more, part[:, -1:]], axis=1).reshape(len(view), width + m, -1)
+        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+    return batches.sum_by_view(by_batch)
 
 
 def residuals(batches: PointBatches, state: CameraState) -> Array:

@@ -7,9 +7,11 @@ conventions see `geometry`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -164,3 +166,9 @@ def entries_of(alpha_u: Any, alpha_v: Any, u0: Any, v0: Any, theta: float) -> tu
     # The tangent of the float nearest to pi/2 is finite, so this case is separate.
     skew = -alpha_u / np.tan(theta) if theta != np.pi / 2 else 0.0
     return alpha_u, skew, alpha_v / np.sin(theta), u0, v0
+
+
+def in_cameras(poses: Sequence[Pose], world: Array, view: NDArray[np.intp]) -> Array:
+    """World points (N, 3) in the camera's frame of their views; `view` (N,) are indices of poses."""
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    return np.asarray((R[view] @ world[..., None])[..., 0] + t[view])

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.evaluation import StereoEvaluation, evaluate_stereo
 
 _FOLDS = 5
-
-Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)
@@ -144,8 +144,7 @@ def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed
 def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
     """(N, 2) predicted minus observed pixels."""
     poses = [calibration.views[name].pose for name in points.view_names]
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    inside = (R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]
+    inside = in_cameras(poses, points.world, points.view_index)
     return calibration.camera.project(inside)[0] - points.pixels
 
 

@@ -315,7 +315,7 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     cost = float(normal[:, -1, -1].sum())
     if cost <= _FAR_FROM_SHORT**2 * float(least_of_free_networks(normal).sum()):
         return False
-    own = free_networks(views.subset(some), replace(state, R=state.R[some], t=state.t[some]), _STEPS)
+    own = free_networks(views.subset(some), state.of_views(some), _STEPS)
     return cost > _SHORT**2 * float(own.sum()) + 1e-20
 
 

@@ -7,6 +7,9 @@ small system, so the work grows linearly with the number of blocks.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +18,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import NOTHING, inverse_scaled, solve_scaled
 
 Columns = NDArray[np.intp]
+State = TypeVar("State")
 
 
 @frozen_dataclass(eq=False)
@@ -77,6 +81,51 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
     by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
     gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
     return step, by_own, float(gain)
+
+
+class SharedAndOwn(Generic[State]):
+    """A sum of squares of such unknowns as a `LeastSquaresProblem` of one group.
+
+    Parameters
+    ----------
+    start : State
+    blocks : callable
+        Products (V, D, D) of derivatives and residuals at a state, as for `schur_step`.
+    moved : callable
+        The state after a step of the shared (f,) and of the own (V, p) unknowns, and whether it is valid.
+    shared, own : (f,), (p,) int arrays
+        Columns of the unknowns.
+    """
+
+    def __init__(
+        self,
+        start: State,
+        blocks: Callable[[State], Array],
+        moved: Callable[[State, Array, Array], tuple[State, bool]],
+        shared: Columns,
+        own: Columns,
+    ) -> None:
+        self.state, self.blocks, self.moved, self.shared, self.own = start, blocks, moved, shared, own
+
+    @property
+    def cost(self) -> Array:
+        """(1,) sum of squares."""
+        return self.blocks(self.state)[:, -1, -1].sum(keepdims=True)
+
+    def solve(self, damping: Array, active: Columns) -> tuple[tuple[Array, Array], Array]:
+        """Steps of the shared and of the own unknowns, and the predicted gain."""
+        *step, gain = schur_step(self.blocks(self.state), self.shared, self.own, float(damping[0]))
+        return (step[0], step[1]), np.array([gain])
+
+    def move(self, step: tuple[Array, Array], active: Columns) -> tuple[State, Array, NDArray[np.bool_]]:
+        """The state after a step, its cost, and whether it is valid."""
+        trial, valid = self.moved(self.state, *step)
+        return trial, self.blocks(trial)[:, -1, -1].sum(keepdims=True), np.array([valid])
+
+    def accept(self, trial: State, better: NDArray[np.bool_], active: Columns) -> None:
+        """Accept the trial."""
+        if better[0]:
+            self.state = trial
 
 
 def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.view_bends import find_bends
 from neurocal_cli.verdict.given_parameters import reestimate_given
-from neurocal_cli.verdict.stated_noise import stated_noise
+from neurocal_cli.verdict.noise import stated_noise
 from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
 
 _ROUNDS = 3

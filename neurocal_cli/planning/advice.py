@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.open_coefficients import open_of_calibration
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, free_entries
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
@@ -19,7 +19,6 @@ from neurocal_cli.geometry import Array, cross_matrix, euler_to_rotation, neares
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.verdict.projection_uncertainty import image_grid
 
-_ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 _POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # shares of the image's width and height
 _WIDTHS = (0.3, 0.5, 0.75)  # width of the target as a share of the image's width
 _TILTS = ((0.0, 0.0), *((tilt, way) for tilt in (25.0, 45.0) for way in range(0, 360, 45)))  # degrees
@@ -166,8 +165,7 @@ class _Known:
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
     """(5 + K,) mask of the entries of A and the coefficients that were estimated."""
-    names = (*_ORDER, *coefficient_names(calibration.distortion_model))
-    free = np.array([name not in calibration.fixed and name not in NODES for name in names])
+    free = free_entries(calibration, NODES)
     if not calibration.camera.intrinsics.skewed:
         free[1] = False
     if not free.any():

@@ -6,7 +6,7 @@ for Tsai's, gets their true values, and has its own bound with fewer unknowns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import field
 
 import numpy as np
@@ -24,14 +24,13 @@ from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 _BLOCK = 5  # trials per task, all with one sigma
 _HALF_TURN = np.pi
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
-
-Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)
@@ -239,8 +238,7 @@ class _Fold:
 
     def rms(self, errors: Array) -> Array:
         """Rms over views and trials with an answer; (S, T, ...) to (S, P)."""
-        camera, poses = self._split(errors)
-        return np.sqrt(np.concatenate([_mean(camera**2, (1,)), _mean(poses**2, (1, 2))], axis=-1))
+        return np.sqrt(self.mean(errors**2))
 
     def mean(self, errors: Array) -> Array:
         """Mean over views and trials with an answer; (S, T, ...) to (S, P)."""

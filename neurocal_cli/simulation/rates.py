@@ -14,7 +14,7 @@ points on one side of the camera.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -24,7 +24,7 @@ from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
-from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.methods import calibrate
 from neurocal_cli.network import output, random_weights
 from neurocal_cli.points import Correspondences
@@ -37,8 +37,6 @@ RATES_WEIGHTS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 RATES_GAMMA = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6, 2.0)
 _SIGMA = 0.3  # px
 _SAME = 1.02  # greatest ratio to the best rms error (5), as for two starts of backprop
-
-Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)

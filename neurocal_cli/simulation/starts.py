@@ -34,7 +34,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
 from neurocal_cli.initialisation.given_poses import solve_given_poses
-from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.initialisation.view_networks import begin_flat, train_networks
 from neurocal_cli.network import random_weights
 from neurocal_cli.processes import work_through
@@ -47,8 +47,6 @@ _FOCAL = 0.5, 20.0  # half image widths
 _DEPTH = 2.0, 50.0  # radii of the target
 _BLOCK = 10  # starts per task
 _NOISE = 10**6  # part of the seeds; the study of noise uses lower numbers
-
-Progress = Callable[[str, float], None]
 
 
 @frozen_dataclass(eq=False)

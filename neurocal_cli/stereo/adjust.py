@@ -8,23 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
-from neurocal_cli.calibration import Calibration
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import minimise
-from neurocal_cli.least_squares.schur_complement import schur_step
+from neurocal_cli.least_squares.schur_complement import SharedAndOwn
 from neurocal_cli.stereo.problem import RigProblem
-from neurocal_cli.stereo.reprojection import Columns, Frames, Observations, RigState, rig_normal_blocks
+from neurocal_cli.stereo.reprojection import RigState, rig_normal_blocks
 
+_Linearised = tuple[RigState, Array]  # a state and its normal matrices
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 
 
 @frozen_dataclass(eq=False)
-class AdjustedRig:
-    """Result of `adjust_rig`.
+class RigFit:
+    """A problem, and what the common bundle adjustment made of it.
 
     Attributes
     ----------
+    problem : RigProblem
+    free : (n_shared,) bool array
+        Which parameters of the cameras and the rig moved.
     state : RigState
     normal : (V, D, D) array
         From `reprojection.rig_normal_blocks`.
@@ -32,6 +35,8 @@ class AdjustedRig:
     converged : bool
     """
 
+    problem: RigProblem
+    free: NDArray[np.bool_]
     state: RigState
     normal: Array
     iterations: int
@@ -42,99 +47,42 @@ class AdjustedRig:
         """Sum of squared whitened residuals."""
         return float(self.normal[:, -1, -1].sum())
 
-
-@frozen_dataclass(eq=False)
-class RigFit:
-    """A problem, and what the common bundle adjustment made of it.
-
-    Attributes
-    ----------
-    problem : RigProblem
-    calibrations : two of Calibration
-        Each camera alone.
-    adjusted : AdjustedRig
-    free : (n_shared,) bool array
-        Which parameters of the cameras and the rig moved.
-    """
-
-    problem: RigProblem
-    calibrations: tuple[Calibration, Calibration]
-    adjusted: AdjustedRig
-    free: NDArray[np.bool_]
-
     @property
     def variance(self) -> float:
         """Of the whitened residuals; 1 where both cameras alone leave no less."""
         equations = sum(observed.n_equations for observed in self.problem.observations)
         unknowns = int(self.free.sum()) + 6 * len(self.problem.frames.scale)
-        return self.adjusted.cost / max(equations - unknowns, 1)
+        return self.cost / max(equations - unknowns, 1)
 
 
-def adjust_rig(
-    frames: Frames,
-    observations: tuple[Observations, Observations],
-    start: RigState,
-    free: NDArray[np.bool_],
-) -> AdjustedRig:
+def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) -> RigFit:
     """Minimise the reprojection error of both cameras from a start near the minimum.
 
     Parameters
     ----------
-    frames : Frames
-    observations : two of Observations
+    problem : RigProblem
     start : RigState
         With all points in front of their cameras.
     free : (n_shared,) bool array
         Which parameters of the cameras and the rig are free; the poses always are.
     """
-    problem = _RigReprojection(frames, observations, start, free)
-    options = replace(OPTIONS, damping=_DAMPING)
-    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in observations)
-    outcome = minimise(problem, options, floor)
-    settled = bool(outcome.settled[0])
-    return AdjustedRig(problem.state.orthonormalised(), problem.normal, int(outcome.iterations[0]), settled)
+    shared, columns = np.flatnonzero(free), start.columns
 
+    def blocks(state: RigState) -> tuple[Array, bool]:
+        return rig_normal_blocks(problem.frames, problem.observations, state)
 
-_Step = tuple[Array, Array]  # of the shared parameters (n_shared,) and of the poses (V, 6)
-_Trial = tuple[RigState, Array]  # a state and its normal matrices
+    def moved(before: _Linearised, by_shared: Array, by_own: Array) -> tuple[_Linearised, bool]:
+        # Valid if all points are in front of their cameras and the distortions are monotonic.
+        step = np.zeros(columns.n_shared)
+        step[shared] = by_shared
+        state = before[0].moved(step, by_own)
+        normal, sensible = blocks(state)
+        positive = all(camera.entries[0, [0, 2]].min() > 0 for camera in state.cameras)
+        return (state, normal), sensible and positive
 
-
-class _RigReprojection:
-    """The reprojection error of both cameras as a problem of `least_squares` with one group."""
-
-    def __init__(
-        self,
-        frames: Frames,
-        observations: tuple[Observations, Observations],
-        start: RigState,
-        free: NDArray[np.bool_],
-    ) -> None:
-        self.frames, self.observations, self.state = frames, observations, start
-        self.columns, self.shared = Columns.of(start), np.flatnonzero(free)
-        self.normal, _ = rig_normal_blocks(frames, observations, start, self.columns)
-
-    @property
-    def cost(self) -> Array:
-        """(1,) sum of squares."""
-        return self.normal[:, -1, -1].sum(keepdims=True)
-
-    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of the shared parameters and of the poses, and the predicted gain."""
-        by_shared, by_own, promised = schur_step(
-            self.normal, self.shared, self.columns.pose, float(damping[0])
-        )
-        step = np.zeros(self.columns.n_shared)
-        step[self.shared] = by_shared
-        return (step, by_own), np.array([promised])
-
-    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The state after a step; valid if all points are in front and the distortion is monotonic."""
-        trial = self.state.moved(self.columns, *step)
-        normal, sensible = rig_normal_blocks(self.frames, self.observations, trial, self.columns)
-        sensible = sensible and all(camera.entries[0, [0, 2]].min() > 0 for camera in trial.cameras)
-        return (trial, normal), normal[:, -1, -1].sum(keepdims=True), np.array([sensible])
-
-    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Accept the trial."""
-        if better[0]:
-            self.state, self.normal = trial
+    error = SharedAndOwn((start, blocks(start)[0]), lambda at: at[1], moved, shared, columns.pose)
+    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in problem.observations)
+    outcome = minimise(error, replace(OPTIONS, damping=_DAMPING), floor)
+    state, normal = error.state
+    iterations, settled = int(outcome.iterations[0]), bool(outcome.settled[0])
+    return RigFit(problem, free, state.orthonormalised(), normal, iterations, settled)

@@ -20,13 +20,12 @@ from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
 from neurocal_cli.stereo.depth_uncertainty import depth_std
-from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.pair_covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
-from neurocal_cli.stereo.problem import estimated_parameters, rig_problem
+from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.rules import reach_rig_verdict
+from neurocal_cli.stereo.rules import RigEvidence, reach_rig_verdict
 from neurocal_cli.stereo.sound_pairs import MOVED
 from neurocal_cli.verdict.assessment import assess
 
@@ -53,17 +52,15 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
         With the points of both cameras.
     """
     pairs = (*rig.pairs, *rig.left_out)
-    problem = rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ()))
-    free = estimated_parameters(rig.left), estimated_parameters(rig.right)
     cameras = assess(rig.left), assess(rig.right)
-    poses = relative_poses(problem, free, rig.pose)
+    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ())), rig.pose)
     nan = float("nan")
     if poses is None:
         return RigEvidence(cameras, pairs, np.zeros(0), None, None, nan, nan, nan, nan)
     used = np.array([pair not in rig.left_out for pair in poses.names])
     found = contradiction(poses, used, seek_odd=False)
     covariance = rig_covariance(poses, used, found)
-    depth, std = depth_std(rig, problem, poses, covariance, _some_points(rig))
+    depth, std = depth_std(rig, poses, covariance, _some_points(rig))
     return RigEvidence(
         cameras=cameras,
         names=poses.names,

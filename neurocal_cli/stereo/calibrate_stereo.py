@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import UsageError
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.methods import calibrate
 from neurocal_cli.pipeline.common_target import can_tell, common_target
 from neurocal_cli.points import Correspondences
@@ -16,8 +17,6 @@ from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.pairing import pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import Target
-
-Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")
 _ROUNDS = 2  # rounds of selecting lenses and target alternately

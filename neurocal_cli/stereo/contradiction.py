@@ -136,7 +136,7 @@ def _as_contradiction(
     amount = float(found.values[0]) if found.kind in ("late", "early") else 0.0
     for side, kind in enumerate(("left focal", "right focal")):
         if found.kind == kind:
-            amount = float(np.mean(found.values / poses.entries[side][[0, 2]]))
+            amount = float(np.mean(found.values / poses.problem.cameras[side].entries[0, [0, 2]]))
     gain = float(np.sqrt(found.gain / len(found.values)))
     return Contradiction(
         found.kind, found.at, amount, n, odd, scatter, float(np.sqrt(left)), gain, growth, found.shift

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration, Verdict
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.evaluation import refuse_another_size
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -232,9 +232,7 @@ class _Evaluator:
             which=pairs.view,
             method=self.method,
         )
-        R = np.stack([pose.R for pose in poses])[pairs.view]
-        t = np.stack([pose.t for pose in poses])[pairs.view]
-        true = (R @ self.points[0].world[pairs.left][..., None])[..., 0] + t
+        true = in_cameras(poses, self.points[0].world[pairs.left], pairs.view)
         names = [a for a, _ in self.views.both]
         triangulated = np.where(found.behind[:, None], np.nan, found.points)
         K = self.cameras[0].intrinsics

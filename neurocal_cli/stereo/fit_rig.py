@@ -14,15 +14,14 @@ from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.stereo.adjust import RigFit, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
+from neurocal_cli.stereo.open_covariance import covariance_of_stretch
 from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
-from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, free_parameters, rig_problem
+from neurocal_cli.stereo.problem import RigProblem, free_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import relative_poses
-from neurocal_cli.stereo.reprojection import Columns
 from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import sound_pairs
-from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
 # Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
@@ -79,37 +78,34 @@ def fit_rig(
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
         problem = rig_problem(left, right, ViewPairs(kept, (), ()))
-    fit, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
+    fit, warnings = _adjusted(problem, sound.rig, refine_cameras)
     least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:
         uncertain = with_target_uncertainty(left.target, fit)
         least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
     stretched = None
     if target_kept or left.target_stretched or right.target_stretched:
-        stretched = stretched_rig(fit)
+        stretched = covariance_of_stretch(fit)
     if target_kept and stretched is not None:
-        left, right = (replace(camera, target_stretched=stretched.probability) for camera in (left, right))
-        fit = replace(fit, calibrations=(left, right))
-    rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched.added)
+        left, right = (replace(camera, target_stretched=stretched[0]) for camera in (left, right))
+        fit = replace(fit, problem=replace(problem, calibrations=(left, right)))
+    rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched[1])
     _refuse_one_place(rig)
     if sound.left_out:
         warnings.insert(0, sound.contradiction(len(views.both)))
     return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
 
 
-def _adjusted(
-    problem: RigProblem, calibrations: tuple[Calibration, Calibration], start: Pose, refine_cameras: bool
-) -> tuple[RigFit, list[str]]:
+def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[RigFit, list[str]]:
     """The common bundle adjustment, and its warnings."""
     moving = [refine_cameras, refine_cameras]
     warnings = []
     while True:
         free = np.concatenate(
-            [free_parameters(c) & moves for c, moves in zip(calibrations, moving, strict=True)]
+            [free_parameters(c) & moves for c, moves in zip(problem.calibrations, moving, strict=True)]
             + [np.ones(6, dtype=bool)]
         )
-        adjusted = adjust_rig(problem.frames, problem.observations, problem.start(start), free)
-        fit = RigFit(problem, calibrations, adjusted, free)
+        fit = adjust_rig(problem, problem.start(start), free)
         if any(moving) and np.sqrt(fit.variance) > _SPOILS:
             moving = [False, False]
             warnings = [
@@ -125,13 +121,11 @@ def _adjusted(
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     """Covariance of the shared parameters if that of independent points is too small; else None."""
-    sides = estimated_parameters(fit.calibrations[0]), estimated_parameters(fit.calibrations[1])
-    estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
+    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None
-    state = fit.adjusted.state
-    poses = relative_poses(fit.problem, sides, Pose(state.R, state.t * fit.problem.frames.unit))
+    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.frames.unit))
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
@@ -187,8 +181,7 @@ def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: Vie
     """
     problem = rig_problem(*cameras, views)
     start = problem.start(rig)
-    free = np.zeros(Columns.of(start).n_shared, dtype=bool)
-    state = adjust_rig(problem.frames, problem.observations, start, free).state
+    state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
     frames = problem.frames
     return {
         name: Pose(state.view_R[k], state.view_t[k] * frames.scale[k] - state.view_R[k] @ frames.centre[k])

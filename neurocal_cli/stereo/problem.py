@@ -11,11 +11,9 @@ from neurocal_cli.bundle_adjustment.point_batches import batches_of
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.calibration import Calibration, estimated_parameters
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -27,8 +25,6 @@ from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
 # test_without_noise_the_truth_comes_back checks such data.
 _LEAST_SHARE = 1e-3
 _LEAST_NOISE = 1e-12
-# Parameters that the entries A11, A12, A22, A13, A23 determine.
-_ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")
 
 
 @frozen_dataclass(eq=False)
@@ -37,6 +33,8 @@ class RigProblem:
 
     Attributes
     ----------
+    calibrations : two of Calibration
+        Each camera alone.
     names : two tuples of str
         Views of each camera, in the order of its observations.
     frames : Frames
@@ -58,6 +56,7 @@ class RigProblem:
     flat : (P,) bool array
     """
 
+    calibrations: tuple[Calibration, Calibration]
     names: tuple[tuple[str, ...], tuple[str, ...]]
     frames: Frames
     observations: tuple[Observations, Observations]
@@ -68,6 +67,12 @@ class RigProblem:
     spread: Array
     axes: Array
     flat: NDArray[np.bool_]
+
+    @property
+    def estimated(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """`estimated_parameters` of the left and of the right camera."""
+        left, right = self.calibrations
+        return estimated_parameters(left), estimated_parameters(right)
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -87,27 +92,11 @@ class RigProblem:
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and the distortion coefficients are free.
+    """(5 + K,) which of A's entries and the distortion coefficients a common fit may move.
 
-    Given parameters are not, nor a rich lens's nodes, which need their prior. With a distortion from
-    straight lines none is, as camera and distortion belong together.
+    With a distortion from straight lines none is, as camera and distortion belong together.
     """
-    names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
-    held = calibration.straight_lines is not None
-    return np.array([not held and name not in (*calibration.fixed, *NODES) for name in names])
-
-
-def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and the distortion coefficients the views' points determined."""
-    from_lines = calibration.straight_lines is not None
-    coefficients = coefficient_names(calibration.distortion_model)
-    names = (*_ENTRY_NAMES, *coefficients)
-    return np.array(
-        [
-            name not in (*calibration.fixed, *NODES) and not (from_lines and name in coefficients)
-            for name in names
-        ]
-    )
+    return estimated_parameters(calibration) & (calibration.straight_lines is None)
 
 
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
@@ -144,7 +133,7 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     paired_right = np.flatnonzero(through[frame] & (frame < n_left))
     paired = frame[paired_right]
     return RigProblem(
-        names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]),
+        (left, right), names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]),
         (normals[0], normals[1]), paired, paired_right, _spread(arranged[0], paired),
         arranged[0].basis[paired], arranged[0].nearly_flat[paired],
     )  # fmt: skip

@@ -45,6 +45,7 @@ class RelativePoses:
 
     Attributes
     ----------
+    problem : RigProblem
     names : tuple of (left name, right name)
     cameras : Quadratics
         Information of each frame's views about the cameras alone, V groups.
@@ -52,14 +53,12 @@ class RelativePoses:
         Term that each pair adds: the cost of the common fit beyond that of the cameras alone, P groups.
     frame : (P,) int array
         Frame of each pair.
-    left, right, rig : (f,) int arrays
-        Columns of the unknowns.
-    estimated : two of (f,) int arrays
-        Indices of the left and the right unknowns among A's entries and the distortion coefficients.
+    own : two of (f,) int arrays
+        Columns of the left and of the right camera's parameters.
+    rig : (6,) int array
+        Columns of the rig's step.
     focal : two of (0, 1 or 2) int arrays
         Columns of alpha_u and alpha_v of each camera, if they are free.
-    entries : two of (5,) arrays
-        Entries of A of each camera, normalised.
     offset : (P, 6) array
         z.
     design : (P, 6, F) array
@@ -77,20 +76,16 @@ class RelativePoses:
         Equations of both views of each pair.
     spare : float
         Equations of both cameras alone less their unknowns.
-    unit : float
-        Of the rig's translation [world unit].
     """
 
+    problem: RigProblem
     names: tuple[tuple[str, str], ...]
     cameras: Quadratics
     pairs: Quadratics
     frame: NDArray[np.intp]
-    left: NDArray[np.intp]
-    right: NDArray[np.intp]
+    own: tuple[NDArray[np.intp], NDArray[np.intp]]
     rig: NDArray[np.intp]
-    estimated: tuple[NDArray[np.intp], NDArray[np.intp]]
     focal: tuple[NDArray[np.intp], NDArray[np.intp]]
-    entries: tuple[Array, Array]
     offset: Array
     design: Array
     covariance: Array
@@ -99,7 +94,11 @@ class RelativePoses:
     motion: Array
     n_equations: Array
     spare: float
-    unit: float
+
+    @property
+    def unit(self) -> float:
+        """Unit of the rig's translation [world unit]."""
+        return self.problem.frames.unit
 
     def __len__(self) -> int:
         return len(self.names)
@@ -115,17 +114,13 @@ class RelativePoses:
         return np.asarray(solve_scaled(S, g[:, None])[:, 0])
 
 
-def relative_poses(
-    problem: RigProblem, free: tuple[NDArray[np.bool_], NDArray[np.bool_]], reference: Pose
-) -> RelativePoses | None:
+def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None:
     """Relative poses of all pairs of a problem.
 
     Parameters
     ----------
     problem : RigProblem
         The cameras need not be at their own minimum; one step leads there.
-    free : two of (5 + K,) bool array
-        Which of A's entries and the distortion coefficients were estimated from the points.
     reference : Pose
         A rig near those of most pairs.
 
@@ -134,7 +129,7 @@ def relative_poses(
     RelativePoses or None
         None if a view does not determine its pose.
     """
-    sides = [_Alone(problem, side, free[side]) for side in (0, 1)]
+    sides = [_Alone(problem, side) for side in (0, 1)]
     if not all(side.determined for side in sides):
         return None
     names = in_order(problem.pairs)
@@ -160,37 +155,33 @@ def relative_poses(
     offset += (of_right @ sides[1].step[second][..., None] + of_left @ sides[0].step[first][..., None])[
         ..., 0
     ]
-    n_left, n_right = (int(side.sum()) for side in free)
+    n_left, n_right = (int(side.sum()) for side in problem.estimated)
     columns = np.arange(n_left + n_right + 6)
-    places = columns[:n_left], columns[n_left : n_left + n_right], columns[-6:]
+    places, rig = (columns[:n_left], columns[n_left:-6]), columns[-6:]
     design = np.zeros((len(order), 6, len(columns)))
     design[:, :, places[0]] = of_left @ sides[0].follow[first]
     design[:, :, places[1]] = of_right @ sides[1].follow[second]
-    design[:, :, places[2]] = np.eye(6)
+    design[:, :, rig] = np.eye(6)
     weight = np.linalg.inv(covariance)
     weighted = np.swapaxes(design, 1, 2) @ weight
     cost = np.einsum("pi,pij,pj->p", offset, weight, offset)
     pairs = Quadratics(weighted @ design, (weighted @ offset[..., None])[..., 0], cost)
     counts = [_equations(problem, side) for side in (0, 1)]
     return RelativePoses(
-        tuple(names),
-        _both(problem, sides, places[:2], len(columns)),
-        pairs, first, *places, (np.flatnonzero(free[0]), np.flatnonzero(free[1])),
-        (places[0][sides[0].focal], places[1][sides[1].focal]),
-        (left.entries[0], right.entries[0]), offset, design, covariance,
+        problem, tuple(names), _both(problem, sides, places, len(columns)), pairs, first, places, rig,
+        (places[0][sides[0].focal], places[1][sides[1].focal]), offset, design, covariance,
         frames.scale[first], centre * scale[:, None],
         _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
         counts[0][first] + counts[1][second],
         sum(side.spare for side in sides),
-        frames.unit,
     )  # fmt: skip
 
 
 class _Alone:
     """One camera alone: the poses of its views at its minimum, and their response to its parameters."""
 
-    def __init__(self, problem: RigProblem, side: int, free: NDArray[np.bool_]) -> None:
-        observed, normal = problem.observations[side], problem.own_normal[side]
+    def __init__(self, problem: RigProblem, side: int) -> None:
+        observed, normal, free = problem.observations[side], problem.own_normal[side], problem.estimated[side]
         shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
         left, solved = eliminate(normal, np.append(shared, normal.shape[-1] - 1), _POSE)
         S, g, cost = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]

@@ -12,6 +12,7 @@ camera are transformed by the chain rule:
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -94,15 +95,22 @@ class RigState:
     view_R: Array
     view_t: Array
 
-    def moved(self, columns: Columns, shared: Array, own: Array) -> RigState:
+    @cached_property
+    def columns(self) -> Columns:
+        """Columns of the unknowns for the distortion models of both cameras."""
+        ends = np.cumsum([0, *(5 + len(camera.k) for camera in self.cameras), 6, 6])
+        return Columns(*(np.arange(a, b) for a, b in pairwise(ends.tolist())))
+
+    def moved(self, shared: Array, own: Array) -> RigState:
         """The state after a step: shared (columns.n_shared,), own (V, 6)."""
+        columns = self.columns
         cameras = tuple(
             replace(
                 camera,
                 entries=camera.entries + shared[None, place[:5]],
                 k=camera.k + shared[place[5:]],
             )
-            for camera, place in zip(self.cameras, (columns.left, columns.right), strict=True)
+            for camera, place in zip(self.cameras, columns.cameras, strict=True)
         )
         rig = shared[columns.rig]
         return RigState(
@@ -148,11 +156,10 @@ class Columns:
     rig: NDArray[np.intp]
     pose: NDArray[np.intp]
 
-    @classmethod
-    def of(cls, state: RigState) -> Columns:
-        """Columns for the distortion models of a state."""
-        ends = np.cumsum([0, *(5 + len(camera.k) for camera in state.cameras), 6, 6])
-        return cls(*(np.arange(a, b) for a, b in pairwise(ends.tolist())))
+    @property
+    def cameras(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns of the left and of the right camera."""
+        return self.left, self.right
 
     @property
     def n_shared(self) -> int:
@@ -166,7 +173,7 @@ class Columns:
 
 
 def rig_normal_blocks(
-    frames: Frames, observations: tuple[Observations, Observations], state: RigState, columns: Columns
+    frames: Frames, observations: tuple[Observations, Observations], state: RigState
 ) -> tuple[Array, bool]:
     """Products of derivatives and residuals, summed over the points of each view in both cameras.
 
@@ -177,22 +184,22 @@ def rig_normal_blocks(
     sensible : bool
         Whether all points are in front of their cameras and the distortions are monotonic there.
     """
-    normal = np.zeros((len(frames.scale), columns.width, columns.width))
+    D = state.columns.width
+    normal = np.zeros((len(frames.scale), D, D))
     sensible = True
     for side, observed in enumerate(observations):
         camera = state.camera_with_poses(side, frames, observed)
         blocks, fine = normal_blocks(observed.batches, camera)
-        T = rig_jacobian(frames, observed, state, columns, side)
+        T = rig_jacobian(frames, observed, state, side)
         normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
         sensible = sensible and bool(fine.all())
     return normal, sensible
 
 
-def rig_jacobian(
-    frames: Frames, observed: Observations, state: RigState, columns: Columns, side: int
-) -> Array:
+def rig_jacobian(frames: Frames, observed: Observations, state: RigState, side: int) -> Array:
     """Derivatives of the columns of one camera by the columns of the rig, (V_c, 12 + K, D)."""
-    place = (columns.left, columns.right)[side]
+    columns = state.columns
+    place = columns.cameras[side]
     own = camera_columns(len(place) - 5)
     T = np.zeros((len(observed.view), len(own) + 7, columns.width))
     T[:, own, place] = 1.0

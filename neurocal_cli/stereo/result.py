@@ -28,9 +28,9 @@ from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import RigFit
-from neurocal_cli.stereo.choice_covariance import open_covariance
+from neurocal_cli.stereo.open_covariance import covariance_of_choice
 from neurocal_cli.stereo.pair_covariance import not_smaller
-from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
+from neurocal_cli.stereo.reprojection import Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
 
@@ -64,12 +64,11 @@ def assemble_rig(
 
 def non_monotonic_sides(fit: RigFit) -> list[int]:
     """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
-    state = fit.adjusted.state
-    columns, shared = Columns.of(state), np.flatnonzero(fit.free)
+    problem, state = fit.problem, fit.state
     found = []
-    for side, own in enumerate((columns.left, columns.right)):
-        camera, observed, given = state.cameras[side], fit.problem.observations[side], fit.calibrations[side]
-        estimated = np.isin(own, shared)
+    for side, own in enumerate(state.columns.cameras):
+        camera, observed, given = state.cameras[side], problem.observations[side], problem.calibrations[side]
+        estimated = fit.free[own]
         if not estimated.any():
             continue
         A = _intrinsics(given, camera, observed, estimated[:5]).A if estimated[:5].any() else given.K
@@ -80,11 +79,11 @@ def non_monotonic_sides(fit: RigFit) -> list[int]:
 
 class _RigAssembly:
     def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
-        self.problem, self.calibrations, self.adjusted = fit.problem, fit.calibrations, fit.adjusted
-        self.columns = Columns.of(self.adjusted.state)
+        self.fit, self.problem, self.calibrations = fit, fit.problem, fit.problem.calibrations
+        self.state, self.columns = fit.state, fit.state.columns
         self.scale_std = scale_of(self.calibrations[0].points).std
         self.shared = np.flatnonzero(fit.free)
-        inverse = schur_covariance(self.adjusted.normal, self.shared, self.columns.pose)
+        inverse = schur_covariance(fit.normal, self.shared, self.columns.pose)
         if not inverse.smallest > _SINGULAR:
             raise DegenerateGeometryError(
                 "the points do not determine the rig and both cameras (the normal matrix is singular); "
@@ -99,13 +98,13 @@ class _RigAssembly:
         )
         if least is not None:
             self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
-        for more in (open_covariance(fit), stretched):
+        for more in (covariance_of_choice(fit), stretched):
             if more is not None:
                 self.covariance = _widened(self.covariance, self.covariance.shared + more)
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         """The rig in pixels and world units, with the pairs left out and why."""
-        state, frames = self.adjusted.state, self.problem.frames
+        state, frames = self.state, self.problem.frames
         errors = [
             _squared_errors(observed, state.camera_with_poses(side, frames, observed))
             for side, observed in enumerate(self.problem.observations)
@@ -134,14 +133,14 @@ class _RigAssembly:
             max_px=float(np.sqrt(max(e.max() for e in errors))),
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
-            iterations=self.adjusted.iterations,
+            iterations=self.fit.iterations,
         )
 
     def _stop_reason(self) -> str:
         for calibration in self.calibrations:
             if not calibration.converged:
                 return calibration.stop_reason
-        return (StopReason.CONVERGED if self.adjusted.converged else StopReason.MAX_ITERATIONS).value
+        return (StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS).value
 
     def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
         """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
@@ -168,9 +167,9 @@ class _RigAssembly:
     def _calibration(self, side: int, squares: Array, largest: float, reason: str) -> Calibration:
         """One camera after the common bundle adjustment."""
         given, observed = self.calibrations[side], self.problem.observations[side]
-        camera = self.adjusted.state.cameras[side]
-        columns = (self.columns.left, self.columns.right)[side]
-        estimated = np.isin(columns, self.shared)
+        camera = self.state.cameras[side]
+        columns = self.columns.cameras[side]
+        estimated = self.fit.free[columns]
         intrinsics = given.intrinsics
         if estimated[:5].any():
             intrinsics = _intrinsics(given, camera, observed, estimated[:5])
@@ -195,7 +194,7 @@ class _RigAssembly:
             max_px=float(np.sqrt(largest)),
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
-            network=_network(given.network, intrinsics, views, rmse, self.adjusted.iterations),
+            network=_network(given.network, intrinsics, views, rmse, self.fit.iterations),
             judgement=None,
             **changes,
         )
@@ -231,14 +230,14 @@ class _RigAssembly:
     def _world_poses(self, side: int) -> tuple[Array, Array]:
         """Poses of the views in their camera, in world units."""
         frames, observed = self.problem.frames, self.problem.observations[side]
-        state = self.adjusted.state.camera_with_poses(side, frames, observed)
+        state = self.state.camera_with_poses(side, frames, observed)
         scale, centre = frames.scale[observed.view][:, None], frames.centre[observed.view]
         return state.R, state.t * scale - (state.R @ centre[..., None])[..., 0]
 
     def _pose_stds(self, side: int, R: Array) -> Array:
         """Standard deviations of the angles and translations of the views, (V_c, 6)."""
         frames, observed, columns = self.problem.frames, self.problem.observations[side], self.columns
-        T = rig_jacobian(frames, observed, self.adjusted.state, columns, side)[:, POSE]
+        T = rig_jacobian(frames, observed, self.state, side)[:, POSE]
         by_rig, by_pose = T[:, :, columns.rig], T[:, :, columns.pose]
         own = self.covariance.own[observed.view]
         places = np.flatnonzero(np.isin(self.shared, columns.rig))

@@ -1,4 +1,4 @@
-"""The rules of the verdict on a rig: good, usable or poor, with reasons and advice."""
+"""The verdict on a rig, good, usable or poor, with reasons and advice: its measures and its rules."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.contradiction import Contradiction
-from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import MOVED, describe_faults, describe_move, pair_name
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
@@ -27,6 +28,43 @@ _LEFT_OUT = Limit(0.0, 0.34)  # share of the pairs
 _MOMENT = (
     "trigger both cameras at the same moment, or hold the target still; check that the cameras are fixed"
 )
+
+
+@frozen_dataclass(eq=False)
+class RigEvidence:
+    """Measures of a rig's quality.
+
+    Attributes
+    ----------
+    cameras : two of Verdict or None
+        Verdict on each camera by its own points.
+    names : tuple of (left name, right name)
+        All pairs in order of their names.
+    size : (P,) array
+        Of each pair's target [world unit].
+    moved : Contradiction or None
+        Of all pairs, including those left out because the rig moved; None if it did not move.
+    contradiction : Contradiction or None
+        Of the pairs that determine the rig; None if a view does not determine its pose.
+    displacement : float [world unit]
+        Rms distance of the targets from their positions predicted by the rig, in the right camera.
+    held_out_px : float [px]
+        Five-fold cross-validation error over pairs; nan if no pair can be left out.
+    depth : float [world unit]
+        Median depth of the points.
+    depth_share : float
+        Standard deviation of triangulated depth over the depth, median over the points, for exact pixels.
+    """
+
+    cameras: tuple[Verdict | None, Verdict | None]
+    names: tuple[tuple[str, str], ...]
+    size: Array
+    moved: Contradiction | None
+    contradiction: Contradiction | None
+    displacement: float
+    held_out_px: float
+    depth: float
+    depth_share: float
 
 
 def reach_rig_verdict(rig: Rig, evidence: RigEvidence) -> Verdict:

@@ -17,7 +17,7 @@ from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pairing import ViewPairs
-from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
+from neurocal_cli.stereo.problem import RigProblem, rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.verdict.findings import name_some
 
@@ -96,8 +96,7 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     # A fault that has a name is certain. The others may belong to a rig that moved.
     named = {pair: reason for pair, reason in reasons.items() if reason not in ("", UNSYNCHRONISED)}
     found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
-    free = estimated_parameters(left), estimated_parameters(right)
-    poses = relative_poses(problem, free, consensus.rig)
+    poses = relative_poses(problem, consensus.rig)
     if poses is not None:
         used = np.array([pair not in named for pair in poses.names])
         found = _explained(poses, used, found)

@@ -13,7 +13,7 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.adjust import RigFit
 from neurocal_cli.stereo.problem import RigProblem
-from neurocal_cli.stereo.reprojection import Columns, Observations, RigState, rig_jacobian, rig_normal_blocks
+from neurocal_cli.stereo.reprojection import Observations, rig_jacobian, rig_normal_blocks
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Information, point_terms
 from neurocal_cli.target_shape.posterior import known_sizes
@@ -24,7 +24,7 @@ from neurocal_cli.target_shape.surveyed import noise_variance
 def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
     prior = prior_of_target(target)
-    info = _information(target, fit.problem, fit.adjusted.state, fit.free).turned(prior.axes)
+    info = _information(target, fit).turned(prior.axes)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     offsets = prior.along_axes(target.offsets)
     variance = info.cost / max(spare, 1.0)
@@ -38,22 +38,18 @@ def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     return found.variance * found.camera
 
 
-def _information(
-    target: Target, problem: RigProblem, state: RigState, free: NDArray[np.bool_]
-) -> Information:
-    columns, n = Columns.of(state), len(target.given)
-    shared, frames = np.flatnonzero(free), problem.frames
-    N, _ = rig_normal_blocks(frames, problem.observations, state, columns)
+def _information(target: Target, fit: RigFit) -> Information:
+    problem, state, n = fit.problem, fit.state, len(target.given)
+    columns, shared, frames = state.columns, np.flatnonzero(fit.free), problem.frames
+    N, _ = rig_normal_blocks(frames, problem.observations, state)
     point, point_right = np.zeros((n, 3, 3)), np.zeros((n, 3))
     point_shared = np.zeros((n, 3, columns.n_shared))
     pose_point = np.zeros((len(frames.scale), 6, n, 3))
-    for side, (observed, own) in enumerate(
-        zip(problem.observations, (columns.left, columns.right), strict=True)
-    ):
+    for side, (observed, own) in enumerate(zip(problem.observations, columns.cameras, strict=True)):
         camera = state.camera_with_poses(side, frames, observed)
         label, scale = _labels(target, problem, observed), frames.scale[observed.view]
         terms = point_terms(observed.batches, camera, scale, label, camera_columns(len(own) - 5), n)
-        T, w = rig_jacobian(frames, observed, state, columns, side), observed.weight
+        T, w = rig_jacobian(frames, observed, state, side), observed.weight
         point += w * terms.point
         point_right += w * terms.point_right
         point_shared[:, :, own] += w * terms.point_camera

@@ -80,7 +80,7 @@ class PointBatch:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
         points = np.stack([x / w, y / w, 1 / w], axis=1)
-        covariance = _point_covariance(_inverse(N), x, y, w)
+        covariance = _point_covariance(inverse_entries(N), x, y, w)
         depth = self._depth(x, y, w)
         behind = left_out | ~(w > 0) | ~(depth > 0)
         epipolar = np.sqrt(cost)
@@ -173,12 +173,7 @@ class PointBatch:
         equations[:, 0, 2], equations[:, 1, 2] = rays[0]
         for row, ray in enumerate(rays[1]):
             equations[:, 2 + row] = ray[:, None] * P[:, 2] - P[:, row]
-        nowhere = ~np.isfinite(equations).all(axis=(1, 2))
-        equations[nowhere] = np.eye(4)
-        last = np.linalg.svd(equations)[2][:, 3]
-        points = last[:, :3] / last[:, 3:]
-        points[nowhere] = np.nan
-        return np.asarray(points)
+        return nearest_solution(equations)
 
     def midpoint(self) -> Array:
         """(n, 3) midpoints of the shortest segments between the rays."""
@@ -201,6 +196,16 @@ class PointBatch:
         _, cost = self._normal(x, y, w)
         behind = ~(Z > 0) | ~(self._depth(x, y, w) > 0) | ~np.isfinite(cost)
         return np.sqrt(cost), behind
+
+
+def nearest_solution(equations: Array) -> Array:
+    """(n, 3) points whose (X, Y, Z, 1) solve equations (n, m, 4) best: smallest singular vectors."""
+    nowhere = ~np.isfinite(equations).all(axis=(1, 2))
+    equations[nowhere] = np.eye(equations.shape[1], 4)
+    last = np.linalg.svd(equations)[2][:, 3]
+    points = last[:, :3] / last[:, 3:]
+    points[nowhere] = np.nan
+    return np.asarray(points)
 
 
 def _solve(N: list[Array]) -> list[Array]:
@@ -229,7 +234,7 @@ def _step_length(N: list[Array], step: list[Array]) -> Array:
     return np.sqrt(np.abs(x * (a * x + 2 * (b * y + c * w)) + y * (d * y + 2 * e * w) + f * w * w))
 
 
-def _inverse(N: list[Array]) -> list[Array]:
+def inverse_entries(N: list[Array]) -> list[Array]:
     """Entries xx, xy, xw, yy, yw, ww of the inverse of each symmetric 3 x 3 matrix."""
     a, b, c, d, e, f = N[:6]
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.two_view_points import MAX_STEPS, RISE, ROUNDING, SMALL_STEP
+from neurocal_cli.stereo.two_view_points import (
+    MAX_STEPS,
+    RISE,
+    ROUNDING,
+    SMALL_STEP,
+    inverse_entries,
+    nearest_solution,
+)
 
 _HALVINGS = 10
 
@@ -111,13 +118,7 @@ class WidePointBatch:
         identity = np.broadcast_to(np.eye(3, 4), (n, 3, 4))
         rig = np.concatenate([self.R, self.t[:, :, None]], axis=2)
         rows = [_cross(ray) @ P for ray, P in ((self.left, identity), (self.right, rig))]
-        equations = np.concatenate(rows, axis=1)
-        nowhere = ~np.isfinite(equations).all(axis=(1, 2))
-        equations[nowhere] = np.eye(6, 4)
-        last = np.linalg.svd(equations)[2][:, 3]
-        points = last[:, :3] / last[:, 3:]
-        points[nowhere] = np.nan
-        return np.asarray(points)
+        return nearest_solution(np.concatenate(rows, axis=1))
 
     def midpoint(self) -> Array:
         """(n, 3) midpoints of the shortest segments between the rays."""
@@ -173,8 +174,5 @@ def _solved(J: Array, r: Array) -> Array:
 
 def _inverse(N: Array) -> Array:
     """Inverses (n, 3, 3) of symmetric matrices; not finite where they are singular."""
-    a, b, c, d, e, f = N[:, 0, 0], N[:, 0, 1], N[:, 0, 2], N[:, 1, 1], N[:, 1, 2], N[:, 2, 2]
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * A + b * B + c * C
-    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
-    return np.stack([A, B, C, B, D, E, C, E, F], axis=1).reshape(-1, 3, 3) / det[:, None, None]
+    upper = [N[:, j, k] for j in range(3) for k in range(j, 3)]
+    return np.stack(inverse_entries(upper), axis=1)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]

@@ -59,7 +59,7 @@ class Sight:
         return self._of(np.unique(self.views.index[kept]), self.views.of_points(kept), kept)
 
     def _of(self, which: NDArray[np.intp], views: Views, kept: NDArray[np.bool_]) -> Sight:
-        state = replace(self.state, R=self.state.R[which], t=self.state.t[which])
+        state = self.state.of_views(which)
         bends = None if self.bends is None else self.bends[which]
         return replace(self, views=views, state=state, label=self.label[kept], bends=bends)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
-from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -126,16 +126,4 @@ def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Ar
     by : (2, 3, 3) array
         From `stretches`.
     """
-    width, n = 12 + len(state.k), batches.local.shape[2]
-    by_batch = np.empty((len(batches.view), width + 2, width + 2))
-    buffer = batches.memory(width)
-    for chunk in batches.chunks():
-        view = batches.view[chunk]
-        part = buffer[: len(view), :-1]
-        derivatives(batches, chunk, state, part)
-        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
-        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
-        by_stretch = np.einsum("tipn,tsin->tspn", by_local, by @ batches.local[chunk][:, None])
-        J = np.concatenate([part[:, :-1], by_stretch, part[:, -1:]], axis=1).reshape(len(view), width + 2, -1)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
-    return batches.sum_by_view(by_batch)
+    return displaced_blocks(batches, state, 2, lambda chunk: by @ batches.local[chunk][:, None])

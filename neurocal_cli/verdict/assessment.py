@@ -42,11 +42,10 @@ from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.camera.rich_lens import NODES
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
@@ -57,15 +56,14 @@ from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
-from neurocal_cli.verdict.noise_shape import noise_shape
+from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
+from neurocal_cli.verdict.pixel_values import repeated_views
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
     projection_uncertainty,
 )
-from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import reach_verdict
-from neurocal_cli.verdict.stated_noise import stated_noise, stated_survey
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
@@ -74,7 +72,6 @@ _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plan
 _BY_FLEXING = 0.01  # relative change of the focal length that bends of single views can mimic
 _EXACT = 1e-4  # of the spread of the pixels: negligible errors
 _DISTANT = 10.0  # times the distance of the farthest point
-_ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
 
 # In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
@@ -125,10 +122,8 @@ def _views_behind(calibration: Calibration) -> int:
     points = calibration.points
     poses = [calibration.views[name].pose for name in points.view_names]
     if calibration.camera.distortion.wide:
-        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        world, index = points.world, points.view_index
-        seen = calibration.camera.sees((R[index] @ world[..., None])[..., 0] + t[index])
-        return int(np.count_nonzero(np.bincount(index[~seen])))
+        seen = calibration.camera.sees(in_cameras(poses, points.world, points.view_index))
+        return int(np.count_nonzero(np.bincount(points.view_index[~seen])))
     axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
     depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
     behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
@@ -150,7 +145,9 @@ class _AtMinimum:
             self.camera.distortion.coefficients,
         )
         self.views = self._arranged()
-        self.free = _free(calibration)
+        self.free = estimated_parameters(calibration)
+        if xi_is_flat(calibration.distortion_model, calibration.distortion):
+            self.free[5] = False  # xi: alpha and alpha_u determine what is projected
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
@@ -329,20 +326,6 @@ class _AtMinimum:
         )  # fmt: skip
 
 
-def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and the distortion coefficients were determined by the points alone.
-
-    The displacement of a rich lens counts as fixed.
-    """
-    fixed = {*calibration.fixed, *NODES}
-    coefficients = coefficient_names(calibration.distortion_model)
-    if calibration.straight_lines is not None:
-        fixed |= set(coefficients)
-    if xi_is_flat(calibration.distortion_model, calibration.distortion):
-        fixed.add("xi")  # alpha and alpha_u determine what is projected
-    return np.array([name not in fixed for name in (*_ORDER, *coefficients)])
-
-
 def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
     """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
     names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
@@ -350,5 +333,5 @@ def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bo
     to_entries = np.eye(len(names))
     to_entries[:5, :5] = np.linalg.inv(calibration.intrinsics.entry_jacobian() * pixel_scale)
     block = to_entries[:, place] @ calibration.covariance @ to_entries[:, place].T
-    free = np.array([name not in calibration.fixed for name in (*_ORDER, *names[5:])])
+    free = free_entries(calibration)
     return free, np.asarray(block[np.ix_(free, free)])

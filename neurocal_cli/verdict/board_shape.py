@@ -10,17 +10,10 @@ in-plane displacements.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.reprojection import (
-    POSE,
-    CameraState,
-    camera_columns,
-    derivatives,
-)
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -104,7 +97,7 @@ def board_shape(
     seen = views.n_views
     if seen > _ENOUGH:
         some = np.linspace(0, seen - 1, _ENOUGH).astype(np.intp)
-        views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
+        views, state = views.subset(some), state.of_views(some)
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     N = _with_shape(views, state, frame)
     f, n = len(shared), len(_BENT) + len(_STRETCHED)
@@ -196,29 +189,17 @@ def _powers(x: Array, y: Array) -> Array:
 
 def _with_shape(views: Views, state: CameraState, frame: _Frame) -> Array:
     """Normal matrices (V, 12 + K + 9, 12 + K + 9) with the shape's columns before the residual's."""
-    batches, n = views.batches, len(_BENT) + len(_STRETCHED)
-    width = 12 + len(state.k)
-    found = np.empty((len(batches.view), width + n, width + n))
-    for chunk in batches.chunks():
+    batches = views.batches
+
+    def displaced(chunk: slice) -> Array:
         view = batches.view[chunk]
-        J = np.zeros((len(view), width, 2, batches.local.shape[2]))
-        derivatives(batches, chunk, state, J)
-        scale = views.scale[view]
-        world = batches.local[chunk] * scale[:, None, None] + views.centre[view][:, :, None]
-        x, y = (
-            np.moveaxis(np.swapaxes(frame.axes[:, :2], 0, 1) @ (world - frame.centre[:, None]), 1, 0)
-            / frame.size
-        )
-        # The derivative by tau is that by the point in front of the camera.
-        along, _, normal = np.moveaxis(state.R[view] @ frame.axes * (frame.size / scale)[:, None, None], 2, 0)
-        drawn, lifted = (
-            np.einsum("ti,tiun->tun", axis, J[:, POSE.start + 3 : POSE.stop])[:, None]
-            for axis in (along, normal)
-        )
-        bent = np.moveaxis(_powers(x, y), 0, 1)[:, :, None] * lifted
-        stretched = np.stack([x, y], axis=1)[:, :, None] * drawn
-        whole = np.concatenate([J[:, :-1], bent, stretched, J[:, -1:]], axis=1).reshape(
-            len(view), width + n, -1
-        )
-        found[chunk] = whole @ np.swapaxes(whole, 1, 2)
-    return batches.sum_by_view(found)
+        scale = views.scale[view][:, None, None]
+        world = batches.local[chunk] * scale + views.centre[view][:, :, None]
+        on_board = frame.axes[:, :2].T @ (world - frame.centre[:, None]) / frame.size  # (T, 2, n)
+        height = np.moveaxis(_powers(*np.moveaxis(on_board, 1, 0)), 0, 1)  # (T, 7, n)
+        axes = (frame.axes * frame.size / scale)[:, None]
+        bent = height[:, :, None] * axes[..., 2:]
+        stretched = on_board[:, :, None] * axes[..., :1]
+        return np.concatenate([bent, stretched], axis=1)
+
+    return displaced_blocks(batches, state, len(_BENT) + len(_STRETCHED), displaced)

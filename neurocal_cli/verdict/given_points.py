@@ -9,7 +9,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread
+from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread, verdict_of
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
 # Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
@@ -57,15 +57,12 @@ def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoi
     if given.fit is not None:
         reestimated = gather_evidence(given.fit).reestimated
         findings += given_parameters(reestimated, calibration.intrinsics, calibration.std)
-    findings = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
-    if not findings:
-        return verdict
-    grades, reasons, advice = zip(*findings, strict=True)
+    found = verdict_of(findings, {})
     return replace(
         verdict,
-        word=WORDS[max(*grades, WORDS.index(verdict.word))],
-        reasons=(*reasons, *verdict.reasons),
-        advice=tuple(dict.fromkeys((*advice, *verdict.advice))),
+        word=max(found.word, verdict.word, key=WORDS.index),
+        reasons=(*found.reasons, *verdict.reasons),
+        advice=tuple(dict.fromkeys((*found.advice, *verdict.advice))),
     )
 
 

@@ -6,8 +6,6 @@ information criterion selects among them.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,7 +77,7 @@ def missing_coefficients(
         return None
     if views.n_views > _ENOUGH:
         some = np.linspace(0, views.n_views - 1, _ENOUGH).astype(np.intp)
-        views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
+        views, state = views.subset(some), state.of_views(some)
         normal = normal[some]
     before, n_coefficients = float(normal[:, -1, -1].sum()), len(state.k)
     richer = [state.with_model(m) for m in POLYNOMIAL_MODELS[POLYNOMIAL_MODELS.index(state.model) + 1 :]]

@@ -1,4 +1,4 @@
-"""Findings about implausible pixel coordinates: rounded, clipped, normalised, outside the image."""
+"""Findings about implausible pixel coordinates: rounded, clipped, normalised, outside the image, twice."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ _ALIKE = 6
 _ALIKE_SHARE = 0.01
 _BESIDE = 1.0  # px by which a detected point may lie outside the image
 _SOME = 0.01  # share of points outside the image up to which they count as single outliers
+_SAME = 1e-3  # px by which a copy of a view may differ
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 
 
@@ -123,3 +124,20 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
             "pixels",
             "check the ids and X,Y,Z of these points",
         )
+
+
+def repeated_views(points: Correspondences) -> tuple[str, ...]:
+    """Names of views with the same pixels as an earlier view, and of views with duplicated rows."""
+    table = np.round(np.column_stack([points.pixels / _SAME, points.world]), 6)
+    order = np.lexsort((*table.T, points.view_index))
+    table, view = table[order], points.view_index[order]
+    again = (table[1:] == table[:-1]).all(axis=1) & (view[1:] == view[:-1])
+    doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
+    of_views = np.split(np.round(table[:, :2]), np.cumsum(np.bincount(points.view_index))[:-1])
+    found, known = [], set()
+    for name, pixels, twice in zip(points.view_names, of_views, doubled, strict=True):
+        key = pixels.tobytes()
+        if key in known or twice:
+            found.append(name)
+        known.add(key)
+    return tuple(found)

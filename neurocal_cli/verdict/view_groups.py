@@ -8,6 +8,8 @@ cameras are adjusted to their views. If hardly more than noise remains, there ar
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -141,7 +143,11 @@ def _two_cameras(
     for _ in range(_ADJUSTED):
         if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < _FEWEST:
             return found
-        both = [_adjusted(views, state, np.flatnonzero(group), free) for group in (member, ~member)]
+        groups = np.flatnonzero(member), np.flatnonzero(~member)
+        both = [
+            adjust(views.subset(which).batches, state.of_views(which), free, True, _STEPS).state
+            for which in groups
+        ]
         cost = np.stack([_cost_of_each(views, state, camera) for camera in both])
         cameras = np.stack([camera.entries[0] for camera in both])
         found = _Split(member, cameras, float(cost[0][member].sum() + cost[1][~member].sum()))
@@ -173,16 +179,9 @@ def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
     return division
 
 
-def _adjusted(
-    views: Views, state: CameraState, which: NDArray[np.intp], free: NDArray[np.bool_]
-) -> CameraState:
-    start = CameraState(state.entries, state.R[which], state.t[which], state.model, state.k)
-    return adjust(views.subset(which).batches, start, free, True, _STEPS).state
-
-
 def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Array:
     """(V,) squared error of each view with a given camera and its best pose."""
-    start = CameraState(camera.entries, state.R, state.t, camera.model, camera.k)
+    start = replace(camera, R=state.R, t=state.t)
     return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
 
 

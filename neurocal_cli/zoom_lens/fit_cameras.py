@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
@@ -101,7 +102,7 @@ def fit_lens_cameras(
     seed: int = 0,
     *,
     topologies: tuple[tuple[int, int], ...] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> ZoomLens:
     """Fit networks to known cameras; the scatter about them gives the noise of the parameters.
 

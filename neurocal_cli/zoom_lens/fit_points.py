@@ -10,22 +10,20 @@ import numpy as np
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
 from neurocal_cli.errors import DegenerateGeometryError, check_choice
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.target import TARGETS, Target
-from neurocal_cli.zoom_lens.alternating_training import take_turns
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.cross_validation import left_out_errors
-from neurocal_cli.zoom_lens.distortion_selection import choose_model
+from neurocal_cli.zoom_lens.cross_validation import contradiction, left_out_errors, most_suspect
 from neurocal_cli.zoom_lens.initialisation import (
     CalibratedSettings,
     FitOptions,
-    Progress,
     calibrate_settings,
     check_settings,
+    choose_model,
     may_reject,
     without,
 )
-from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, train_joint
-from neurocal_cli.zoom_lens.outlier_settings import contradiction, most_suspect
+from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, take_turns, train_joint
 from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants

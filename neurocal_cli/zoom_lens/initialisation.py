@@ -1,8 +1,11 @@
-"""Step 1: a calibration at each setting, and rejection of settings whose pixels do not fit."""
+"""Step 1: a calibration at each setting, without settings whose pixels do not fit, and the distortion model.
+
+The distortion model is the simplest whose cross-validation error no richer one lowers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +14,9 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.committee import Budget
-from neurocal_cli.zoom_lens.outlier_settings import bad_pixels
+from neurocal_cli.initialisation.options import Progress
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
+from neurocal_cli.zoom_lens.network_training import Schedule
 from neurocal_cli.zoom_lens.setting_normals import PixelData, Tables
 from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
 from neurocal_cli.zoom_lens.static_calibration import (
@@ -23,7 +27,15 @@ from neurocal_cli.zoom_lens.static_calibration import (
 )
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting
 
-Progress = Callable[[str, float], None]
+LADDER = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
+_QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
+# A richer model must lower the cross-validation error to this share and the residual variance by so many
+# standard deviations. The tests of the choice in tests/test_zoom_lens.py have both outcomes.
+_LARGEST_SHARE = 0.98
+_SIGMAS = 3.0
+# Times the median rms error of the settings. As a lens may change sharply between two settings, the limit is
+# wide; the tests of settings that are left out in tests/test_zoom_lens.py check both sides.
+_WRONG_PIXELS = 3.0
 
 
 @frozen_dataclass
@@ -91,7 +103,7 @@ def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> Cal
                 f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
                 "moved, give several views of the board at each setting, and --camera moving"
             )
-        bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if options.reject else None
+        bad = _bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if options.reject else None
         if bad is None or not may_reject(rejected, lens):
             return CalibratedSettings(lens, data, static, tables, tuple(rejected))
         setting, reason = bad
@@ -120,3 +132,61 @@ def without(
         good=static.good[keep],
     )
     return rest, PixelData.of(rest, options.still, model, options.free_theta), part
+
+
+def _bad_pixels(rms: Array) -> tuple[int, str] | None:
+    """The setting that fits far worse than the others and the reason to reject it; rms is (S,) in px."""
+    worst, typical = int(rms.argmax()), float(np.median(rms))
+    if rms[worst] <= _WRONG_PIXELS * typical:
+        return None
+    return worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
+
+
+def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
+    """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
+    best: CalibratedSettings | None = None
+    best_px: float | None = None  # computed when a richer model is compared
+    failure: DegenerateGeometryError | None = None
+    for model in LADDER:
+        try:
+            start = calibrate_settings(lens, model, options)
+        except DegenerateGeometryError as error:
+            failure = error
+            continue
+        if best is None:
+            best = start
+            continue
+        if not _explains_more(start, best):
+            continue
+        options.report(f"trying distortion model {model}", 0.5)
+        best_px = _held_out(best, options) if best_px is None else best_px
+        error_px = _held_out(start, options)
+        if error_px < _LARGEST_SHARE * best_px:
+            best, best_px = start, error_px
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def _explains_more(rich: CalibratedSettings, simple: CalibratedSettings) -> bool:
+    """Whether the residual variance decreases significantly."""
+    freedom = rich.data.views.n_equations
+    return rich.variance < simple.variance * (1 - _SIGMAS * np.sqrt(2 / freedom))
+
+
+def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
+    """Twofold cross-validation error [px]: every second setting is predicted from the others."""
+    x = start.controls
+    inside = np.arange(len(x)) % 2 == 0
+    squares = 0.0
+    for part in (inside, ~inside):
+        rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
+        H = start.tables.normal.H[part]
+        members = fit_committee(
+            x[part], names, local[part], H, start.variance, rng, _QUICK_BUDGET, lambda share: None
+        )
+        predicted = np.mean([nets.local(x) for nets in members], axis=0)
+        there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
+        squares += float(there.cost[~part].sum()) if np.isfinite(there.cost).all() else np.inf
+    return float(np.sqrt(squares / len(start.lens.points)))

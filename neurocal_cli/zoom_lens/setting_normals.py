@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.bundle_adjustment.units import translations, translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -160,7 +161,7 @@ class PixelData:
         if not self.still:
             free = np.zeros(5 + state.k.shape[1], dtype=bool)
             state = adjust(self.views.batches, state, free, True, _POSE_STEPS).state
-            constants = self._with_poses(constants, state)
+            constants = replace(constants, R=state.R, t=translations(self.views, state))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             N, sensible = normal_blocks(self.views.batches, state)
             reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
@@ -187,13 +188,9 @@ class PixelData:
             t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[self.setting, 4]])
         else:
             R, t = constants.R, constants.t
-        centred = ((R @ views.centre[..., None])[..., 0] + t) / views.scale[:, None]
+        centred = translations_normalised(views, R, t)
         k = local[self.setting, len(self.names) - len(coefficient_names(self.model)) :]
         return CameraState(A / views.pixel_scale, R, centred, self.model, k)
-
-    def _with_poses(self, constants: Constants, state: CameraState) -> Constants:
-        t = state.t * self.views.scale[:, None] - (state.R @ self.views.centre[..., None])[..., 0]
-        return replace(constants, R=state.R, t=t)
 
     def entries_by_parameters(self, local: Array, constants: Constants) -> tuple[Array, Array]:
         """Derivatives of A's normalised entries by alpha_u, alpha_v, u0, v0 (V, 5, 4) and by theta (V, 5)."""

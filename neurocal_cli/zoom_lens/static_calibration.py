@@ -7,7 +7,8 @@ smallest error that any model of the local parameters can reach at the settings.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
+from neurocal_cli.least_squares.schur_complement import SharedAndOwn, schur_covariance
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData, Tables
@@ -51,9 +53,7 @@ class StaticFit:
     reasons: dict[int, str]
 
 
-def calibrate_each(
-    lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Callable[[str, float], None]
-) -> StaticFit:
+def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
     """Calibrate each setting alone, from random weights.
 
     Raises
@@ -136,73 +136,41 @@ def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
 
 
 def common_tables(
-    data: PixelData, local: Array, constants: Constants, progress: Callable[[str, float], None] | None = None
+    data: PixelData, local: Array, constants: Constants, progress: Progress | None = None
 ) -> Tables:
     """Minimise the reprojection error over the local parameters and the constants."""
-    return _minimise(_CommonTables(data, local, constants, True, progress))
+    return _minimum(data, local, constants, data.n_shared, progress)
 
 
 def fit_local(data: PixelData, local: Array, constants: Constants) -> Tables:
     """Minimise the reprojection error over the local parameters alone."""
-    return _minimise(_CommonTables(data, local, constants, False, None))
+    return _minimum(data, local, constants, 0, None)
 
 
-def _minimise(problem: _CommonTables) -> Tables:
-    settled = bool(minimise(problem, _OPTIONS).settled[0])
-    return Tables(problem.local, problem.constants, problem.normal, settled)
+def _minimum(
+    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None
+) -> Tables:
+    """Minimise over the local parameters and some constants; the local ones are eliminated."""
+    tried = count()
+
+    def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
+        # Valid if all points are in front and the distortion is monotonic.
+        if progress is not None:
+            progress("common constants", (done := next(tried)) / (done + 10))
+        constants = before.constants.moved(by_shared) if n_shared else before.constants
+        tables = _linearised(data, before.local + by_local, constants)
+        return tables, tables.normal.sensible
+
+    L, start = local.shape[1], _linearised(data, local, constants)
+    shared = np.arange(L, L + n_shared)
+    problem = SharedAndOwn(start, lambda tables: tables.normal.blocks, moved, shared, np.arange(L))
+    settled = minimise(problem, _OPTIONS).settled[0]
+    return replace(problem.state, converged=bool(settled))
 
 
-_Step = tuple[Array, Array]  # of the local parameters (S, L) and of the constants (Q,)
-_Trial = tuple[Array, Constants, Normal]
-
-
-class _CommonTables:
-    """The reprojection error of all settings as a problem of `least_squares` with one group.
-
-    The local parameters of each setting are eliminated (Schur complement).
-    """
-
-    def __init__(
-        self,
-        data: PixelData,
-        local: Array,
-        constants: Constants,
-        shared: bool,
-        progress: Callable[[str, float], None] | None,
-    ) -> None:
-        self.data, self.local, self.shared, self.progress = data, local, shared, progress
-        self.normal, self.constants = data.linearise(local, constants)
-        self.tried = 0
-
-    @property
-    def cost(self) -> Array:
-        """(1,) sum of squares."""
-        return self.normal.cost.sum(keepdims=True)
-
-    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of the local parameters and of the constants, and the predicted gain."""
-        if self.progress is not None:
-            self.progress("common constants", self.tried / (self.tried + 10))
-        self.tried += 1
-        L, Q = self.local.shape[1], self.data.n_shared
-        moving = np.arange(L, L + Q) if self.shared else np.arange(0)
-        by_shared, by_local, promised = schur_step(
-            self.normal.blocks, moving, np.arange(L), float(damping[0])
-        )
-        return (by_local, by_shared), np.array([promised])
-
-    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The tables after a step; valid if all points are in front and the distortion is monotonic."""
-        by_local, by_shared = step
-        local = self.local + by_local
-        constants = self.constants.moved(by_shared) if self.shared else self.constants
-        normal, constants = self.data.linearise(local, constants)
-        return (local, constants, normal), normal.cost.sum(keepdims=True), np.array([normal.sensible])
-
-    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Accept the trial."""
-        if better[0]:
-            self.local, self.constants, self.normal = trial
+def _linearised(data: PixelData, local: Array, constants: Constants) -> Tables:
+    normal, constants = data.linearise(local, constants)
+    return Tables(local, constants, normal)
 
 
 def local_covariance(normal: Normal, L: int, variance: float) -> Array:

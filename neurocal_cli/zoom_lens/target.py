@@ -6,12 +6,12 @@ these cameras (`pipeline.common_target`). The lens is fitted to the target that 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.methods import calibrate
 from neurocal_cli.pipeline.common_target import common_target
 from neurocal_cli.target import Target
@@ -27,7 +27,7 @@ def lens_target(
     distortion: str,
     skew: bool,
     seed: int,
-    progress: Callable[[str, float], None],
+    progress: Progress,
 ) -> Target | None:
     """Estimate the target; None if it stays as given.
 

@@ -14,8 +14,8 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.light import enough_parts, image_light
+from neurocal_cli.simulation.rendering.render import response, signal
 from neurocal_cli.simulation.rendering.scene import Scene, Sensor
-from neurocal_cli.simulation.rendering.sensor import response, signal
 from support.wide_camera import WideCamera
 
 _SRGB_LINEAR = 0.0031308

@@ -30,7 +30,7 @@ from neurocal_cli.simulation.rendering import (
     ground_truth,
 )
 from neurocal_cli.simulation.rendering.light import image_light
-from neurocal_cli.simulation.rendering.sensor import digitised
+from neurocal_cli.simulation.rendering.render import digitised
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 
