@@ -62,7 +62,8 @@ def test_outermost_midpoints_are_measured_along_their_edges(name: str) -> None:
     for seed in range(4):
         scene, one = seen(seed, name)
         rows, (plane,) = outermost(one), scene.board.planes
-        assert len(rows) == 2 * (plane.cols - 1) + 2 * (plane.rows - 1)
+        whole = 2 * (plane.cols - 1) + 2 * (plane.rows - 1)
+        assert whole - 1 <= len(rows) <= whole  # an outlier is left out
         assert all(is_in_an_outer_row(one.ids[row], plane.cols, plane.rows) for row in rows)
         truth = scene.camera.project(scene.pose.to_camera(one.world[rows]))[0]
         u, v = (one.pixels[rows] - truth).T

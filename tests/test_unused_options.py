@@ -17,16 +17,17 @@ distortion_model: plumb_bob
 distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
 """
 SETTINGS = "zoom,alpha_u,alpha_v,u0,v0\n" + "".join(f"{z},{500 * z},{500 * z},320,240\n" for z in range(1, 6))
+ENDS_SOON = ("--camera", "nowhere.yaml")  # with an error that comes after the note
 UNUSED = {
     "calibrate --starts": ("calibrate", FLAT, "--method", "linear", "--starts", 5),
     "stereo --no-skew": ("stereo", LEFT, RIGHT, "--no-skew"),
     "stereo --distortion": ("stereo", LEFT, RIGHT, "--distortion", "k1"),
     "stereo --type": ("stereo", LEFT, RIGHT, "--type", 2),
-    "simulate --data-sets": ("simulate", "--data-sets", 2),
-    "simulate --sigma": ("simulate", "--rates", "--sigma", 2),
-    "simulate --trials": ("simulate", "--rates", "--trials", 2),
-    "simulate --methods": ("simulate", "--rates", "--methods", "linear"),
-    "simulate --random-starts": ("simulate", "--rates", "--random-starts", 2),
+    "simulate --data-sets": ("simulate", "--data-sets", 2, *ENDS_SOON),
+    "simulate --sigma": ("simulate", "--rates", "--sigma", 2, *ENDS_SOON),
+    "simulate --trials": ("simulate", "--rates", "--trials", 2, *ENDS_SOON),
+    "simulate --methods": ("simulate", "--rates", "--methods", "linear", *ENDS_SOON),
+    "simulate --random-starts": ("simulate", "--rates", "--random-starts", 2, *ENDS_SOON),
     "detect --jobs": ("detect", SAMPLES, "--cols", 9, "--rows", 6, "--square", 25, "--watch", 1, "--jobs", 2),
     "rectify --side-by-side": ("rectify", "rig.yaml", LEFT, RIGHT, "-o", "new", "--side-by-side"),
     "rectify --interpolation": ("rectify", "rig.yaml", "--maps", "-o", "new", "--interpolation", "linear"),
