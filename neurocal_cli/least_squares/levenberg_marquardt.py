@@ -17,13 +17,6 @@ Nielsen's smallest factor is 1/3. Here it is an option, because starts near the 
 quickly. 2 rho - 1 is limited to 2, because the model does not hold either if a step gains far more than
 predicted.
 
-Near the minimum the gains fall at least by a constant factor, which the last two of them estimate. So after
-a step with the predicted gain d_n and another before it with the gain d_(n-1), the next step promises at most
-
-    d_n min(1, d_n / d_(n-1)).
-
-The descent has converged when that is negligible, which saves a last step that only confirms it.
-
 Groups are independent problems solved side by side. They share no unknowns; each has its own lambda and its
 own end. A single problem is one group.
 
@@ -93,13 +86,12 @@ class DescentOptions:
     least_damping, largest_damping : float
         Lower limit of lambda, and the value above which the descent counts as stuck.
     tolerance : float
-        Converged after an accepted step when the gain is less than this share of the cost.
+        Converged when an accepted step gains less than this share of the cost.
     negligible : float
         Likewise as an absolute gain, added to that share.
     by_promise : bool
-        Whether this gain is what the next step promises or the actual gain of the last one. Near the minimum
-        the next step gains less still. Far from it, a small actual gain may be accidental, and a small
-        predicted gain a saddle point.
+        Whether this gain is the predicted or the actual one. Near the minimum both are equal. Far from it, a
+        small actual gain may be accidental, and a small predicted gain a saddle point.
     flat : float
         The minimum is reached when a rejected step had predicted a gain of less than this share of the cost:
         it failed by rounding only.
@@ -199,7 +191,6 @@ class LevenbergMarquardt:
         G = len(self.cost)
         self.active = np.arange(G)
         self.damping, self.growth = np.full(G, options.damping), np.full(G, 2.0)
-        self.last = np.zeros(G)  # gain predicted for the last step; 0 if there is none or it was rejected
         self.floor = np.zeros(G) + floor
         self.limit = np.full(G, options.max_iterations) if limit is None else limit
         self.soonest = int(self.limit.min(initial=options.max_iterations))  # first iteration at a limit
@@ -233,12 +224,7 @@ class LevenbergMarquardt:
         self.growth = np.where(better, 2.0, 2 * self.growth)
         self.cost = np.where(better, after, before)
         exact = self.cost <= self.floor
-        gain = gained
-        if options.by_promise:
-            fall = np.divide(promised, self.last, out=np.ones(len(gained)), where=self.last > 0)
-            gain = promised * np.minimum(fall, 1.0)
-            self.last = np.where(better, promised, 0.0)
-        converged = better & (gain < self._last_gain(before))
+        converged = better & ((promised if options.by_promise else gained) < self._last_gain(before))
         done = exact | converged
         if self.iteration >= self.soonest:
             done |= self.limit <= self.iteration
@@ -266,7 +252,7 @@ class LevenbergMarquardt:
         """
         self.cost = self.problem.cost.copy()
         self.damping = np.minimum(self.damping, self.options.damping)
-        self.growth, self.last = np.full(len(self.cost), 2.0), np.zeros(len(self.cost))
+        self.growth = np.full(len(self.cost), 2.0)
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Record the groups that have stopped, and remove them from the active ones."""
@@ -274,5 +260,4 @@ class LevenbergMarquardt:
         self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
         self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]
         self.damping, self.growth = self.damping[going], self.growth[going]
-        self.last = self.last[going]
         self.limit = self.limit[going]
