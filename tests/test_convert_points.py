@@ -219,6 +219,41 @@ def test_corners_of_matlab_run_down_the_columns_of_the_board(tmp_path: Path) -> 
             read_corners([tmp_path / "wrong.mat"], None, [])
 
 
+@pytest.mark.parametrize(
+    ("target", "ending"), [("mrcal", ".vnl"), ("json", ".json"), ("npz", ".npz"), ("matlab", ".mat")]
+)
+def test_points_come_through_pipes(target: str, ending: str, tmp_path: Path) -> None:
+    """As in ``neurocal detect ... | neurocal convert - --to mrcal``, and back."""
+    write_points(points(pixels()), tmp_path / "points.csv")
+    by_name = tmp_path / f"corners{ending}"
+    assert run("convert", tmp_path / "points.csv", "--to", target, "-o", by_name).exit_code == 0
+    piped = tmp_path / f"piped{ending}"
+    csv = (tmp_path / "points.csv").read_bytes()
+    result = run("convert", "-", "--to", target, "-o", piped, stdin=csv)
+    assert result.exit_code == 0, result.stderr
+    assert "60 points of 3 views" in result.stderr
+    if target != "matlab":  # it stores the time
+        assert piped.read_bytes() == by_name.read_bytes()
+    words = SIZE if target == "mrcal" else []
+    result = run("convert", "-", *words, "--to", "neurocal", stdin=piped.read_bytes())
+    again = run("convert", by_name, *words, "--to", "neurocal")
+    assert result.exit_code == again.exit_code == 0, result.stderr
+    assert result.stdout == again.stdout
+
+
+@pytest.mark.parametrize("text", [b"", b"1 2 3", b"a: ["])
+def test_what_is_neither_camera_nor_points_is_refused_from_stdin_as_from_a_file(
+    text: bytes, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_bytes(text)
+    piped, file = (
+        run("convert", "-", "--to", "ros", stdin=text),
+        run("convert", tmp_path / "file", "--to", "ros"),
+    )
+    assert piped.exit_code == file.exit_code == 1
+    assert piped.stderr == file.stderr.replace(str(tmp_path / "file"), "<stdin>")
+
+
 def test_calibrate_says_what_to_do_with_corners_of_other_programs(tmp_path: Path) -> None:
     np.savez(tmp_path / "corners.npz", corners=pixels())
     (tmp_path / "corners.vnl").write_text("# filename x y level\na.png 1 2 0\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -128,23 +129,20 @@ def convert(
     folder = os.path.isdir(output) or output.endswith(os.sep)
     check_outputs((None if folder else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
-    points = _points(files, target_board, unit, image_size)
-    if points is None:
-        if target_board is not None:
-            raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
-        if len(files) > 2:
-            raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
-        from neurocal_cli.io.exchange.reading import read_cameras
+    from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.io.files import repeatable_stdin
 
-        cameras = _completed(read_cameras(files), unit, image_size)
-        told = _write_cameras(cameras, target, model, force, output)
+    with repeatable_stdin() if "-" in files else nullcontext():
+        found = _read(files, target_board, unit, image_size)
+    if isinstance(found, CameraSet):
+        told = _write_cameras(found, target, model, force, output)
     else:
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
         options.note_unused("on points", "force")
-        told = _write_points(points, target, output)
+        told = _write_points(found, target, output)
         if not as_json:
-            say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
+            say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
     if as_json:
         print_summary(told)
 
@@ -178,6 +176,21 @@ def _write_cameras(
         "n_views": len(adapted.cameras.poses),
         "warnings": [*adapted.losses, *adapted.remarks],
     }
+
+
+def _read(
+    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
+) -> Correspondences | CameraSet:
+    points = _points(files, board, unit, size)
+    if points is not None:
+        return points
+    if board is not None:
+        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
+    if len(files) > 2:
+        raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
+    from neurocal_cli.io.exchange.reading import read_cameras
+
+    return _completed(read_cameras(files), unit, size)
 
 
 def _points(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
@@ -20,6 +22,19 @@ _WIDE_MARKS = (
     (b"\xff\xfe", "UTF-16"),
     (b"\xfe\xff", "UTF-16"),
 )
+# All of stdin within `repeatable_stdin`.
+_KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
+
+
+@contextmanager
+def repeatable_stdin() -> Iterator[None]:
+    """Keep what is read from stdin, so that several readers can look at it in turn."""
+    token = _KEPT.set(None)
+    try:
+        _KEPT.set(read_bytes("-")[0])
+        yield
+    finally:
+        _KEPT.reset(token)
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
@@ -43,7 +58,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
-            return sys.stdin.buffer.read(), "<stdin>"
+            return _stdin().read(), "<stdin>"
     source = one_line(path)
     with reading_failures(source), open(path, "rb") as file:
         _protect(file)
@@ -58,7 +73,7 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
-            yield from _whole_lines(sys.stdin.buffer, size)
+            yield from _whole_lines(_stdin(), size)
         return
     with reading_failures(one_line(path)):
         file = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
@@ -71,6 +86,11 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
             if block is None:
                 return
             yield block
+
+
+def _stdin() -> IO[bytes]:
+    kept = _KEPT.get()
+    return sys.stdin.buffer if kept is None else io.BytesIO(kept)
 
 
 def _protect(file: IO[bytes]) -> None:

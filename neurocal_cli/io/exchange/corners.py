@@ -55,7 +55,8 @@ def read_corners(
     Parameters
     ----------
     paths : sequence of str or Path
-        One file; or a file of board points and then a file for each view.
+        One file; or a file of board points and then a file for each view. ``-`` is stdin, which has to be
+        repeatable (`repeatable_stdin`).
     board : Board, optional
         Gives the board points if the files do not.
     notes : list of str
@@ -73,8 +74,6 @@ def read_corners(
         A file cannot be read, or its corners are not those of the board.
     """
     names = [str(path) for path in paths]
-    if "-" in names:
-        return None  # stdin can be read only once, and may be a camera
     data, source = read_bytes(names[0])
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
         return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
