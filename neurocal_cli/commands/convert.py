@@ -116,8 +116,7 @@ def convert(
       neurocal convert fisheye.yaml --to ros --model rational --json \\
           -o rational.yaml
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
-          --points vertices -o points.csv
-      neurocal convert points.csv --to mrcal -o corners.vnl
+          --points vertices | neurocal convert - --to mrcal -o corners.vnl
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
       neurocal convert corners.vnl --board board.yaml --to neurocal -o again.csv
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
