@@ -50,6 +50,17 @@ OVERWRITING = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("target", "-"), ("convert", "-", "--to", "ros"), ("lens", "camera", "-", "--zoom", 1), ("report", "-")],
+    ids=lambda words: words[0],
+)
+def test_a_command_after_one_that_failed_says_that_its_input_is_empty(words: tuple[object, ...]) -> None:
+    result = run(*words, stdin=b"")
+    assert result.exit_code == 1
+    assert result.stderr == "Error: <stdin>: is empty; check the command before it\n"
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 

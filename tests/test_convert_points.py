@@ -241,7 +241,7 @@ def test_points_come_through_pipes(target: str, ending: str, tmp_path: Path) -> 
     assert result.stdout == again.stdout
 
 
-@pytest.mark.parametrize("text", [b"", b"1 2 3", b"a: ["])
+@pytest.mark.parametrize("text", [b"1 2 3", b"a: ["])
 def test_what_is_neither_camera_nor_points_is_refused_from_stdin_as_from_a_file(
     text: bytes, tmp_path: Path
 ) -> None:

@@ -69,6 +69,8 @@ def parse_yaml(text: str, source: str) -> Any:
     FormatError
         The text is not YAML, or has aliases, duplicate keys or more than one document.
     """
+    if source == "<stdin>" and not text.strip():
+        raise FormatError("is empty; check the command before it", source)
     text = text.replace("\r\n", "\n")
     text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which YAML parsers refuse
     text, tables = _cut_rows(text)
