@@ -7,6 +7,7 @@ import gc
 import signal
 import sys
 import warnings
+from contextlib import suppress
 
 
 def main() -> None:
@@ -30,7 +31,10 @@ def main() -> None:
     except KeyboardInterrupt:  # pressed while modules are still being loaded
         sys.exit(_interrupted())
     finally:
-        # Python takes some ms to end, in which an interrupt would kill it whatever its exit code is.
+        # Python takes some ms to end, in which an interrupt would kill it whatever its exit code is. One that
+        # has just come is raised by the first of the two calls.
+        with suppress(KeyboardInterrupt):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         # It also kills itself at its end if an interrupt came while a text was evaluated, as some modules do
         # when they are loaded, even if the interrupt was handled. The next evaluation makes it forget that.

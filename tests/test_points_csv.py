@@ -267,6 +267,7 @@ LABELS = st.text(
     st.characters(exclude_categories=("Cs",), exclude_characters="\0\r\n"), min_size=1, max_size=8
 )
 NUMBERS = st.floats(-1e99, 1e99)
+COORDINATES = NUMBERS.filter(lambda x: x == 0 or abs(x) > 1e-99)  # smaller ones are refused
 
 
 @st.composite
@@ -280,7 +281,7 @@ def correspondences(draw):
     views = draw(st.none() | st.lists(LABELS, min_size=n, max_size=n))
     ids = draw(st.none() | st.lists(LABELS, min_size=n, max_size=n, unique=True))
     return Correspondences(
-        draw(arrays(float, (n, 3), elements=NUMBERS)),
+        draw(arrays(float, (n, 3), elements=COORDINATES)),
         draw(arrays(float, (n, 2), elements=NUMBERS)),
         view=views,
         point=ids,
