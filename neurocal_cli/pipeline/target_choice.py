@@ -15,7 +15,6 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
@@ -23,20 +22,18 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import may_be_bent
+from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
-from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.target_shape.view_bends import find_bends
-from neurocal_cli.verdict.given_parameters import reestimate_given
-from neurocal_cli.verdict.noise import stated_noise
-from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
+from neurocal_cli.verdict.view_groups import OWN_STEPS
 
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
 _OF_LINES = "k1k2p1p2"  # the model that `plumb-line` estimates
-_TOLD_APART = 5.0  # standard deviations, as for the verdict
 # Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
 # most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
 # half 3 % worse.
@@ -101,7 +98,7 @@ def _searched(
     found = _found(solution, choice, None)
     if choice != "flat":
         found = _with_bends(solution, found)
-    if found is not None and choice == "auto" and _other_reason(solution, found):
+    if found is not None and choice == "auto" and has_other_cause(solution, found):
         return solution, rejected
     kept = replace(solution, target_kept=choice == "auto")
     best: tuple[Solution, Rejected] = kept, rejected
@@ -140,7 +137,7 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
     if not problem.free_poses or not enough_views(label, problem.views.n_views):
         return ""
     found = find_target([fit], least_gain=LEAST_GAIN)
-    if found is None or _other_reason(replace(solution, problem=fit[0], adjusted=fit[1]), found):
+    if found is None or has_other_cause(replace(solution, problem=fit[0], adjusted=fit[1]), found):
         return ""
     target = found.target
     off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
@@ -149,45 +146,6 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
         "where they are given; its lines are not straight, which biases the distortion estimated from them; "
         "estimate it from the points instead (--distortion auto)"
     )
-
-
-def _other_reason(solution: Solution, found: Found) -> bool:
-    """Whether wrong sigmas, a too simple lens, wrong given parameters or several cameras are the cause."""
-    problem, points = solution.problem, solution.problem.points
-    place = np.array([problem.views.names.index(name) for name in points.view_names])
-    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
-    if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
-        return True
-    named = solution.model_errors is None and solution.straight_lines is None
-    if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
-        return True
-    if not problem.free_poses:
-        return False
-    asked = reestimate_given(problem.views, solution.state, problem.fixed, problem.free_poses)
-    if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
-        return True
-    return _are_two_cameras(solution, found)
-
-
-def _are_two_cameras(solution: Solution, found: Found) -> bool:
-    """Whether two cameras (or a moving zoom) on the given target fit better than one on the found target.
-
-    A bent board alone can look like two cameras on the given target, so two cameras must also show on the
-    found target. A board that bends differently in some views shows that as well, but then two cameras fit
-    worse than the found target.
-    """
-    if _groups(*found.fits[0]) is None:
-        return False
-    before, (_, after) = solution.adjusted, found.fits[0]
-    groups = _groups(solution.problem, before)
-    return groups is not None and bool((1.0 - groups.explained) * before.cost.sum() < after.cost.sum())
-
-
-def _groups(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
-    """Test for two cameras among the views, or a moving zoom."""
-    if not problem.free.any():
-        return None
-    return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
 
 
 def _with_bends(solution: Solution, common: Found | None) -> Found | None:
@@ -209,7 +167,7 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
     if float(after[1].cost.sum()) < least_of_groups:
         return found
-    groups = _groups(*before)
+    groups = groups_of_views(*before)
     explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
     return found if groups is None or groups.explained < explained else common
 

@@ -1,0 +1,86 @@
+"""Causes of errors on the given target other than its shape.
+
+Wrong stated sigmas, a distortion model that is too simple, wrong given parameters, two cameras and a camera
+that changes between the views all leave residuals that a target of another shape explains in part.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
+from neurocal_cli.target_shape.find import Found, evidence_as_given
+from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
+from neurocal_cli.verdict.given_parameters import reestimate_given
+from neurocal_cli.verdict.noise import stated_noise
+from neurocal_cli.verdict.view_change import view_change
+from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
+
+_TOLD_APART = 5.0  # standard deviations, as for the verdict
+_OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
+_ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
+
+
+def has_other_cause(solution: Solution, found: Found) -> bool:
+    """Whether the errors on the given target have another cause than its shape."""
+    problem, points = solution.problem, solution.problem.points
+    place = np.array([problem.views.names.index(name) for name in points.view_names])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
+        return True
+    named = solution.model_errors is None and solution.straight_lines is None
+    if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
+        return True
+    if not problem.free_poses:
+        return False
+    asked = reestimate_given(problem.views, solution.state, problem.fixed, problem.free_poses)
+    if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
+        return True
+    return _are_two_cameras(solution, found) or _changes_between_views(solution, found)
+
+
+def _are_two_cameras(solution: Solution, found: Found) -> bool:
+    """Whether two cameras (or a moving zoom) on the given target fit better than one on the found target.
+
+    A bent board alone can look like two cameras on the given target, so two cameras must also show on the
+    found target. A board that bends differently in some views shows that as well, but then two cameras fit
+    worse than the found target.
+    """
+    if groups_of_views(*found.fits[0]) is None:
+        return False
+    before, (_, after) = solution.adjusted, found.fits[0]
+    groups = groups_of_views(solution.problem, before)
+    return groups is not None and bool((1.0 - groups.explained) * before.cost.sum() < after.cost.sum())
+
+
+def groups_of_views(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
+    """Test for two cameras among the views, or a moving zoom."""
+    if not problem.free.any():
+        return None
+    return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
+
+
+def _changes_between_views(solution: Solution, found: Found) -> bool:
+    """Whether a small change of the camera between the views is more probable than the found target.
+
+    A change of the image's size by 1 % looks like a target of another shape, or like bends of single views.
+    """
+    problem, adjusted = solution.problem, solution.adjusted
+    views, free = problem.views, problem.free_camera
+    if not problem.free.any():
+        return False
+    repeated = repeated_poses(views, adjusted.state, point_residuals(views, adjusted.state))
+    spare = views.n_equations - problem.n_parameters
+    scores = scores_of_poses(adjusted.normal, free, problem.free_poses, repeated)
+    variance = float(adjusted.cost.sum()) / spare
+    change = view_change(views, adjusted.state, free, scores, repeated.group, variance, spare)
+    if change is None:
+        return False
+    gain = -0.5 * spare * float(np.log1p(-min(change.explained, _ALL))) - _OCCAM * np.log(views.n_equations)
+    return bool(gain > found.evidence - evidence_as_given([(problem, adjusted)]))
