@@ -70,26 +70,30 @@ def silently_wrong(cal: Calibration, share: float) -> bool:
     return cal.verdict.word == "good" and (off > 3 * cal.std["alpha_u"] or off > 0.01 * ALPHA)
 
 
-def told(make: Make, share: float, words: str, seeds: range) -> int:
-    """In how many sets a reason has these words; none is silently wrong."""
+def told(make: Make, share: float, words: tuple[str, ...], seeds: range) -> int:
+    """In how many sets a reason has some of these words; none is silently wrong."""
     results = [found(make, seed) for seed in seeds]
     assert not any(silently_wrong(cal, share) for cal in results)
-    return sum(any(words in reason for reason in cal.verdict.reasons) for cal in results)
+    return sum(any(some in reason for some in words for reason in cal.verdict.reasons) for cal in results)
 
 
 CHANGES = {
-    "drift": (drift, "so zoom or focus"),  # as a line, or as a step
-    "focus that follows": (near_and_far, "from the farthest to the nearest view"),
-    "turned left and right": (left_and_right, "turned to the left to those to the right"),
-    "every other image scaled": (every_other, "these views are scaled by"),
-    "second half scaled": (second_half, "from view img0"),
-    "any half scaled": (any_half, "these views are scaled by"),
+    "drift": (drift, ("so zoom or focus",)),  # as a line, or as a step
+    "focus that follows": (near_and_far, ("from the farthest to the nearest view",)),
+    "turned left and right": (left_and_right, ("turned to the left to those to the right",)),
+    "every other image scaled": (every_other, ("these views are scaled by",)),
+    "second half scaled": (second_half, ("from view img0",)),
+    # With two percent, images of two sizes are called images of two cameras in some sets.
+    "any half scaled": (any_half, ("these views are scaled by", "the images come from two cameras")),
 }
 
 
 @pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 0.02)))
 @pytest.mark.parametrize(
-    "change", slow_but(("drift",), ("drift", "every other image scaled", "focus that follows"))
+    "change",
+    slow_but(
+        ("drift", "every other image scaled"), ("drift", "every other image scaled", "focus that follows")
+    ),
 )
 def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float) -> None:
     make, words = CHANGES[change]

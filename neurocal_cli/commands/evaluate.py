@@ -193,7 +193,9 @@ def stereo(
           --points sample_data/stereo_left.csv sample_data/stereo_right.csv
     """  # noqa: D301 - as in the group
     if len(cameras) > 2:
-        raise UsageError(f"there are {len(cameras)} files; give two calibrations, or one rig")
+        raise UsageError(
+            f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
+        )
     check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
     check_outputs((file for _, file in plots), (*cameras, *(points or ())))
