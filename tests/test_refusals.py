@@ -122,6 +122,10 @@ def test_parallel_boards_are_refused_with_and_without_noise(
     refused(see([BOARD] * n_views, poses, sigma, n_views), **HELD[options])
 
 
+def test_views_that_determine_no_camera_determine_no_bends() -> None:
+    test_parallel_boards_are_refused_with_and_without_noise("parallel to the image", "centre", 20, 0.05)
+
+
 def test_the_refusal_of_parallel_boards_says_that_they_are_and_what_to_do() -> None:
     poses = [
         Pose(euler_to_rotation(0.5, -0.3, 0.1), np.array([10.0 * k, 0.0, 600.0 + 30 * k])) for k in range(4)

@@ -118,8 +118,14 @@ def _few_enough(
 
 
 def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
-    """Logarithm of the evidence of the given target, of the views from which a target would be estimated."""
-    return evidence_of_given(Search(_few_enough(fits, None) or fits, False, None).information())
+    """Logarithm of the evidence of the given target, of the views from which a target would be estimated.
+
+    It is -inf if the points do not determine the cameras.
+    """
+    try:
+        return evidence_of_given(Search(_few_enough(fits, None) or fits, False, None).information())
+    except np.linalg.LinAlgError:
+        return -np.inf
 
 
 def searched(search: Search, least_gain: float) -> Found | None:

@@ -38,7 +38,10 @@ def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | N
     if not _may_bend(fit[0]):
         return common
     known = None if common is None else common.target
-    rigid, bent = _promise(Search([fit] if common is None else common.fits, False, known, bending=True))
+    try:
+        rigid, bent = _promise(Search([fit] if common is None else common.fits, False, known, bending=True))
+    except np.linalg.LinAlgError:  # the points do not determine the camera
+        return common
     if bent < rigid + _EARLY * LEAST_GAIN:
         return common
     only = searched(Search([fit], False, None, bending=True, still=True), LEAST_GAIN)
