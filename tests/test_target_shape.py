@@ -24,10 +24,10 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.target import distinct_points, planes_of
 from neurocal_cli.target_shape import find as find_module
 from neurocal_cli.target_shape import posterior as posterior_module
-from neurocal_cli.target_shape.find import LEAST_GAIN, find_target, sight_of
+from neurocal_cli.target_shape.find import LEAST_GAIN, evidence_as_given, find_target, sight_of
 from neurocal_cli.target_shape.information import Information, information_of
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
-from neurocal_cli.target_shape.posterior import known_sizes, posterior
+from neurocal_cli.target_shape.posterior import evidence_of_given, known_sizes, posterior
 from neurocal_cli.target_shape.prior import Prior, prior_of
 from neurocal_cli.target_shape.system import System
 
@@ -78,6 +78,14 @@ def test_the_quadratic_is_that_of_the_squared_error() -> None:
     cost = normal[:, -1, -1].sum() * moved.views.pixel_scale**2
     promised = info.cost + (d * ((info.point @ d[..., None])[..., 0] - 2 * info.point_right)).sum()
     assert abs(promised - cost) < 1e-3 * abs(info.cost - cost)
+
+
+def test_the_evidence_of_the_given_target_needs_no_derivatives_by_its_points() -> None:
+    one, other = (minimum(photographed("parabola", seed, 5)[0]) for seed in (1, 2))
+    _, label, _ = distinct_points([one[0].points, other[0].points])
+    labels = np.split(label, [len(one[0].points)])
+    whole = information_of([sight_of(*fit, part) for fit, part in zip((one, other), labels, strict=True)], 63)
+    assert evidence_as_given([one, other]) == pytest.approx(evidence_of_given(whole), abs=1e-6)
 
 
 def test_points_first_and_poses_first_solve_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.bend_size import bends_of, most_probable_precision
 from neurocal_cli.target_shape.bend_validation import bends_are_valid
-from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of, of_views
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
 from neurocal_cli.target_shape.target_validation import passes_cross_validation
@@ -108,10 +108,11 @@ def _few_enough(
     fits: Sequence[tuple[Problem, Adjusted]], known: Target | None
 ) -> Sequence[tuple[Problem, Adjusted]] | None:
     """The fits, with some of their views if a dense system has no room for all; None if for none."""
+    of_poses = 6 * sum(problem.views.n_views for problem, _ in fits)
+    if of_poses <= _DENSE:
+        return fits
     points = [problem.points if known is None else known.straightened(problem.points) for problem, _ in fits]
-    n_points = len(distinct_points(points)[0])
-    n_views = sum(problem.views.n_views for problem, _ in fits)
-    unknowns = min(3 * n_points, 6 * n_views)
+    unknowns = min(3 * len(distinct_points(points)[0]), of_poses)
     if unknowns > _MOST_DENSE:
         return None
     return fits if unknowns <= _DENSE else [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits]
@@ -123,9 +124,18 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
     It is -inf if the points do not determine the cameras.
     """
     try:
-        return evidence_of_given(Search(_few_enough(fits, None) or fits, False, None).information())
+        return evidence_of_given(*(_with_given_points(*fit) for fit in _few_enough(fits, None) or fits))
     except np.linalg.LinAlgError:
         return -np.inf
+
+
+def _with_given_points(problem: Problem, adjusted: Adjusted) -> Information:
+    """The quadratic of one camera at its minimum, with fixed target points."""
+    views = problem.views
+    none = np.zeros(0, dtype=np.intp)
+    sight = Sight(views, adjusted.state, problem.free_camera, problem.free_poses, none)
+    normal = views.pixel_scale**2 * adjusted.normal
+    return of_views(sight, normal, np.ones(views.n_views, dtype=bool))
 
 
 def searched(search: Search, least_gain: float) -> Found | None:

@@ -346,12 +346,12 @@ def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Informati
     """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
     N = normal[which]
     columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
-    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N)
+    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N) if sight.free_poses else 0
     p, f = len(of_pose), len(columns)
-    camera = N.sum(axis=0)
+    camera, own = N.sum(axis=0), N[:P]
     found = Information(
         camera[columns[:, None], columns], camera[columns, -1],
-        N[:, of_pose[:, None], of_pose], N[:, of_pose[:, None], columns], N[:, of_pose, -1],
+        own[:, of_pose[:, None], of_pose], own[:, of_pose[:, None], columns], own[:, of_pose, -1],
         np.zeros((0, 3, 3)), np.zeros((0, 3, f)), np.zeros((0, 3)), np.zeros((P, p, 0, 3)),
         float(camera[-1, -1]), float(sight.views.equations[which].sum()),
     )  # fmt: skip

@@ -94,12 +94,15 @@ _PASSES = 40
 _NO_COST = 1e-300  # lower bound of a cost, which rounding may make negative
 
 
-def evidence_of_given(info: Information) -> float:
-    """Log evidence of the given target."""
-    S, g, cost, logdet = _poses_eliminated(info)
-    cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
-    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
-    return log_evidence(info.spare, cost, logdet - info.log_precision)
+def evidence_of_given(*cameras: Information) -> float:
+    """Log evidence of the given target, from cameras that share no unknowns."""
+    spare = cost = logdet = 0.0
+    for info in cameras:
+        S, g, least, of_poses = _poses_eliminated(info)
+        spare += info.spare
+        cost += least - (float(g @ np.linalg.solve(S, g)) if len(g) else 0.0)
+        logdet += of_poses + (float(np.linalg.slogdet(S)[1]) if len(g) else 0.0) - info.log_precision
+    return log_evidence(spare, cost, logdet)
 
 
 def camera_step_of(info: Information) -> Array:
