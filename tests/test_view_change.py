@@ -50,6 +50,13 @@ def second_half(share: float) -> Make:
     return lambda n, rng: rescaled(photographed(poses(n, rng), rng), np.arange(n) >= n // 2, 1.0 + share)
 
 
+def bent_and_every_other(share: float, curl: float) -> Make:
+    def make(n: int, rng: np.random.Generator) -> Correspondences:
+        return rescaled(photographed(poses(n, rng), rng, curl=curl), np.arange(n) % 2 == 1, 1.0 + share)
+
+    return make
+
+
 def any_half(share: float) -> Make:
     return lambda n, rng: rescaled(photographed(poses(n, rng), rng), rng.permutation(n) < n // 2, 1.0 + share)
 
@@ -108,6 +115,14 @@ def test_changes_of_all_sizes(change: str, share: float) -> None:
     make, words = CHANGES[change]
     least = {0.002: 0, 0.005: 0 if change == "any half scaled" else 7, 0.01: 20, 0.02: 24}[share]
     assert told(make(share), share, words, range(30)) >= least
+
+
+@pytest.mark.parametrize("seeds", slow_but((range(2, 5),), (range(2, 5), range(20))))
+@pytest.mark.parametrize("curl", slow_but((0.5,), (0.5, 2.0)))
+def test_images_of_two_sizes_are_told_of_a_bent_board_too(curl: float, seeds: range) -> None:
+    words = ("these views are scaled by",)
+    assert told(bent_and_every_other(0.01, curl), 0.01, words, seeds) >= 2 / 3 * len(seeds)
+    assert told(bent_and_every_other(0.0, curl), 0.0, words, seeds) == 0
 
 
 def clean_sets_told(seeds: range) -> int:

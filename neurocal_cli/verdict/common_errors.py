@@ -36,7 +36,7 @@ _LEFT = 1.25
 Cause = TypeVar("Cause", BoardShape, ViewChange, ViewGroups)
 
 
-def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding]:
+def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) -> Iterator[Finding]:
     """Findings about a camera that is not the same in all views, or a board that is not flat.
 
     Parameters
@@ -46,8 +46,10 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
         Of the world.
     wide : bool
         Whether the lens is wide, and so may have no single centre of projection.
+    estimated : bool
+        Whether the target was estimated.
     """
-    change, board, groups = _explanation(evidence), evidence.board, evidence.groups
+    change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
     missing = evidence.missing
     if missing is not None and _explains(missing.explained, evidence):
         # Residual distortion looks like a bent board, and like several cameras.
@@ -83,10 +85,16 @@ def _above(share: float, cause: Cause | None) -> Cause | None:
     return None if cause is None or cause.explained < share else cause
 
 
-def _explanation(evidence: Evidence) -> ViewChange | None:
-    """The change between views that explains the error; None if there is none, or if two cameras do."""
+def _explanation(evidence: Evidence, estimated: bool) -> ViewChange | None:
+    """The change between views that explains the error; None if there is none, or if two cameras do.
+
+    An estimated target has taken in a part of the change, and real boards leave other errors besides.
+    """
     change, groups = evidence.change, evidence.groups
-    if change is None or not _explains(change.explained, evidence):
+    if change is None:
+        return None
+    of_groups = estimated and change.pattern == "groups"
+    if not of_groups and not _explains(change.explained, evidence):
         return None
     if groups is None:
         return change

@@ -73,8 +73,8 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # A common error explains the others, so it is reported first even if it hardly biases the camera.
-    wide = calibration.camera.distortion.wide
-    for grade, reason, advice in common_errors(evidence, calibration.unit, wide):
+    wide, estimated = calibration.camera.distortion.wide, calibration.target is not None
+    for grade, reason, advice in common_errors(evidence, calibration.unit, wide, estimated):
         yield max(grade, int(bool(errors))), reason, advice
     yield from errors
     yield from given_parameters(evidence.reestimated, calibration.intrinsics, calibration.std)
