@@ -1,25 +1,7 @@
 """neurocal: camera calibration by a neural network whose weights are the camera.
 
-Data flow from the top to the bottom of this list, and nothing imports from further down:
-
-====================================  ==================================================================
-errors, geometry, camera, processes   the language: conventions, projection, distortion
-points, board, calibration            what goes in and what comes out
-least_squares                         steps, Schur complements and covariances of nonlinear least squares
-network, training                     the calibrating network and its trainers
-bundle_adjustment                     the reprojection error of all views, its minimum, its covariance
-initialisation                        from random weights to a camera
-distortion                            which distortion model the data support; undistortion
-pipeline                              the fit, without outliers, as a result
-baselines                             the methods that the paper compares the network with, and OpenCV's
-methods                               `calibrate`
-verdict, evaluation, report           what a result is worth
-stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
-comparison                            the network and the methods beside it, on the same points
-simulation                            synthetic points, images and zoom lenses with their exact truth
-io, detection                         files; points from images
-commands                              the command line
-====================================  ==================================================================
+Data flow one way: points, network, calibration, evaluation. The page `docs/architecture.md` lists the
+packages in their order and describes the path of a calibration through them.
 
 The names below are loaded on first use, so that a command imports only what it needs.
 """

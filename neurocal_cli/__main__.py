@@ -11,7 +11,7 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Run the command line and leave with its exit code."""
+    """Run the command line and leave with its exit status."""
     if not sys.warnoptions:
         # Warnings of the libraries below are for their developers; what a user should know is in
         # the result's own warnings.
@@ -31,8 +31,8 @@ def main() -> None:
     except KeyboardInterrupt:  # pressed while modules are still being loaded
         sys.exit(_interrupted())
     finally:
-        # Python takes some ms to end, in which an interrupt would kill it whatever its exit code is. One that
-        # has just come is raised by the first of the two calls.
+        # Python takes some ms to end, in which an interrupt would kill it whatever its exit status is. One
+        # that has just come is raised by the first of the two calls.
         with suppress(KeyboardInterrupt):
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _interrupted() -> int:
-    """Say so where the commands cannot, and return the exit code."""
+    """Say so where the commands cannot, and return the exit status."""
     if sys.stderr is not None:
         sys.stderr.write("Error: interrupted\n")
     return 130

@@ -185,10 +185,10 @@ class Calibration:
         thousandths, which the standard deviations include. 0 if it is below 0.001.
     judgement : Verdict or callable, optional
         The verdict read from a file, or the function that computes it from this calibration; see `verdict`.
-    lens_choice : dict of float by lens model [px]
+    lens_choice : dict of float by distortion model [px]
         The candidate models of ``distortion="auto"`` and their cross-validation errors.
     would_take : frozenset of str
-        Lens models that would have been selected if they were `preferred`; any other preference has no
+        Distortion models that would have been selected if they were `preferred`; any other preference has no
         effect. Not in files.
     covariance : (n, n) array
         Of the free intrinsic parameters, in the order of `covariance_names`; `views` holds the standard

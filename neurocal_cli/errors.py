@@ -1,6 +1,6 @@
 """The exceptions of the library, under one base class.
 
-The library deliberately raises only these; the command layer turns each into one line and the exit code of
+The library deliberately raises only these; the command layer turns each into one line and the exit status of
 its class. A message says what is wrong, where, and what to do.
 """
 

@@ -255,8 +255,12 @@ def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> P
     grid = np.array([place for place, _, _ in rows])
     given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
     unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
-    square = float(np.linalg.norm(unknowns[1]))
-    x_axis, y_axis = unknowns[1:] / np.linalg.norm(unknowns[1:], axis=1)[:, None]
+    sides = np.linalg.norm(unknowns[1:], axis=1)
+    square = float(sides.mean())
+    # Given points may be those of an estimated board, whose sides are neither equal nor perpendicular. The
+    # nearest perpendicular axes are the polar factor.
+    U, _, Vt = np.linalg.svd(unknowns[1:] / sides[:, None], full_matrices=False)
+    x_axis, y_axis = U @ Vt
     cols, rows_ = (_size(places) for places in grid.T)
     origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
     measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))

@@ -285,16 +285,30 @@ def test_an_image_comes_from_stdin(folder: Path) -> None:
     assert "\nstdin,h:0:0," in result.stdout
 
 
-def test_a_turned_image_is_used_and_said_once(folder: Path) -> None:
+def turn_by_exif(path: Path) -> None:
+    """Add the EXIF orientation of an image upside down."""
     exif = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 274, 3, 1, 3, 0, 0)
     body = struct.pack(">I", len(exif)) + b"eXIf" + exif + struct.pack(">I", zlib.crc32(b"eXIf" + exif))
+    data = path.read_bytes()
+    path.write_bytes(data[:33] + body + data[33:])
+
+
+def test_a_turned_image_is_used_and_said_once(folder: Path) -> None:
     for path in folder.iterdir():
-        data = path.read_bytes()
-        path.write_bytes(data[:33] + body + data[33:])
+        turn_by_exif(path)
     result = detect(folder, *BOARD)
     assert result.exit_code == 0
     first, _ = result.stderr.splitlines()
     assert first.startswith("note: board01 and 2 more: turned by 180 degrees, as its EXIF orientation says")
+
+
+def test_images_of_different_orientations_are_warned_of(folder: Path) -> None:
+    turn_by_exif(folder / "board02.png")
+    result = detect(folder, *BOARD)
+    assert result.exit_code == 0
+    (warning,) = [line for line in result.stderr.splitlines() if line.startswith("warning:")]
+    assert "different EXIF orientations (2 as stored, 1 turned by 180 degrees)" in warning
+    assert "remove the orientation" in warning
 
 
 @pytest.mark.parametrize("words", [["detect", "--help"], ["calibrate", str(SAMPLES / "flat.csv")]])

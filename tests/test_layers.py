@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -113,6 +114,20 @@ def test_a_module_imports_from_its_own_room_and_from_below() -> None:
         used = {m.split(".")[1] for m in imports(name) if m.startswith("neurocal_cli.")}
         wrong[name] = used - set().union({mine}, *LEVELS[:level])
     assert {name: rooms for name, rooms in wrong.items() if rooms} == {}
+
+
+def test_the_architecture_page_lists_all_rooms_in_this_order() -> None:
+    page = (ROOT.parent / "docs" / "architecture.md").read_text("utf-8")
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    rooms = {mine for level in LEVELS for mine in level} - {"__main__"}
+    table = [set(re.findall(r"`(\w+)`", row)) & rooms for row in rows[: len(LEVELS)]]
+    place = {mine: k for k, row in reversed(list(enumerate(table))) for mine in row}
+    assert set(place) == rooms
+    height = {mine: k for k, level in enumerate(LEVELS) for mine in level}
+    for name in set(NAMES) - {"__init__.py", "__main__.py"}:
+        for used in {m.split(".")[1] for m in imports(name) if m.startswith("neurocal_cli.")} & rooms:
+            assert place[used] <= place[room(name)], (room(name), used)
+            assert height[used] <= height[room(name)]
 
 
 @pytest.mark.parametrize("package", HOMES)

@@ -18,7 +18,7 @@ POINTS = flat()
 @pytest.mark.parametrize(
     ("factor", "views", "said"),
     [
-        (1 / 25.4, [3], "view03: the points lie 25.4 times less far apart"),
+        (1 / 25.4, [3], "view03: the points lie 25.4 times closer together"),
         (1 / 25.4, range(5), "inches and millimetres mixed"),
         (0.1, range(4), "centimetres and millimetres mixed"),
         (1.2, [2], "view02: the points lie 1.2 times farther apart than in the other views"),

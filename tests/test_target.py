@@ -86,6 +86,19 @@ def test_the_found_board_is_a_board_file() -> None:
     np.testing.assert_allclose(plane.truly_at(place), target.found[rows], atol=1e-9)
 
 
+def test_a_board_estimated_again_from_its_own_file_is_a_board() -> None:
+    target = bent().target
+    assert target is not None
+    again = replace(
+        target, given=target.found @ np.array([[1.001, 0.0, 0.0], [0.001, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    )
+    (plane,) = board_of(again, "mm").planes
+    assert np.dot(plane.x_axis, plane.y_axis) == pytest.approx(0.0, abs=1e-9)
+    assert plane.square == pytest.approx(25.0, rel=2e-3)
+    rows = again.places(again.given[:3])
+    np.testing.assert_allclose(np.array(plane.measured)[rows, 2:], target.found[rows], atol=1e-9)
+
+
 def test_between_measured_places_a_board_is_smooth() -> None:
     c, r = np.meshgrid(np.arange(5.0), np.arange(4.0))
     grid = np.column_stack([c.ravel(), r.ravel()])

@@ -7,13 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.command_line import run
 from support.distorted import bent_set
+from support.real_data import RealFiles
 from support.scenes import Scene, pinhole, random_flat_set, table_1
 from support.wrong_inputs import flat
 
-from neurocal_cli import Calibration, Correspondences, Pose, calibrate
+from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.verdict.assessment import assess, gather_evidence
+from neurocal_cli.verdict.rules import reach_verdict
+
+BENT = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
 
 
 def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, depth: float) -> np.ndarray:
@@ -126,3 +131,27 @@ def test_poses_with_points_behind_the_camera_are_poor() -> None:
         assert verdict is not None
         assert verdict.word == "poor"
         assert "behind the camera" in verdict.reasons[0]
+
+
+def test_a_board_that_flexes_does_not_excuse_two_cameras() -> None:
+    """An error above the noise floor as of a board held by hand; halves of the views agree or do not."""
+    cal = calibrate(read_points(str(BENT)), skew=False)
+    assert cal.target is not None
+    measured = gather_evidence(cal)
+    floor = measured.rmse_px / 1.5
+    flexing = replace(measured, precision_px=floor, contradiction=1.5, disagreement=4.0, correlation=0.0)
+    assert reach_verdict(cal, flexing).reasons == cal.verdict.reasons
+    (first, *_) = reach_verdict(cal, replace(flexing, disagreement=18.0)).reasons
+    assert first.startswith("the results of two halves of the data differ by 4.2 standard deviations")
+
+
+@pytest.mark.slow
+def test_two_real_cameras_are_not_good(tmp_path: Path, real_files: RealFiles) -> None:
+    images = [*real_files("opencv_stereo/left*.jpg"), *real_files("opencv_stereo/right*.jpg")]
+    words = ["--cols", 9, "--rows", 6, "--square", 25, "-o", tmp_path / "points.csv"]
+    assert run("detect", *images, *words).exit_code == 0
+    points = read_points(tmp_path / "points.csv")
+    right = np.char.startswith(points.view_names, "right")[points.view_index]
+    for distortion in ("k1k2", "auto"):
+        assert calibrate(points, distortion=distortion).verdict.word != "good"
+        assert calibrate(points.select(right), distortion=distortion).verdict.word != "poor"

@@ -98,7 +98,7 @@ def _summary(ctx: click.Context) -> str:
 
 def _option(ctx: click.Context, option: click.Option) -> tuple[str, str]:
     names = ", ".join(option.opts)
-    values = "" if option.is_flag else f" {option.make_metavar(ctx)}"
+    values = "" if option.is_flag or option.count else f" {option.make_metavar(ctx)}"
     if isinstance(option.show_default, str):
         default = option.show_default
     else:

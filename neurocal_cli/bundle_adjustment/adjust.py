@@ -146,7 +146,7 @@ class _Reprojection:
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
         """The state after a step, its costs, and whether it is valid.
 
-        It is if all points lie in front of their cameras, where the distortion is monotonic.
+        A state is valid if all points lie in front of their cameras, where the distortion is monotonic.
         """
         trial = self.state.moved(*step)
         normal, by_view = self._blocks(trial)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -44,7 +44,6 @@ _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
 _ODDS = 3.0  # prior odds that a group is present
 _SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
-_RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
 
 @frozen_dataclass(eq=False)
@@ -198,7 +197,9 @@ def open_coefficients(
         `corner_radius`.
     """
     own = coefficient_names(model)
-    richer = model if model == "fisheye" else next((m for m in _RICHEST if m in choice), "none")
+    richer = (
+        model if model == "fisheye" else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
+    )
     names = coefficient_names(richer)
     if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
         return None

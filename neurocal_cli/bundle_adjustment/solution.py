@@ -14,6 +14,8 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels
 from neurocal_cli.calibration import StraightLines
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
@@ -121,6 +123,13 @@ class Solution:
     def state(self) -> CameraState:
         """Camera and poses, normalised."""
         return self.adjusted.state
+
+    @property
+    def camera(self) -> Camera:
+        """The camera in pixels, without image size and name."""
+        return Camera(
+            Intrinsics.from_matrix(self.problem.matrix(self.state.entries[0])), self.state.distortion
+        )
 
     @property
     def in_pixels(self) -> CameraState:

@@ -1,9 +1,9 @@
 """Jackknife covariance over views, for residuals that are correlated within a view.
 
 The inverse normal matrix treats all residuals as independent. But if the board is not quite flat, the focus
-moves or the lens model is not quite right, the errors of a view are correlated, and the parameters scatter
-more from view to view than the residuals suggest. The jackknife measures that: each view is left out by one
-step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
+moves or the distortion model is not quite right, the errors of a view are correlated, and the parameters
+scatter more from view to view than the residuals suggest. The jackknife measures that: each view is left out
+by one step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
 
     covariance = (V - 1) / V  sum_v (d_v - mean) (d_v - mean)^T.
 

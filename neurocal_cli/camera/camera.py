@@ -196,6 +196,11 @@ class Camera:
         ----------
         scale : float, or one for u and one for v
             New width over old width, new height over old height. The new image size is rounded.
+
+        Raises
+        ------
+        InputError
+            A scale is not positive.
         """
         factors = np.array(np.broadcast_to(scale, 2), dtype=float)
         if not (np.isfinite(factors).all() and (factors > 0).all()):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.distortion import (
     NOT_RADIAL,
+    POLYNOMIAL_MODELS,
     Distortion,
     coefficient_names,
     distort,
@@ -100,7 +101,7 @@ def reaches(distortion: Distortion, farthest: float) -> bool:
     mapped without a fold and covers everything inside the image of its edge. False is inconclusive.
     """
     k = distortion.coefficients
-    if distortion.model not in ("k1", "k1k2", "k1k2p1p2", "plumb_bob"):
+    if distortion.model not in POLYNOMIAL_MODELS[1:]:
         return False  # these models have poles, or use another radius
     r = np.linspace(0, _BEYOND * farthest, _RADII)
     p = np.hypot(*k[2:4]) if len(k) > 2 else 0.0

@@ -73,7 +73,18 @@ class Intrinsics:
 
     @classmethod
     def from_matrix(cls, A: Array) -> Intrinsics:
-        """Parameters of an upper triangular A, which is scaled to ``A[2, 2] = 1``."""
+        """Parameters of an upper triangular A.
+
+        Parameters
+        ----------
+        A : (3, 3) array
+            It is scaled to ``A[2, 2] = 1``.
+
+        Raises
+        ------
+        InputError
+            A is not finite or not upper triangular, or its last entry is 0.
+        """
         A = np.asarray(A, dtype=float)
         if A.shape != (3, 3) or not np.isfinite(A).all() or A[2, 2] == 0:
             raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")

@@ -1,8 +1,8 @@
 """The command line: the group ``neurocal``, whose commands load when they run.
 
 A command parses, reads, calls one function of the library and shows what it returns. Errors of all
-commands become one line and an exit code here and nowhere else. Modules of commands import nothing
-but click at their top, so that ``--help`` needs no numpy.
+commands become one line and an exit status here and nowhere else. Modules of commands import nothing
+at their top that needs NumPy, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _SUMMARIES = {
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
-    "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
+    "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board with its estimated shape.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
@@ -97,7 +97,7 @@ class _LazyGroup(click.Group):
 
 @contextmanager
 def _one_line_errors() -> Iterator[None]:
-    """Convert errors to one line on stderr and an exit code; click does so with its own errors."""
+    """Convert errors to one line on stderr and an exit status; click does so with its own errors."""
     try:
         yield
         return

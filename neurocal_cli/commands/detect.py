@@ -243,6 +243,24 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
 
 
+def _mixed_orientations(outcomes: Sequence[Outcome]) -> list[str]:
+    """Warn of images that were turned differently: each way of turning has its own image centre."""
+    from neurocal_cli.io.images import BY_EXIF
+
+    turns = Counter(
+        next((text.split(BY_EXIF)[0] for text in outcome.notes if BY_EXIF in text), "as stored")
+        for outcome in outcomes
+    )
+    if len(turns) < 2:
+        return []
+    counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
+    return [
+        f"the images have different EXIF orientations ({counts}), so their image centres differ although "
+        "they may be of one camera; remove the orientation from all files, for example with `exiftool "
+        "-Orientation= FILE`, and detect again"
+    ]
+
+
 def _check_overlay(folder: str, paths: Sequence[str]) -> None:
     check_folder("--overlay", folder)
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
@@ -262,6 +280,7 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool
     note(f"{some_of(names)}: {text}" for text, names in remarks.items())
     found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
+    warn(_mixed_orientations([outcome for _, outcome in outcomes]))
     warn(_another_board([outcome.shown for _, outcome in outcomes], board))
     if not found:
         raise NeurocalError(

@@ -164,7 +164,8 @@ def _options(ctx: click.Context) -> list[tuple[str, str]]:
     for option in ctx.command.get_params(ctx):
         if isinstance(option, click.Option) and not option.hidden:
             head = ", ".join(option.opts)
-            values = "" if option.is_flag else f" {option.metavar or _choices(option)}"
+            bare = option.is_flag or option.count
+            values = "" if bare else f" {option.metavar or _choices(option)}"
             rows.append((head + values, f"{option.help} {_default(option)}".strip()))
     return rows
 

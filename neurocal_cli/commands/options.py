@@ -25,7 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 class _Place(click.Path):
     """A file or folder, whose name is not empty, as that of a variable is that the shell does not know.
 
-    Whether it can be read or written is checked by the code that does so: exit code 1, not wrong usage.
+    Whether it can be read or written is checked by the code that does so: exit status 1, not wrong usage.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:

@@ -65,8 +65,8 @@ def triangulate(
       flag        ok, or off: the pixels are too far from their epipolar lines,
                   or behind: the point is behind a camera or at infinity
 
-    A point that does not exist has X, Y, Z of nan. No row is dropped. The rows are processed in batches, so
-    the file may have any length.
+    If the rays of a row do not determine a point, its X, Y and Z are nan. No row is dropped. The rows are
+    processed in batches, so the file may have any length.
 
     \b
     Examples:
@@ -167,9 +167,13 @@ class _Tally:
         """Report the outcome on stderr, or as JSON on stdout."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
-            parts.append(f"{self.off} more than {self.limit:.3g} px off their epipolar lines")
+            one = self.off == 1
+            which = "is more than" if one else "are more than"
+            lines = "its epipolar line" if one else "their epipolar lines"
+            parts.append(f"{self.off} of them {which} {self.limit:.3g} px off {lines}")
         if self.behind:
-            parts.append(f"{self.behind} behind a camera or at infinity")
+            which = "is" if self.behind == 1 else "are"
+            parts.append(f"{self.behind} {which} behind a camera or at infinity")
         if as_json:
             counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
             print_summary({**counts, "n_outside": self.outside, "epipolar_limit_px": self.limit})

@@ -80,8 +80,8 @@ def undistort(
     --to equirectangular show the wider field of view of fisheyes. The part that is lost is reported on
     standard error. Pixels without a source are black.
 
-    Several images are written to a folder as PNG; a single image may go to a file of any of the
-    kinds above. An image that cannot be undistorted, for example one of another size, is reported on
+    Several images are written to a folder as PNG; a single image may go to a PNG, JPEG, TIFF, BMP, PGM
+    or PPM file. An image that cannot be undistorted, for example one of another size, is reported on
     standard error and left out. In a CSV file of points, u,v and their covariances are undistorted.
     A pixel that the distortion model cannot produce is an error; points that no plane can show are left
     out, and a line says how many. Inputs are never overwritten.

@@ -20,7 +20,13 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, eff
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names, distort, pinhole_coefficients
+from neurocal_cli.camera.distortion import (
+    NOT_RADIAL,
+    POLYNOMIAL_MODELS,
+    coefficient_names,
+    distort,
+    pinhole_coefficients,
+)
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
@@ -37,7 +43,7 @@ _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
 # Number of coefficients that each model adds to the next simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Nested models, from simple to rich.
-_CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
+_CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
 _SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
 # The same for the quadratic models of the free networks. Where these give less, full descents of the networks
 # never gave more than 1.2; tests/test_free_networks.py repeats it.

@@ -70,7 +70,7 @@ def boofcv_camera(root: Field) -> Camera:
     Raises
     ------
     InputError, FormatError
-        The lens model is unknown.
+        The distortion model is unknown.
     """
     pinhole = root["pinhole"]
     model = root.get("model", "").text()

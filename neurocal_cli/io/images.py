@@ -22,6 +22,8 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
 
+BY_EXIF = ", as its EXIF orientation says"
+"""Follows what was done to an image, in the note about it."""
 _TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -117,8 +119,8 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
     if header.orientation == 1:
         return pixels, ()
     note = (
-        f"{_TURNS[header.orientation]}, as its EXIF orientation says and OpenCV does; pixel coordinates "
-        "are those of the turned image"
+        f"{_TURNS[header.orientation]}{BY_EXIF} and OpenCV does; pixel coordinates are those of the turned "
+        "image"
     )
     return pixels, (note,)
 

@@ -67,7 +67,13 @@ def read_lens_data(
 def read_lens_points(
     paths: str | Path | Sequence[str | Path], *, notes: list[str] | None = None
 ) -> LensPoints:
-    """Read points at many settings; see `read_lens_data`."""
+    """Read points at many settings; see `read_lens_data`.
+
+    Raises
+    ------
+    FormatError
+        A file is malformed, or has known cameras instead of points.
+    """
     data = read_lens_data(paths, notes=notes)
     if not isinstance(data, LensPoints):
         raise FormatError("has known cameras, not points; give columns X,Y,Z,u,v", data.source)

@@ -27,8 +27,6 @@ from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Rejected
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -164,9 +162,7 @@ class _Search:
 
     def _rays(self, views: Views) -> Array:
         """Rays of all pixels through the current lens, in the order of the views."""
-        solution = self.solution
-        matrix = solution.problem.matrix(solution.state.entries[0])
-        rays = Camera(Intrinsics.from_matrix(matrix), solution.state.distortion).unproject(self.points.pixels)
+        rays = self.solution.camera.unproject(self.points.pixels)
         rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
         return rays if views.order is None else rays[views.order]
 
@@ -278,8 +274,7 @@ class _Search:
         """Diagnose each view that was left out."""
         if not self.wrong_views:
             return
-        matrix = self.solution.problem.matrix(self.solution.state.entries[0])
-        camera = Camera(Intrinsics.from_matrix(matrix), self.solution.state.distortion)
+        camera = self.solution.camera
         rmse = rms(self.solution)
         for name, reason in self.wrong_views.items():
             rows = self.points.view_index == self.points.view_names.index(name)

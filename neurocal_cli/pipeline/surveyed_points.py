@@ -16,8 +16,6 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Rejected
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.median import median
@@ -98,9 +96,7 @@ def _with_places(solution: Solution, points: Correspondences, factor: float) -> 
     view = np.array([names.get(name, -1) for name in points.view_names])[points.view_index]
     state = solution.in_pixels
     in_camera = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
-    matrix = solution.problem.matrix(solution.state.entries[0])
-    camera = Camera(Intrinsics.from_matrix(matrix), state.distortion)
-    J = camera.project_jacobian(in_camera)[1] @ state.R[view]
+    J = solution.camera.project_jacobian(in_camera)[1] @ state.R[view]
     assert points.world_std is not None
     J = J * factor * points.world_std[:, None]
     place = np.stack(

@@ -1,8 +1,8 @@
 """Estimate the target's shape with the camera if the data support it, and select lens and target together.
 
 Residuals of a bent board look like lens distortion. So the target is estimated with the lens selected for the
-given target, the lens is selected again for that target, and so on until the lens model stays the same. The
-outliers are judged again as well: many of them contradict only the given target.
+given target, the lens is selected again for that target, and so on until the distortion model stays the same.
+The outliers are judged again as well: many of them contradict only the given target.
 """
 
 from __future__ import annotations

@@ -117,6 +117,19 @@ def evaluate_rig(
     """Evaluate a rig by the points of both cameras; see `evaluate_stereo`.
 
     The views of a rig have one pose for both cameras, so `by_view` and `rig` are equal.
+
+    Parameters
+    ----------
+    rig : Rig
+    points : (left, right) of Correspondences, optional
+        By default those that the rig was calibrated with.
+    method : {"optimal", "linear", "midpoint"}
+        How points are triangulated; see `triangulate`.
+
+    Raises
+    ------
+    InputError
+        There are no points, or the two cameras have none in common.
     """
     if points is None and not (len(rig.left.points) and len(rig.right.points)):
         raise InputError("the rig has no points of its own; give the points to evaluate it on")

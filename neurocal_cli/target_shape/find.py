@@ -56,7 +56,7 @@ class Found:
     fits : tuple of (Problem, Adjusted)
         The points of each problem have the target's coordinates.
     evidence : float
-        Log evidence, comparable between lens models.
+        Log evidence, comparable between distortion models.
     """
 
     target: Target

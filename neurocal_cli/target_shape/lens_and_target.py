@@ -1,4 +1,4 @@
-"""Select lens model and target together, because lens distortion and a bent board leave similar residuals.
+"""Select distortion model and target together: distortion and a bent board leave similar residuals.
 
 Starting from the lens selected for the given target, the next richer model is tried as long as it raises the
 evidence enough. If none does, the next simpler one is tried as long as it hardly lowers it.
@@ -28,7 +28,7 @@ def find_lens_and_target(
     known: Target | None = None,
     least_gain: float = -np.inf,
 ) -> Found | None:
-    """Estimate the positions of the target's points and select the lens model; see `find_target`."""
+    """Estimate the positions of the target's points and select the distortion model; see `find_target`."""
     best = find_target(fits, flat, known, least_gain)
     if best is None:
         return None
@@ -44,7 +44,7 @@ def find_lens_and_target(
 
 
 def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
-    """Estimate the target with the next lens model of the chain for every camera; None at the chain's end."""
+    """Estimate the target with every camera's next distortion model; None at the end of the chain."""
     fits = []
     for problem, adjusted in found.fits:
         place = (

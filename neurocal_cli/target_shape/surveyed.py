@@ -74,7 +74,7 @@ def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
         for _ in range(_STEPS):
             sights = [sight_of(p, a, own) for (p, a), own in zip(moved, labels, strict=True)]
             info = information_of(sights, len(given)).around_given(offsets)
-            if _spare(info) < 1 or not info.cost > 0:
+            if info.spare < 1 or not info.cost > 0:
                 return None
             factor = factor or _factor(info, prior)
             found = known_sizes(info, prior, {"stated": factor}, noise_variance(info, prior, factor))
@@ -113,7 +113,7 @@ def noise_variance(info: Information, prior: Prior, factor: float) -> float:
 
 def _noise(info: Information, prior: Prior, factor: float) -> tuple[float, float]:
     """Most likely variance of the pixels, and -2 log L."""
-    at, spare = quadratic_at(info, prior), _spare(info)
+    at, spare = quadratic_at(info, prior), info.spare
 
     def likelihood(log_variance: float) -> float:
         cost, logdet = at(factor / np.exp(0.5 * log_variance))
@@ -128,7 +128,7 @@ def _noise(info: Information, prior: Prior, factor: float) -> tuple[float, float
 
 def _factor(info: Information, prior: Prior) -> float:
     """Factor on the stated standard deviations: 1 unless the residuals contradict them."""
-    at, spare = quadratic_at(info, prior), _spare(info)
+    at, spare = quadratic_at(info, prior), info.spare
     assert prior.stated is not None
 
     def likelihood(log_ratio: float) -> float:
@@ -142,10 +142,6 @@ def _factor(info: Information, prior: Prior) -> float:
     factor = float(np.exp(log_ratio) * np.sqrt(cost / spare))
     gain = 0.5 * (_noise(info, prior, 1.0)[1] - least)
     return factor if gain > _CONTRADICTED and abs(np.log(factor)) > np.log(_OFF) else 1.0
-
-
-def _spare(info: Information) -> float:
-    return info.equations - len(info.camera) - 6 * len(info.pose)
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:

@@ -48,8 +48,9 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
         unit = next((text for known, text in _UNITS.items() if abs(factor / known - 1) < _ROUND), "")
         yield (
             1,
-            f"{name_some(names)}: the points lie {factor:.3g} times {'farther' if ratio > 0 else 'less far'} "
-            "apart than in the other views" + (f", as with {unit} mixed" if unit else ""),
+            f"{name_some(names)}: the points lie {float(f'{factor:.3g}'):g} times "
+            f"{'farther apart' if ratio > 0 else 'closer together'} than in the other views"
+            + (f", as with {unit} mixed" if unit else ""),
             "give X,Y,Z of all views in one unit"
             if unit
             else "check the unit of X,Y,Z and the size of the squares in these views",

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -27,7 +28,6 @@ from neurocal_cli.zoom_lens.static_calibration import (
 )
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting
 
-LADDER = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
 _QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 # A richer model must lower the cross-validation error to this share and the residual variance by so many
 # standard deviations. The tests of the choice in tests/test_zoom_lens.py have both outcomes.
@@ -147,7 +147,7 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     best: CalibratedSettings | None = None
     best_px: float | None = None  # computed when a richer model is compared
     failure: DegenerateGeometryError | None = None
-    for model in LADDER:
+    for model in POLYNOMIAL_MODELS:
         try:
             start = calibrate_settings(lens, model, options)
         except DegenerateGeometryError as error:
