@@ -36,8 +36,9 @@ OUTLIERS = ("reject", "keep")
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
 _NOT_FOUND = (
-    "the target stays as given, because these points do not determine its shape; that needs three different "
-    "views of most points, and offsets below 2 % of the target's size"
+    "the target stays as given: either another shape does not predict the points of other views better, or "
+    "these points do not determine it, which needs three different views of most points and offsets below "
+    "2 % of the target's size"
 )
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 

@@ -16,7 +16,12 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.command_line import run
 
+from neurocal_cli import Board, read_image
 from neurocal_cli.commands import streams
+from neurocal_cli.commands.detect import _another_board, _shown
+from neurocal_cli.detection.batch import Outcome
+from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.measuring import Points
 from neurocal_cli.io.image_headers import stated_sizes
 from neurocal_cli.io.image_paths import find_images, natural_order
 
@@ -48,6 +53,31 @@ def test_another_board_in_most_images_is_named_once() -> None:
     assert result.exit_code == 1
     told = "warning: most images show 9 x 6 inner vertices, and 10 x 7 were asked for; count inner vertices"
     assert result.stderr.count(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("shown", "named"),
+    [
+        (
+            [(9, 6)] * 8 + [(9, 5), None],
+            True,
+        ),  # images that were accepted as parts of the board count as well
+        ([(9, 6)] * 8 + [(9, 7)], True),  # one image shows something of the given size, such as a screen
+        ([(9, 7)] * 8 + [(9, 6)], False),
+        ([(9, 6)] * 4 + [(8, 6)] * 4, False),
+        ([None] * 8 + [(9, 6)], False),
+    ],
+)
+def test_a_board_of_which_most_images_show_another_size_is_questioned(
+    shown: list[tuple[int, int] | None], named: bool
+) -> None:
+    assert bool(_another_board(shown, Board.single(9, 7, 25.0))) == named
+
+
+@pytest.mark.parametrize("kind", ["midpoints", "vertices", "edges"])
+def test_the_size_that_an_image_shows_is_counted_from_its_points(kind: Points) -> None:
+    detection = detect_points(read_image(SAMPLES / "board01.png").grey, Board.single(9, 6, 25.0), kind)
+    assert _shown(Outcome("board01.png", detection)) == (9, 6)
 
 
 def test_images_of_different_sizes_are_named_before_the_work(tmp_path: Path) -> None:

@@ -281,7 +281,7 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool
     found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
     warn(_mixed_orientations([outcome for _, outcome in outcomes]))
-    warn(_another_board([outcome.shown for _, outcome in outcomes], board))
+    warn(_another_board([_shown(outcome) for _, outcome in outcomes], board))
     if not found:
         raise NeurocalError(
             outcomes[0][1].problem
@@ -309,12 +309,23 @@ def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
     }
 
 
+def _shown(outcome: Outcome) -> tuple[int, int] | None:
+    """Columns and rows of inner vertices that an image shows of a board of one plane."""
+    if outcome.detection is None:
+        return outcome.shown
+    ids = [label.rpartition("/")[2].split(":") for label in outcome.detection.ids]
+    columns = {one[-2] for one in ids if one[0] != "h"}
+    rows = {one[-1] for one in ids if one[0] != "v"}
+    return len(columns), len(rows)
+
+
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
     """Suggest another board size that most images show: often squares were counted instead of vertices."""
     (size, count), *_ = Counter(shown).most_common(1)
-    if size is None or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
-        return []
     plane = board.planes[0]
+    given = size == (plane.cols, plane.rows)
+    if size is None or given or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
+        return []
     return [
         f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
         "for; count inner vertices, not squares"

@@ -48,8 +48,8 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     calibration = read_calibration(camera)
     if calibration.target is None:
         raise InputError(
-            f"{camera}: the target was taken as it was given, so there is nothing to write; calibrate with "
-            "--target free to find it"
+            f"{camera}: the target was taken as it was given, so its own file still holds; if it may have "
+            "another shape, calibrate with --target free"
         )
     if plot is not None:
         from neurocal_cli.target_plot import draw_target

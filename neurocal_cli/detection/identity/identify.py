@@ -27,7 +27,7 @@ from neurocal_cli.detection.identity.linear_camera import fit_camera, is_flat, r
 from neurocal_cli.detection.identity.messages import (
     SYMMETRIC_BOARD,
     NoBoardError,
-    ambiguity_message,
+    ambiguous,
     wrong_size,
 )
 from neurocal_cli.detection.identity.placement import Placement, placements
@@ -204,7 +204,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement
             if placement.plane not in {p.plane for p in one.placements}
         ]
         if len(longer) > _MOST_TRIED:
-            raise NoBoardError(ambiguity_message(board, [c.grid for c in chosen], 0.0))
+            raise ambiguous(board, [c.grid for c in chosen], 0.0)
         found = [_scored(board, chosen[:count], placements, front) for placements in longer]
         found = sorted((one for one in found if np.isfinite(one.rms)), key=lambda one: one.rms)
         if not found:
@@ -246,7 +246,7 @@ def _resolve_symmetry(
     """Choose among arrangements with equal geometry: by colours, then by the image."""
     grids = [candidate.grid for candidate in chosen]
     if not all(_same_board(board, grids, arrangements[0], one) for one in arrangements[1:]):
-        raise NoBoardError(ambiguity_message(board, grids, arrangements[0].rms))
+        raise ambiguous(board, grids, arrangements[0].rms)
     colours = [_colours(grids, one) for one in arrangements]
     left = [one for one, colour in zip(arrangements, colours, strict=True) if colour == max(colours)]
     if len(left) == 1:

@@ -31,14 +31,19 @@ class NoBoardError(NeurocalError):
         self.shown = shown
 
 
+def _in_order(shape: tuple[int, int], board: Board) -> tuple[int, int]:
+    """Columns and rows of a grid in the order of a board of one plane."""
+    if len(board.planes) == 1 and (shape[0] < shape[1]) != (board.planes[0].cols < board.planes[0].rows):
+        return shape[1], shape[0]
+    return shape
+
+
 def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
     """Make the error about a grid that does not fit on the board."""
     wanted = _sizes(board)
-    shape = grid.shape
+    shape = _in_order(grid.shape, board)
     if len(board.planes) == 1:
         plane = board.planes[0]
-        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # columns and rows in the user's order
-            shape = shape[1], shape[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
             return NoBoardError(
                 f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
@@ -51,21 +56,23 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
     )
 
 
-def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
-    """Make the message about grids with several possible arrangements, the best with an rms error [px]."""
+def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
+    """Make the error about grids with several possible arrangements, the best with an rms error [px]."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:
-        return (
-            f"detected {_size(part.shape)} of {_sizes(board)} inner vertices, but it is ambiguous "
-            "which ones; show the whole board, or its outer border on more sides"
+        shape = _in_order(part.shape, board)
+        return NoBoardError(
+            f"detected {_size(shape)} of {_sizes(board)} inner vertices, but it is ambiguous "
+            "which ones; show the whole board, or its outer border on more sides",
+            shape,
         )
     if len(grids) < len(board.planes):
-        return (
+        return NoBoardError(
             f"only {len(grids)} of the {len(board.planes)} planes detected, so their position is ambiguous; "
             "show more of them"
         )
-    return (
+    return NoBoardError(
         f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
         "axes, or take the image from nearer"
     )
