@@ -19,40 +19,30 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.common_noise import common_share, measured, with_common_share
-from neurocal_cli.bundle_adjustment.measured_directions import single, unit, variance_across
 from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import Consensus, find_consensus, find_consensus_through_wide_lens
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.initialisation.radial_networks import middle_of_image
-from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
+from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.points import Correspondences
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
 # tests/test_wrong_inputs.py.
-_CHANCE = 0.01  # of calling any point of a good data set wrong
-_FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
-_WORST_VIEW = 3.0  # cap on a view's own noise level, in units of the noise level of all views
-_ENOUGH = 12  # fewest points of a view from which its noise level is estimated
 _PASSES = 12
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
-_ORDINARY = 6.0  # times the median error: only points below test whether the stated sigmas hold
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
-_LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
 def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
@@ -252,8 +242,8 @@ class _Search:
             known.add(state)
 
     def _explained(self) -> NDArray[np.bool_]:
-        errors, index = _errors(self.solution, self.points), self.points.view_index
-        near = errors.length < _limits(errors, self.kept, self.points)[index]
+        errors, index = point_errors(self.solution, self.points), self.points.view_index
+        near = errors.length < largest_expected(errors, self.kept, self.points)[index]
         share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
         for view in np.flatnonzero(share <= _MAJORITY):
             name = self.points.view_names[view]
@@ -262,7 +252,7 @@ class _Search:
 
     def rejected(self) -> Rejected:
         """The points and views that were left out."""
-        error = _errors(self.solution, self.points).length
+        error = point_errors(self.solution, self.points).length
         rows = np.flatnonzero(~self.kept)
         self._explain()
         if not rows.size:
@@ -282,138 +272,17 @@ class _Search:
             self.wrong_views[name] = why_odd(plain, camera, rmse, reason)
 
 
-@frozen_dataclass(eq=False)
-class _Errors:
-    """Weighted errors of all points [px]; infinite for points behind the camera or in views left out.
-
-    Attributes
-    ----------
-    length : (N,) array
-    parts : (N, 2) array
-        Two independent errors of each point with the same standard deviation. For points measured across an
-        edge these are the errors across and along it; the latter may be far smaller, but not larger.
-    """
-
-    length: Array
-    parts: Array
-
-    def sigma(self, rows: NDArray[np.intp]) -> float:
-        """Robust standard deviation of some points, from their median error."""
-        return float(median(self.parts[rows]).max()) / _ONE
-
-
-def _errors(solution: Solution, points: Correspondences) -> _Errors:
-    place = {name: k for k, name in enumerate(solution.problem.views.names)}
-    view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
-    predicted, in_front = predicted_pixels(solution.in_pixels, points.world, np.maximum(view, 0))
-    residuals = predicted - points.pixels
-    stated = None
-    if points.covariance is not None:
-        share = solution.common_noise
-        if not measured(points.covariance):
-            share = _borne_out(points.covariance, residuals)
-        stated = with_common_share(points.covariance, share, points.across)
-        residuals = _eased(residuals, points.covariance, stated, points.across)
-    length = _lengths(residuals, stated, points.across)
-    length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
-    return _Errors(length, _parts(length, residuals, points.across))
-
-
-def _borne_out(covariance: Array, residuals: Array) -> float:
-    """Share of the noise that is common to all points, estimated also for sigmas chosen by the user.
-
-    A stated sigma that is too small must not make its point an outlier. Real outliers are excluded here.
-    """
-    length = np.hypot(residuals[:, 0], residuals[:, 1])
-    finite = np.isfinite(length)
-    if not finite.any():
-        return 0.0
-    usual = finite & (length <= _ORDINARY * median(length[finite]))
-    return common_share(covariance[usual], residuals[usual])
-
-
-def _eased(residuals: Array, covariance: Array, believed: Array, across: Array | None) -> Array:
-    """Scale down errors along edges where the points are less certain in that direction (at a board's ends).
-
-    The common share of the noise in the believed covariance applies across the edges. Along the edges the
-    stated covariance applies: it comes from the smooth map of the board.
-    """
-    if across is None:
-        return residuals
-    n = unit(across)
-    s = n[:, ::-1] * [-1.0, 1.0]
-    certain, less = variance_across(believed, n), variance_across(covariance, s)
-    ease = np.sqrt(np.minimum(certain / less, 1.0))[:, None]
-    with np.errstate(invalid="ignore"):
-        along = (residuals * s).sum(axis=1, keepdims=True) * s
-    return np.where(single(across)[:, None], residuals - along + ease * along, residuals)
-
-
-def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Array:
-    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, with the mean scale kept.
-
-    An edge's mid-point is given the same tolerance along the edge as across it: errors of the model show in
-    both directions.
-    """
-    if stated is None:
-        return np.hypot(residuals[:, 0], residuals[:, 1])
-    if across is not None:
-        variance = variance_across(stated, across)[:, None]
-        stated = np.where(single(across)[:, None], variance * np.array([1.0, 0.0, 1.0]), stated)
-    suu, suv, svv = stated.T
-    du, dv = residuals.T
-    squared = (svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv)
-    information = 0.5 * (suu + svv) / (suu * svv - suv * suv)
-    return np.sqrt(squared / information.mean())
-
-
-def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
-    """Two independent errors of each point with the same standard deviation; see `_Errors`."""
-    alike = np.repeat(length[:, None] * (_ONE / _LENGTH), 2, axis=1)
-    if across is None:
-        return alike
-    known = np.isfinite(length) & single(across)
-    residuals, n = np.where(known[:, None], residuals, 0.0), unit(across)
-    own = np.stack([(residuals * n).sum(axis=1), (residuals * n[:, ::-1] * [-1, 1]).sum(axis=1)], axis=1)
-    share = np.abs(own) / np.maximum(np.hypot(*residuals.T), 1e-300)[:, None]
-    return np.where(known[:, None], share * np.where(known, length, 0.0)[:, None], alike)
-
-
-def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -> Array:
-    """(V,) largest error expected in each view among so many normally distributed points.
-
-    The noise level is estimated per view, because all errors of a blurred view are larger.
-    """
-    spread = np.sqrt(points.pixels.var(axis=0).sum())
-    rows = np.flatnonzero(kept)
-    overall = errors.sigma(rows)
-    by_view = np.full(points.n_views, overall)
-    index = points.view_index[rows]
-    counts = np.bincount(index, minlength=points.n_views)
-    pieces = np.split(rows[np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
-    for view, piece in enumerate(pieces):
-        if len(piece) >= _ENOUGH:
-            by_view[view] = errors.sigma(piece)
-    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * spread
-    return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
-
-
-def rms(solution: Solution) -> float:
-    """Weighted rms error [px]."""
-    return float(np.sqrt((_errors(solution, solution.problem.points).length ** 2).mean()))
-
-
 def _suspicious(solution: Solution) -> bool:
     """Whether anything in a fit is inconsistent with normal noise."""
     if solution.refusal:
         return True
     points = solution.problem.points
-    errors = _errors(solution, points)
+    errors = point_errors(solution, points)
     error = errors.length
     if not np.isfinite(error).all():
         return True
     everything = np.ones(len(points), dtype=bool)
-    if (error >= _limits(errors, everything, points)[points.view_index]).any():
+    if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
         return True
     spread = np.sqrt(points.pixels.var(axis=0).sum())
     if np.sqrt((error**2).mean()) > _ROUGH * spread:

@@ -23,7 +23,8 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
-from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
+from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly
+from neurocal_cli.pipeline.point_errors import rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
