@@ -288,7 +288,7 @@ def _displacement_row(calibration: Calibration) -> list[str]:
 def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
     label = f"{name} [{unit}]" if unit else name
     if given:
-        return [label, f"{value:.7g}", "given", ""]
+        return [label, f"{value:.7g}", "fixed", ""]
     relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"
     return [label, *rounded(value, std), relative]
 

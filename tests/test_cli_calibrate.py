@@ -189,7 +189,7 @@ def test_type_3_finds_the_pose_of_a_known_camera(tmp_path: Path, camera: Path) -
     found = read_calibration(out)
     assert found.intrinsics == CAMERA
     assert found.image_size == (640, 480)
-    assert sum(line.endswith("given") for line in result.stderr.splitlines()) == 5
+    assert sum(line.endswith("fixed") for line in result.stderr.splitlines()) == 5
 
 
 def test_type_4_finds_the_camera_of_a_known_pose(tmp_path: Path, points: Path, camera: Path) -> None:
@@ -197,7 +197,7 @@ def test_type_4_finds_the_camera_of_a_known_pose(tmp_path: Path, points: Path, c
     result = run("calibrate", points, "--type", 4, "--extrinsics", camera, "-o", out)
     assert result.exit_code == 0, result.stderr
     assert read_calibration(out).views["view00"].fixed
-    assert sum(line.endswith("given") for line in result.stderr.splitlines()) == 6
+    assert sum(line.endswith("fixed") for line in result.stderr.splitlines()) == 6
 
 
 def test_type_3_keeps_the_lens_of_a_ros_file(tmp_path: Path, points: Path) -> None:

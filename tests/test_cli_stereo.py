@@ -91,7 +91,7 @@ def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: 
     rig = read_rig(tmp_path / "rig")
     assert (rig.left.type, rig.right.type) == (3, 1)
     assert rig.left.std["alpha_u"] == 0
-    assert "given" in result.stderr
+    assert "fixed" in result.stderr
     both = run(
         "stereo", *files, "--type", "3", "--left-intrinsics", tmp_path / "left.yaml",
         "--right-intrinsics", tmp_path / "left.yaml",

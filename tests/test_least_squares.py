@@ -347,11 +347,11 @@ def test_groups_are_left_out_in_folds() -> None:
             assert lost[n] == pytest.approx(((r[n] - J[n] @ step) ** 2).sum(), rel=1e-9)
 
 
-def test_a_restraint_is_one_more_group_that_is_never_left_out() -> None:
+def test_a_penalty_is_one_more_group_that_is_never_left_out() -> None:
     q, _, _ = linear(7)
-    restraint = (np.diag([2.0, 3.0, 4.0]), np.array([0.1, 0.2, 0.3]))
-    step = q.steps(np.ones((1, 7)), restraint)[0]
-    np.testing.assert_allclose((q.S.sum(axis=0) + restraint[0]) @ step, q.g.sum(axis=0) + restraint[1])
+    penalty = (np.diag([2.0, 3.0, 4.0]), np.array([0.1, 0.2, 0.3]))
+    step = q.steps(np.ones((1, 7)), penalty)[0]
+    np.testing.assert_allclose((q.S.sum(axis=0) + penalty[0]) @ step, q.g.sum(axis=0) + penalty[1])
 
 
 def exponential(x: Array, y: Array) -> Array:

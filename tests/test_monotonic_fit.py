@@ -56,12 +56,12 @@ def test_the_slope_and_its_derivatives_are_those_of_differences(model: str) -> N
 
 
 def test_a_lens_with_all_the_slope_that_is_asked_for_is_free() -> None:
-    restraint = MonotonicFit(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
+    penalty = MonotonicFit(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
     state = CameraState(np.ones((1, 5)), np.eye(3)[None], np.zeros((1, 3)), "k1", np.array([-0.2]))
-    by_camera, missing = restraint(state)
+    by_camera, missing = penalty(state)
     assert not by_camera.any()
     assert not missing.any()
-    by_camera, missing = restraint(replace(state, k=np.array([-2.0])))
+    by_camera, missing = penalty(replace(state, k=np.array([-2.0])))
     assert missing.any()
     assert (by_camera[missing > 0, 5] > 0).all()  # more k1, more slope
 

@@ -45,21 +45,21 @@ def test_a_calibration_shows_each_parameter_with_deviation_and_relative_deviatio
     assert row["t_z"] == ["t_z", "[mm]", "900.00", "0.50", "0.056", "%"]
 
 
-def test_given_parameters_are_marked_given() -> None:
+def test_given_parameters_are_marked_fixed() -> None:
     calibration = made_calibration()
     given = replace(
         calibration, type=2, fixed=frozenset({"u0", "v0"}), std={**calibration.std, "u0": 0.0, "v0": 0.0}
     )
     text = calibration_report(given)
     assert "type 2 (image centre given)" in text
-    assert [line.split()[0] for line in text.splitlines() if line.endswith("given")] == ["u0", "v0"]
+    assert [line.split()[0] for line in text.splitlines() if line.endswith("fixed")] == ["u0", "v0"]
 
 
-def test_a_given_pose_is_marked_given() -> None:
+def test_a_given_pose_is_marked_fixed() -> None:
     calibration = made_calibration()
     view = replace(calibration.views["view00"], fixed=True)
     text = calibration_report(replace(calibration, type=4, views={"view00": view}))
-    assert sum(line.endswith("given") for line in text.splitlines()) == 6
+    assert sum(line.endswith("fixed") for line in text.splitlines()) == 6
 
 
 def test_only_the_worst_of_many_views_are_listed() -> None:

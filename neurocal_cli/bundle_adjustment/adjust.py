@@ -25,12 +25,12 @@ from neurocal_cli.least_squares.normal_equations import damped_step
 from neurocal_cli.least_squares.schur_complement import schur_step
 
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
-# test_refine.py holds the minimum against SciPy's.
+# tests/test_adjust.py holds the minimum against SciPy's.
 OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
 FLOOR = 1e-13  # rms in normalised pixels that rounding alone can cause
 
 # Extra equations on the shared camera, such as a prior: Jacobian (m, 5 + K) and residuals (m,).
-Restraint = Callable[[CameraState], tuple[Array, Array]]
+Penalty = Callable[[CameraState], tuple[Array, Array]]
 
 
 @frozen_dataclass(eq=False)
@@ -67,7 +67,7 @@ def adjust(
     free: NDArray[np.bool_],
     free_pose: bool = True,
     max_iterations: int = OPTIONS.max_iterations,
-    restraint: Restraint | None = None,
+    penalty: Penalty | None = None,
 ) -> Adjusted:
     """Minimise the reprojection error (3) from a start near the minimum.
 
@@ -82,15 +82,15 @@ def adjust(
     free_pose : bool
         Whether the poses are estimated.
     max_iterations : int
-    restraint : callable, optional
+    penalty : callable, optional
         Extra residuals on the shared camera, whose squares are added to those of the pixels. The result's
         `normal` and `cost` contain the pixels alone.
     """
-    problem = _Reprojection(batches, start, free, free_pose, restraint)
+    problem = _Reprojection(batches, start, free, free_pose, penalty)
     options = replace(OPTIONS, max_iterations=max_iterations)
     outcome = minimise(problem, options, problem.by_group(2.0 * FLOOR**2 * batches.counts.astype(float)))
     state, normal = replace(problem.state, R=orthonormalised(problem.state.R)), problem.normal
-    if restraint is not None:
+    if penalty is not None:
         normal, _ = normal_blocks(batches, problem.state)
     iterations = int(outcome.iterations.max())
     return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, outcome.settled)
@@ -112,9 +112,9 @@ class _Reprojection:
         start: CameraState,
         free: NDArray[np.bool_],
         free_pose: bool,
-        restraint: Restraint | None,
+        penalty: Penalty | None,
     ) -> None:
-        self.batches, self.state, self.restraint = batches, start, restraint
+        self.batches, self.state, self.penalty = batches, start, penalty
         # Columns of the camera's parameters, and indices of the free ones among them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
@@ -180,8 +180,8 @@ class _Reprojection:
 
     def _blocks(self, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
         normal, sensible = normal_blocks(self.batches, state)
-        if self.restraint is not None:
-            by_camera, missing = self.restraint(state)
+        if self.penalty is not None:
+            by_camera, missing = self.penalty(state)
             rows = np.zeros((len(missing), normal.shape[-1]))
             rows[:, self.camera], rows[:, -1] = by_camera, missing
             normal[0] += rows.T @ rows  # any view will do, because all share the camera

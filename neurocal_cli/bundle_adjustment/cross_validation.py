@@ -25,7 +25,7 @@ FOLDS = 5
 _RIDGE = 1e-13  # added to the scaled diagonal, so that one undetermined pose does not spoil the other views
 _GOLDEN = 0.6180339887498949
 _POSE = np.arange(POSE.start, POSE.stop)
-_Restraint = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
+_Penalty = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
 # Undetermined parameters become inf or nan; the results are tested for that.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -103,7 +103,7 @@ def held_out_views(
     normal: Array,
     free: NDArray[np.bool_],
     free_poses: bool,
-    restraint: _Restraint | None = None,
+    penalty: _Penalty | None = None,
     repeated: RepeatedPoses | None = None,
 ) -> Array:
     """Squared error of each view when it is held out; (V,), nan if the others do not determine the camera.
@@ -112,14 +112,14 @@ def held_out_views(
     ----------
     normal, free, free_poses
         As for `reduced`.
-    restraint : (f, f) array and (f,) array, optional
+    penalty : (f, f) array and (f,) array, optional
         Prior, added to the normal matrix of the shared parameters and to its right side.
     repeated : RepeatedPoses, optional
         Views that repeat a pose are held out together.
     """
     q = reduced(normal, free, free_poses)
     fold = folds_of(len(q.cost), FOLDS) if repeated is None else repeated.folds(FOLDS)
-    return q.held_out(fold, restraint)
+    return q.held_out(fold, penalty)
 
 
 @_quietly
@@ -128,7 +128,7 @@ def held_out_points(
     state: CameraState,
     free: NDArray[np.bool_],
     free_poses: bool,
-    restraint: _Restraint | None = None,
+    penalty: _Penalty | None = None,
 ) -> Array:
     """Squared error of the folds of each view's points when they are held out; (V * folds,).
 
@@ -137,7 +137,7 @@ def held_out_points(
     """
     normal = _by_fold(views, state, _wedges(views))  # (V, F, W, W)
     rest = normal.sum(axis=1, keepdims=True) - normal
-    step = _whole_steps(rest, free, free_poses, restraint)
+    step = _whole_steps(rest, free, free_poses, penalty)
     return Quadratics(normal[..., :-1, :-1], normal[..., :-1, -1], normal[..., -1, -1]).at(step).reshape(-1)
 
 
@@ -175,15 +175,13 @@ def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
     return blocks.reshape(views.n_views, FOLDS, *found.shape[1:])
 
 
-def _whole_steps(
-    normal: Array, free: NDArray[np.bool_], free_poses: bool, restraint: _Restraint | None
-) -> Array:
+def _whole_steps(normal: Array, free: NDArray[np.bool_], free_poses: bool, penalty: _Penalty | None) -> Array:
     """Steps to the minimum of each fold's normal matrices (V, F, W, W), poses included; (V, F, W - 1)."""
     step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
     q, solved = _eliminated(normal, free, free_poses)
     S, g = q.S.sum(axis=0), q.g.sum(axis=0)
-    if restraint is not None:
-        S, g = S + restraint[0], g + restraint[1]
+    if penalty is not None:
+        S, g = S + penalty[0], g + penalty[1]
     camera = solve_or_nan(S, g)  # (F, f)
     step[..., _shared(free)] = camera
     step[..., POSE] = solved[..., -1] - (solved[..., :-1] @ camera[:, :, None])[..., 0]

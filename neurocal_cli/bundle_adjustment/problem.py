@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, Penalty, adjust
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
@@ -57,7 +57,7 @@ class Problem:
         The final distortion model, with its coefficients if they are given.
     free_distortion : bool
         Whether the coefficients that are not fixed are estimated.
-    restraint : callable, optional
+    penalty : callable, optional
         Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's
         prior, which holds for any points.
     turned : (V, 3, 3) array, optional
@@ -75,7 +75,7 @@ class Problem:
     intrinsics: Intrinsics | None
     distortion: Distortion
     free_distortion: bool
-    restraint: Restraint | None = None
+    penalty: Penalty | None = None
     turned: Array | None = None
 
     @property
@@ -137,15 +137,15 @@ class Problem:
             views, turned = arrange(points), None
         else:
             views, turned = _undistorted_views(points, self.distortion, self.entries)
-        restraint = self.restraint if self.distortion.model == "rich" else None
-        return replace(self, points=points, views=views, turned=turned, restraint=restraint)
+        penalty = self.penalty if self.distortion.model == "rich" else None
+        return replace(self, points=points, views=views, turned=turned, penalty=penalty)
 
     def with_model(self, model: str) -> Problem:
         """The same points with another distortion model to estimate."""
         # Fixed coefficients belong to the previous model.
         fixed = self.fixed & set(INTRINSIC_NAMES)
         return replace(
-            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, restraint=None
+            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, penalty=None
         )
 
     def with_seen_pixels(self) -> Problem:
@@ -175,7 +175,7 @@ class Problem:
             model = self.distortion.model
             state = replace(state, model=model, k=pinhole_coefficients(model))
         free = self.free if state.model == "none" else self.free_camera
-        adjusted = adjust(self.views.batches, state, free, self.free_poses, max_iterations, self.restraint)
+        adjusted = adjust(self.views.batches, state, free, self.free_poses, max_iterations, self.penalty)
         return replace(adjusted, iterations=done + adjusted.iterations)
 
 

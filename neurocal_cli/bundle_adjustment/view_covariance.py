@@ -143,7 +143,7 @@ def _weighed(q: Quadratics, times: Array) -> Quadratics:
 
 
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
-    """Quadratics summed over repeated views, with the scores at their own minimum (without a restraint)."""
+    """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
     if not repeated.none:
         q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
     step = q.steps(np.ones((1, len(q.cost))))[0]

@@ -69,7 +69,7 @@ class Candidate:
     Attributes
     ----------
     problem : Problem
-        With this model, and a restraint that keeps it monotonic if needed.
+        With this model, and a penalty that keeps it monotonic if needed.
     adjusted : Adjusted
     lost : array
         Cross-validation: squared error of each part of the data when it is held out.
@@ -206,7 +206,7 @@ class _Chain:
         Its descent is long, so its gain is predicted from the quadratic model at the minimum of `plumb_bob`.
         """
         simpler = fitted.get("plumb_bob")
-        if simpler is None or self.wanted == "rational" or rational.restraint is not None:
+        if simpler is None or self.wanted == "rational" or rational.penalty is not None:
             return False
         free, state = rational.free_camera, simpler.adjusted.state
         start = replace(state, model="rational", k=_coefficients(state, "rational", self.reach))
@@ -290,7 +290,7 @@ class _Chain:
     def assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
         """A fit with the measures for the selection; None if a part of the data is indispensable."""
         views, state, free = problem.views, adjusted.state, problem.free_camera
-        held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
+        held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
         if self.by_views:
             lost = held_out_views(adjusted.normal, free, problem.free_poses, held, self.repeated)
         else:

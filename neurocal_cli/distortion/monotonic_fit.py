@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, Penalty
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
@@ -55,7 +55,7 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @frozen_dataclass(eq=False)
 class MonotonicFit:
-    """The penalty for a distortion that is not monotonic, as a `Restraint`.
+    """`Penalty` for a distortion that is not monotonic.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class MonotonicFit:
         return self.weight * rows, self.weight * lacking
 
 
-def normal_part(restraint: Restraint, state: CameraState, free: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Contribution of a restraint to the normal matrix (f, f) and right side (f,) of the free parameters."""
-    rows, missing = restraint(state)
+def normal_part(penalty: Penalty, state: CameraState, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Contribution of a penalty to the normal matrix (f, f) and right side (f,) of the free parameters."""
+    rows, missing = penalty(state)
     rows = rows[:, free]
     return rows.T @ rows, rows.T @ missing
 
@@ -146,7 +146,7 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
     Returns
     -------
     problem, adjusted
-        The problem with its restraint; None if the data contradict every such distortion.
+        The problem with its penalty; None if the data contradict every such distortion.
     """
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
@@ -172,16 +172,16 @@ def _with_slope(
     for _ in range(_ROUNDS):
         if found.state.model == "fisheye":
             last = min(last, np.pi / 2)
-        restraint = MonotonicFit(np.linspace(0, last, _NODES + 1)[1:], weight, least)
-        restrained = replace(problem, restraint=restraint)
-        adjusted = restrained.adjust(adjusted.state, _STEPS)
+        penalty = MonotonicFit(np.linspace(0, last, _NODES + 1)[1:], weight, least)
+        penalised = replace(problem, penalty=penalty)
+        adjusted = penalised.adjust(adjusted.state, _STEPS)
         state = adjusted.state
         if not adjusted.cost.sum() <= most:
             return None
         if folds_back(problem, state) is None:
             # Along the edge of the penalty the descent is slow if several coefficients are involved.
-            adjusted = adjusted if adjusted.converged else restrained.adjust(adjusted, _MORE_STEPS)
-            return (restrained, adjusted) if adjusted.converged else None
+            adjusted = adjusted if adjusted.converged else penalised.adjust(adjusted, _MORE_STEPS)
+            return (penalised, adjusted) if adjusted.converged else None
         corner = beyond * _farthest(problem, state)
         last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
     return None

@@ -69,7 +69,7 @@ def with_displacement(solution: Solution) -> Solution:
     Returns
     -------
     Solution
-        The restraint of its problem is the prior; `shared` is the covariance with the prior.
+        The penalty of its problem is the prior; `shared` is the covariance with the prior.
     """
     solution = _by_evidence(_begun(solution))
     if solution.problem.points.covariance is not None:
@@ -131,7 +131,7 @@ def _extent(directions: Array) -> Array:
 
 @frozen_dataclass(eq=False)
 class _Prior:
-    """The prior of k1 to k4 and the nodes as a `Restraint`.
+    """The prior of k1 to k4 and the nodes, a `Penalty`.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ def _by_evidence(solution: Solution) -> Solution:
     for _ in range(_ROUNDS):
         before = found.sizes
         rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
-        problem = replace(problem, restraint=_Prior(rows, before, processes.scale))
+        problem = replace(problem, penalty=_Prior(rows, before, processes.scale))
         adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
         normal = adjusted.normal
         found = _sizes(problem, adjusted.state, normal, processes, before)
@@ -190,8 +190,8 @@ def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
     """The processes and their initial sizes."""
     reaches = state.k[FIRST_NODE - len(REACHES) : FIRST_NODE]
-    if isinstance(problem.restraint, _Prior):
-        return _processes(reaches, problem.restraint.scale), problem.restraint.sizes
+    if isinstance(problem.penalty, _Prior):
+        return _processes(reaches, problem.penalty.scale), problem.penalty.sizes
     scale = float(np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations) / state.entries[0, 0])
     return _processes(reaches, scale), np.full(len(_OF_PROFILE) + len(_OF_FIELD), scale)
 

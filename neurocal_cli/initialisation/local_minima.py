@@ -163,7 +163,7 @@ def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, 
 def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
     """Flip the view with the largest predicted gain if the camera is adjusted, too; None if none improves."""
     views, posed = second
-    if not problem.free_camera.any() or not problem.free_poses or problem.restraint is not None:
+    if not problem.free_camera.any() or not problem.free_poses or problem.penalty is not None:
         return None
     free = problem.free if adjusted.state.model == "none" else problem.free_camera
     one, two = (reduced(normal, free, True) for normal in (adjusted.normal, posed.normal))

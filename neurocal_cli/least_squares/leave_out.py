@@ -50,14 +50,14 @@ class Quadratics:
         return np.einsum("fg,gij->fij", member, self.S), member @ self.g
 
     @_quietly
-    def steps(self, member: Array, restraint: tuple[Array, Array] | None = None) -> Array:
+    def steps(self, member: Array, penalty: tuple[Array, Array] | None = None) -> Array:
         """Steps to the minimum over F sets of groups.
 
         Parameters
         ----------
         member : (F, G) array
             1 where a group belongs to the set, 0 elsewhere.
-        restraint : (f, f) array and (f,) array, optional
+        penalty : (f, f) array and (f,) array, optional
             Prior, added to the matrix and to the right side.
 
         Returns
@@ -66,13 +66,13 @@ class Quadratics:
             nan where a set does not determine the unknowns.
         """
         S, g = self.summed(member)
-        return solve_or_nan(S, g) if restraint is None else solve_or_nan(S + restraint[0], g + restraint[1])
+        return solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])
 
     @_quietly
-    def held_out(self, fold: NDArray[np.intp], restraint: tuple[Array, Array] | None = None) -> Array:
+    def held_out(self, fold: NDArray[np.intp], penalty: tuple[Array, Array] | None = None) -> Array:
         """(G,) error of each group with the unknowns estimated from all groups outside its fold (G,)."""
         member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
-        return self.at(self.steps(1.0 - member, restraint)[fold])
+        return self.at(self.steps(1.0 - member, penalty)[fold])
 
     @_quietly
     def moves_without_each(self) -> Array:

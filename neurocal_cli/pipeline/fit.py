@@ -75,7 +75,7 @@ def fit_again(
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
     again = restarted(solution, points)
-    if again.problem.restraint is not None:  # a rich lens's prior
+    if again.problem.penalty is not None:  # a rich lens's prior
         return _displaced(again)
     return _finished(again, options, only_from_here)
 

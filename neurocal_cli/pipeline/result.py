@@ -185,7 +185,7 @@ def _xi_warning(ambiguity: Ambiguity | None, model: str) -> tuple[str, ...]:
 
 def _corner_warning(problem: Problem) -> tuple[str, ...]:
     """Warn if the distortion had to be kept monotonic in corners of the image without points."""
-    if problem.restraint is None or problem.distortion.model == "rich":
+    if problem.penalty is None or problem.distortion.model == "rich":
         return ()
     return (
         f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "

@@ -183,7 +183,7 @@ def camera_rows(rig: Rig) -> list[list[str]]:
 
 def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
     return (
-        [f"{value:.7g}", "given"]
+        [f"{value:.7g}", "fixed"]
         if name in camera.fixed
         else [*rounded(value, camera.std.get(name, math.nan))]
     )

@@ -351,5 +351,5 @@ def at_world(
     problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
 ) -> tuple[Problem, Adjusted]:
     """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
-    new = replace(problem.with_points(replace(problem.points, world=world)), restraint=problem.restraint)
+    new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
     return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))
