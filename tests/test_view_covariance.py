@@ -17,6 +17,7 @@ from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.least_squares.chi_squared import chi_squared, exceeded_by_chance
+from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.verdict.assessment import _AtMinimum
 
 NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
@@ -148,6 +149,24 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
     assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
     assert whole.std["alpha_u"] > 0.95 * jackknife
+
+
+def test_the_jackknife_of_noise_is_as_expected() -> None:
+    rng = np.random.default_rng(5)
+    V, rows, sigma = 7, 40, 0.3
+    J = rng.standard_normal((V, rows, 4)) * np.array([0.5] * 6 + [1.2])[:, None, None]
+    S = np.swapaxes(J, 1, 2) @ J
+    total, draws = np.zeros((4, 4)), 400
+    for _ in range(draws):
+        g = (np.swapaxes(J, 1, 2) @ (sigma * rng.standard_normal((V, rows, 1))))[..., 0]
+        g -= S @ np.linalg.solve(S.sum(axis=0), g.sum(axis=0))
+        moves = Quadratics(S, g, np.zeros(V)).moves_without_each()
+        total += view_covariance._jackknife(moves) / draws
+    expected = view_covariance._expected(Quadratics(S, np.zeros((V, 4)), np.zeros(V)), np.ones(V), sigma**2)
+    plain = sigma**2 * np.linalg.inv(S.sum(axis=0))
+    # The last view has half of the information.
+    assert view_covariance._size(expected, plain) > 1.2
+    assert view_covariance._size(total, expected) == pytest.approx(1.0, abs=0.1)
 
 
 def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_each_other() -> None:

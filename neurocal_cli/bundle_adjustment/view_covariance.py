@@ -10,8 +10,8 @@ by one step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
 With few views it is imprecise: used always, it would make the std of clean data a third too large with five
 views, and a quarter with ten. So it is used only if the views contradict each other more than chance allows,
 and it never goes below the covariance of the normal matrix. If each view has bends of its own, they hide such
-contradictions; then it is used if it is far larger than the covariance of the normal matrix. Views that
-repeat a pose (`repeated_poses`) count as one.
+contradictions; then it is used if it is far larger than noise lets one expect. Views that repeat a pose
+(`repeated_poses`) count as one.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diago
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
-# Ratio of the jackknife's variance to that of the normal matrix from which on it is used for boards with a
-# bend in each view: at most 11.5 in 63 sets of tests/test_simulated_targets.py, and 21 to 73 in photographs.
-_GROWN = 15.0
+# Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in each
+# view: above it in one (4.4) of the 143 such sets of tests/test_simulated_targets.py, and 4.7 to 32 in
+# photographs (figures, "The shape of the board").
+_GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
@@ -92,7 +93,8 @@ def counting_views(
         if moves is not None and told is not None:
             moves = moves @ told.back.T
         jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
-        if contradict or _grown(jackknife, entries) > _GROWN:
+        noise = _expected(q, repeated.variance, variance)
+        if contradict or _size(jackknife, entries) > _GROWN * _size(noise, entries):
             entries = _at_least(jackknife, entries)
     if entries is before or not np.isfinite(entries).all():
         return found
@@ -187,10 +189,25 @@ def _jackknife(moves: Array) -> Array:
     return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
 
 
-def _grown(jackknife: Array, entries: Array) -> float:
-    """Mean ratio of the jackknife's variances to the others over all directions; 0 if unknown."""
-    grown = float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
-    return grown if np.isfinite(grown) else 0.0
+def _expected(q: Quadratics, times: Array, variance: float) -> Array:
+    """(f, f) jackknife covariance that noise alone lets one expect, where cov(g) = times variance S.
+
+    It is larger than the covariance of the parameters: a view with a large share of the information moves them
+    far when it is left out.
+    """
+    S, own = q.S.sum(axis=0), times[:, None, None] * q.S
+    share = inverse_or_nan(S) @ q.S
+    by_share = own @ share
+    # At the minimum, g of each pose has lost its share of the sum.
+    scores = own - by_share - np.swapaxes(by_share, 1, 2)
+    scores += np.swapaxes(share, 1, 2) @ own.sum(axis=0) @ share
+    gain = inverse_or_nan(S - q.S)
+    return np.asarray((len(own) - 1) / len(own) * variance * (gain @ scores @ gain).sum(axis=0))
+
+
+def _size(jackknife: Array, entries: Array) -> float:
+    """Mean ratio of a jackknife's variances to the others over all directions; nan if unknown."""
+    return float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
 
 
 def _at_least(jackknife: Array, entries: Array) -> Array:
