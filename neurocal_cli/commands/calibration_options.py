@@ -240,8 +240,7 @@ _OPTIONS = [
     ),
     options.choice(
         "--distortion",
-        "auto none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir "
-        "double_sphere eucm rich plumb-line",
+        f"auto {options.MODELS} rich plumb-line",
         "Distortion model, with coefficients as in OpenCV; none is a pinhole camera. thin_prism and "
         "tilted are OpenCV's models of 12 and 14 coefficients. fisheye, omnidir, double_sphere and eucm are "
         "for wide lenses, also beyond 180 degrees. rich is a fisheye with a smooth displacement of the "

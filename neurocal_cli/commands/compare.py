@@ -23,7 +23,7 @@ from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 @options.methods("neuro,nonlinear,linear,tsai,opencv")
 @options.choice(
     "--distortion",
-    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    options.COMMON_MODELS,
     "Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
     "none, tsai k1 alone.",
     default="auto",

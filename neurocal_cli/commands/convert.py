@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 )
 @options.choice(
     "--model",
-    "none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir double_sphere eucm",
+    options.MODELS,
     "Write the nearest camera of this distortion model, and say how many pixels it is off.",
     without="the camera's own",
 )

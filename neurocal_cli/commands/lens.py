@@ -52,7 +52,7 @@ def lens() -> None:
 )
 @options.choice(
     "--distortion",
-    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    options.COMMON_MODELS,
     "Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
     "richer model only if it lowers the cross-validation error over the settings.",
     default="auto",

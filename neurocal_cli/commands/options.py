@@ -37,6 +37,12 @@ class _Place(click.Path):
 
 PATH = _Place(readable=False, allow_dash=True)
 
+_USUAL = "none k1 k1k2 k1k2p1p2 plumb_bob rational"
+MODELS = f"{_USUAL} thin_prism tilted fisheye omnidir double_sphere eucm"
+"""Distortion models with a formula. A test compares the choices of `calibrate` with those of the library."""
+COMMON_MODELS = f"auto {_USUAL} fisheye"
+"""Those from which "auto" chooses by cross-validation."""
+
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `comparison.by_method`, which a test compares."""
 
