@@ -34,8 +34,8 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diago
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
-# Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in each
-# view: above it in one (4.4) of the 143 such sets of tests/test_simulated_targets.py, and 4.7 to 32 in
+# Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in
+# each view: above it in one (4.4) of the 143 such sets of tests/test_simulated_targets.py, and 4.7 to 32 in
 # photographs (figures, "The shape of the board").
 _GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
@@ -192,8 +192,8 @@ def _jackknife(moves: Array) -> Array:
 def _expected(q: Quadratics, times: Array, variance: float) -> Array:
     """(f, f) jackknife covariance that noise alone lets one expect, where cov(g) = times variance S.
 
-    It is larger than the covariance of the parameters: a view with a large share of the information moves them
-    far when it is left out.
+    It is larger than the covariance of the parameters: a view with a large share of the information moves
+    them far when it is left out.
     """
     S, own = q.S.sum(axis=0), times[:, None, None] * q.S
     share = inverse_or_nan(S) @ q.S
