@@ -213,8 +213,10 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     return replace(found, variance=variance, std=found.std * np.sqrt(variance / found.variance))
 
 
-def offsets_of(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Array:
-    """(n, 3) offsets of `known_sizes`, without the covariances.
+def minimum_of(
+    info: Information, prior: Prior, sizes: Mapping[str, float], variance: float
+) -> tuple[Array, Array]:
+    """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances.
 
     Raises
     ------
@@ -223,7 +225,7 @@ def offsets_of(info: Information, prior: Prior, sizes: Mapping[str, float], vari
     """
     parts = _Parts(info, prior, flat=False)
     noise = np.sqrt(variance)
-    return parts.offsets({name: size / noise for name, size in sizes.items()})
+    return parts.minimum({name: size / noise for name, size in sizes.items()})
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
@@ -288,10 +290,10 @@ class _Parts:
         evidence = log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 
-    def offsets(self, ratios: dict[str, float]) -> Array:
-        """(n, 3) offsets for these sizes."""
-        smooth, single = self.system.offsets(self.of_smooth(ratios), self.of_points(ratios))
-        return np.asarray(self.prior.basis @ smooth + single)
+    def minimum(self, ratios: dict[str, float]) -> tuple[Array, Array]:
+        """Step (f,) of the cameras and offsets (n, 3) for these sizes."""
+        step, smooth, single = self.system.minimum(self.of_smooth(ratios), self.of_points(ratios))
+        return step, np.asarray(self.prior.basis @ smooth + single)
 
     def of_smooth(self, ratios: Mapping[str, float]) -> Array:
         """(m,) precisions of the smooth coefficients, in units of the noise precision."""

@@ -117,16 +117,16 @@ class System:
             np.log(np.diagonal(factor)).sum() - np.log(scale).sum()
         )
 
-    def offsets(self, smooth: Array, single: Array) -> tuple[Array, Array]:
-        """Coefficients (m,) of the smooth parts and offsets (n, 3) of the single points."""
+    def minimum(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
+        """Step (f,) of the cameras, coefficients (m,) of smooth parts, offsets (n, 3) of single points."""
         if not self.points_first:
             M = self._without_poses(smooth, single)
             x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
-            return x[self.f : self.s], x[self.s :].reshape(self.n, 3)
+            return x[: self.f], x[self.f : self.s], x[self.s :].reshape(self.n, 3)
         M, root, rows = self._without_points(smooth, single)
         x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
         own = rows[:, :, -1] - rows[:, :, :-1] @ x
-        return x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
+        return x[: self.f], x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
 
     def _without_poses(self, smooth: Array, single: Array) -> Array:
         """The bordered matrix of cameras, smooth parts and points, with the precisions."""

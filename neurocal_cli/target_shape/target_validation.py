@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
-from neurocal_cli.target_shape.posterior import camera_step, offsets_of, prior_covariance
+from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.leave_out import without_each
+from neurocal_cli.target_shape.posterior import camera_step, minimum_of
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.without_poses import WithoutPoses
 
@@ -66,10 +67,10 @@ def passes_cross_validation(
     folds = np.arange(n_folds)
     try:
         if by_parts:
-            estimated = _offsets_without_each(parts, prior, sizes, variance)
+            estimated = [found for _, found in without_each(parts, prior, sizes, variance)]
         else:
             others = [information(folds[folds != fold]) for fold in range(n_folds)]
-            estimated = [offsets_of(some, prior, sizes, variance) for some in others]
+            estimated = [minimum_of(some, prior, sizes, variance)[1] for some in others]
     except np.linalg.LinAlgError:
         return True
     tried = np.stack([np.zeros_like(offsets), *estimated])
@@ -90,26 +91,6 @@ def passes_cross_validation(
         alone += out[1 + fold] - out[0]
         together += whole[1 + fold] - rest[1 + fold] + rest[0]
     return bool(alone < 0 or together < 0)
-
-
-def _offsets_without_each(
-    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
-) -> list[Array]:
-    """Offsets estimated from all parts but one, for each part left out."""
-    if 3 * len(prior.axes) > sum(part.pose_right.size for part in parts):
-        others = [joined([part for part in parts if part is not out]) for out in parts]
-        return [offsets_of(some, prior, sizes, variance) for some in others]
-    matrices = [WithoutPoses(part).matrix() for part in parts]
-    f = len(parts[0].camera)
-    precision = np.zeros_like(matrices[0][:-1, :-1])
-    precision[f:, f:] = variance * np.linalg.inv(prior_covariance(prior, sizes))
-    whole = sum(matrices)
-    estimated = []
-    for out in matrices:
-        M = whole - out
-        x = np.linalg.solve(M[:-1, :-1] + precision, M[:-1, -1])
-        estimated.append(np.asarray(x[f:].reshape(-1, 3)))
-    return estimated
 
 
 def _least(terms: tuple[Array, Array, Array]) -> Array:

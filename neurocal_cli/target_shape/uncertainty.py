@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from neurocal_cli.target_shape.posterior import Posterior
     from neurocal_cli.target_shape.prior import Prior
 
-_MOST_POSES = (
-    24  # that are left out one by one, each with a target of its own; among more, one matters little
-)
+# Poses that are left out one by one, each with a target of its own; with more that takes too long. From the
+# efficient scores alone the std of 28 photographs (fisheye_stereo, both cameras) are 11 to 13 % smaller.
+_MOST_POSES = 40
 
 
 @frozen_dataclass(eq=False)
@@ -139,30 +139,41 @@ class _TargetUncertainty:
         group : (V,) int array
             Pose of each view.
         """
+        from neurocal_cli.target_shape.information import joined
+        from neurocal_cli.target_shape.leave_out import without_each
+        from neurocal_cli.target_shape.posterior import camera_step_of
+
         n_poses = int(group.max()) + 1
         if n_poses > _MOST_POSES:
             return None
+        parts = [self._information(np.flatnonzero(group == pose)) for pose in range(n_poses)]
         try:
-            return np.stack([self._step(np.flatnonzero(group != pose)) for pose in range(n_poses)])
+            if self._target.only_bends:
+                others = (joined([part for part in parts if part is not out]) for out in parts)
+                return np.stack([camera_step_of(some) for some in others])
+            steps = without_each(parts, self._prior, self._target.sizes, self._variance)
         except np.linalg.LinAlgError:
             return None
+        return np.stack([step for step, _ in steps])
 
-    def _step(self, kept: NDArray[np.intp]) -> Array:
+    def _information(self, which: NDArray[np.intp]) -> Information:
+        """The quadratic of some views, with the prior of their bends."""
         from neurocal_cli.target_shape.information import information_of
 
-        some = self._sight.of_views(kept)
-        info = information_of([some], len(self._offsets)).turned(self._prior.axes)
-        return _solved(
-            info.around_given(self._offsets), self._prior, self._target, self._variance
-        ).camera_step
+        info = information_of([self._sight.of_views(which)], len(self._offsets)).turned(self._prior.axes)
+        return _held(info.around_given(self._offsets), self._target, self._variance)
+
+
+def _held(info: Information, target: Target, variance: float) -> Information:
+    """Add the prior of the bends of single views, if there are any."""
+    return info if target.bends is None else info.held(variance / target.bends.size**2)
 
 
 def _solved(info: Information, prior: Prior, target: Target, variance: float) -> Posterior:
     """Posterior of cameras and target, with the known sizes of the target's parts."""
     from neurocal_cli.target_shape.posterior import given_posterior, known_sizes
 
-    if target.bends is not None:
-        info = info.held(variance / target.bends.size**2)
+    info = _held(info, target, variance)
     if target.only_bends:
         return given_posterior(info, prior)
     return known_sizes(info, prior, target.sizes, variance)
