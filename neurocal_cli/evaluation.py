@@ -144,7 +144,7 @@ def evaluate_camera(
         if given is not None and calibration.target is not None:
             points = calibration.target.applied(given)
         if given is not None:
-            renamed = _other_images(calibration, points)
+            renamed = other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}
             warnings += _compare_units(calibration, points, poses)
     elif points is None:
@@ -155,7 +155,7 @@ def evaluate_camera(
         poses.update({name: view.pose for name, view in fit.views.items()})
         warnings += problems
     camera = camera_of(calibration)
-    predicted, in_front = _predict(camera, [poses[name] for name in points.view_names], points)
+    predicted, in_front = predict(camera, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
@@ -183,7 +183,7 @@ def refuse_another_size(calibration: Calibration, points: Correspondences) -> No
         )
 
 
-def _other_images(calibration: Calibration, points: Correspondences) -> tuple[str, ...]:
+def other_images(calibration: Calibration, points: Correspondences) -> tuple[str, ...]:
     """Views with the name of a view of the calibration, whose pose does not fit most of their points.
 
     A view with too few points for a new pose is not among them.
@@ -192,7 +192,7 @@ def _other_images(calibration: Calibration, points: Correspondences) -> tuple[st
     if not known:
         return ()
     some = points.select(np.isin(points.view_index, [points.view_names.index(name) for name in known]))
-    predicted, in_front = _predict(
+    predicted, in_front = predict(
         calibration.camera, [calibration.views[name].pose for name in some.view_names], some
     )
     near = max(_NEAR_PX, _NEAR * calibration.rmse_px)
@@ -225,7 +225,7 @@ def _fit_poses(
     return fit, warnings
 
 
-def _predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
+def predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
     """Project all points with the poses of their views; also which points lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]

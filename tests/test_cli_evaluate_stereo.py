@@ -97,7 +97,7 @@ def test_held_out_points_are_given_as_two_files(cameras: tuple[Path, Path], tmp_
     values = json.loads(result.stdout)
     assert values["n_points"] == values["rig"]["n_points"] == 3 * 54
     assert values["fitted_views"] == ["left05", "left06"]
-    assert "note: left05, left06: not in the calibrations" in result.stderr
+    assert "note: left05, left06: the calibrations have no such images" in result.stderr
 
 
 def test_a_folded_target_is_judged_in_one_view(tmp_path: Path) -> None:

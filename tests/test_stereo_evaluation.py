@@ -10,8 +10,9 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.stereo.evaluation import evaluate_stereo
 from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.triangulation import METHODS
@@ -125,6 +126,49 @@ def test_held_out_points_of_known_and_new_views() -> None:
     inside = evaluate_stereo(left, right)
     assert inside.rig is not None
     assert 0.7 * inside.rig.rmse < found.rig.rmse < 2 * inside.rig.rmse
+
+
+def seen_again(scene: RigScene, rng: np.random.Generator) -> tuple[Correspondences, Correspondences]:
+    """New images of the cameras of a scene, which have the names of the old ones."""
+    poses = dict(zip(scene.poses, reversed(list(scene.poses.values())), strict=True))
+    again = replace(scene, poses=poses)
+    return again.points(0, 0.2, rng), again.points(1, 0.2, rng)
+
+
+def test_new_images_with_old_names_get_poses_of_their_own() -> None:
+    scene = flat()
+    left, right = calibrated(scene)
+    found = evaluate_stereo(left, right, seen_again(scene, np.random.default_rng(9)))
+    inside = evaluate_stereo(left, right)
+    assert len(found.fitted) == 8
+    assert inside.rig is not None
+    assert found.rig is not None
+    assert found.rig.rmse < 2 * inside.rig.rmse
+    assert found.verdict is not None
+    assert inside.verdict is not None
+    assert found.verdict.word == inside.verdict.word
+
+
+@pytest.mark.parametrize("what", ["moved", "another camera", "the same camera twice"])
+def test_given_points_of_another_rig_are_not_good(what: str) -> None:
+    scene = flat()
+    left, right = calibrated(scene)
+    other = scene
+    if what == "moved":
+        other = replace(
+            scene, rig=Pose(rotation_step(np.array([[0.0, 0.01, 0.0]]))[0] @ scene.rig.R, scene.rig.t)
+        )
+    elif what == "another camera":
+        K = scene.cameras[1]
+        other = replace(scene, cameras=(scene.cameras[0], replace(K, u0=K.u0 + 15)))
+    points = seen_again(other, np.random.default_rng(9))
+    if what == "the same camera twice":
+        views = [name.replace("left", "right") for name in points[0].view_names]
+        points = points[0], replace(points[0], view=[views[k] for k in points[0].view_index])
+    verdict = evaluate_stereo(left, right, points).verdict
+    assert verdict is not None
+    assert verdict.word == "poor"
+    assert any("on the given points" in reason for reason in verdict.reasons)
 
 
 def changed(points: Correspondences, view: str, order: Array) -> Correspondences:

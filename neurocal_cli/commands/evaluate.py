@@ -177,9 +177,11 @@ def stereo(
     as left01 and right01). Points are paired by their ids, else by X, Y, Z.
 
     Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
-    With --points the poses of views that are not in the calibrations are fitted.
+    With --points the poses of images that are not in the calibrations are fitted, also of one that only has
+    the name of a calibrated view.
 
-    The rig also gets a verdict, as in neurocal stereo. It uses the points of the calibrations.
+    The rig also gets a verdict, as in neurocal stereo. It uses the points of the calibrations, and the error
+    on the points after --points.
 
     \b
     Examples:
@@ -210,7 +212,7 @@ def stereo(
     note(views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note([f"{names}: not in the calibrations; the poses are fitted with the cameras fixed"])
+        note([f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed"])
     warn(evaluation.warnings)
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))

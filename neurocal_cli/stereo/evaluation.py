@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
-from neurocal_cli.evaluation import refuse_another_size
+from neurocal_cli.evaluation import other_images, predict, refuse_another_size
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
@@ -25,6 +26,7 @@ from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_view
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError, space_error
 from neurocal_cli.stereo.triangulation import triangulate
+from neurocal_cli.verdict.given_points import GivenPoints, given_camera, given_error, with_findings
 
 
 @frozen_dataclass(eq=False)
@@ -158,17 +160,22 @@ class _Evaluator:
                 _refuse_other(camera, given)
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
-        self.new = [
-            pair
-            for pair in self.views.both
-            if pair[0] not in cameras[0].views or pair[1] not in cameras[1].views
+        known = [
+            camera.views.keys() - (() if points is None else other_images(camera, some))
+            for camera, some in zip(cameras, self.points, strict=True)
         ]
+        self.new = [pair for pair in self.views.both if pair[0] not in known[0] or pair[1] not in known[1]]
+        self.given = points is not None
 
     def evaluation(self) -> StereoEvaluation:
         """The errors of all points, through the poses of the views and through the rig."""
         fitted = self._fit_new() if self.new else None
         by_view = self._by_view(fitted)
-        through = None if self.rig is None else self._through_rig(self.rig, fitted)
+        poses = None if self.rig is None else self._poses_on(self.rig, fitted)
+        through = None if self.rig is None or poses is None else self._through_rig(self.rig, poses)
+        judgement = self.judgement
+        if self.given and self.rig is not None and poses is not None:
+            judgement = partial(self._judged, self.rig, poses, fitted)
         for error in (by_view, through):
             if error is not None and error.n_behind:
                 self.warnings.append(
@@ -185,7 +192,7 @@ class _Evaluator:
             tuple(a for a, _ in self.new),
             (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
             tuple(self.warnings),
-            self.judgement,
+            judgement,
         )
 
     def _fit_new(self) -> tuple[Calibration, Calibration]:
@@ -223,15 +230,53 @@ class _Evaluator:
             rigs.append(Pose.exact(R, second.t - R @ first.t))
         return self._error([first for first, _ in poses], rigs, np.ones(len(poses), dtype=bool))
 
-    def _through_rig(self, rig: Rig, fitted: tuple[Calibration, Calibration] | None) -> SpaceError | None:
-        """Errors through one rig, with the pose of each view that fits both cameras best."""
+    def _poses_on(self, rig: Rig, fitted: tuple[Calibration, Calibration] | None) -> list[Pose]:
+        """The pose of each view in the left camera that fits both cameras best."""
         poses = {name: view.pose for name, view in rig.left.views.items()}
         if fitted is not None:
             poses.update(poses_on_rig(rig.pose, fitted, ViewPairs(tuple(self.new), (), ())))
-        used = np.array([pair not in rig.left_out for pair in self.views.both])
-        if not used.any():
-            return None
-        return self._error([poses[a] for a, _ in self.views.both], [rig.pose], used)
+        return [poses[a] for a, _ in self.views.both]
+
+    def _used(self, rig: Rig) -> NDArray[np.bool_]:
+        """(V,) which views do not contradict the rig."""
+        return np.array([pair not in rig.left_out for pair in self.views.both])
+
+    def _through_rig(self, rig: Rig, poses: list[Pose]) -> SpaceError | None:
+        """Errors through one rig; None if all views contradict it."""
+        used = self._used(rig)
+        return self._error(poses, [rig.pose], used) if used.any() else None
+
+    def _judged(
+        self, rig: Rig, poses: list[Pose], fitted: tuple[Calibration, Calibration] | None
+    ) -> Verdict | None:
+        """The verdict with the findings about the given points."""
+        verdict = self.judgement() if callable(self.judgement) else self.judgement
+        if verdict is None or not len(rig.left.points):
+            return verdict
+        residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
+        seen = residuals[np.isfinite(residuals)]
+        rmse_px = float(np.sqrt((seen**2).mean())) if seen.size else np.nan
+        given = GivenPoints(rmse_px, len(residuals), len(residuals) - seen.size)
+        same = "rig, with both cameras as they were"
+        findings = [given_error(verdict, rig.rmse_px, rig.left.points, given, same)]
+        sides = zip(("left", "right"), self.cameras, fitted or (None, None), strict=True)
+        for side, camera, fit in sides:
+            findings += [
+                (n, f"{side} camera: {text}", advice) for n, text, advice in given_camera(camera, fit)
+            ]
+        return with_findings(verdict, findings)
+
+    def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
+        """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
+        used = self._used(rig)
+        if side == 1:
+            poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]
+        place = {pair[side]: k for k, pair in enumerate(self.views.both) if used[k]}
+        points = self.points[side]
+        some = points.select(np.array([name in place for name in points.view_names])[points.view_index])
+        camera = self.cameras[side].camera
+        predicted, in_front = predict(camera, [poses[place[name]] for name in some.view_names], some)
+        return np.where(in_front, np.hypot(*(predicted - some.pixels).T), np.nan)
 
     def _error(self, poses: list[Pose], rigs: list[Pose], used: NDArray[np.bool_]) -> SpaceError:
         """Triangulate the points of the used views and compare them with the target."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread, verdict_of
 from neurocal_cli.verdict.rules import ERROR, given_parameters
@@ -53,10 +55,19 @@ def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoi
     Verdict
         No better than before.
     """
-    findings = [_error(verdict, calibration, given)]
-    if given.fit is not None:
-        reestimated = gather_evidence(given.fit).reestimated
-        findings += given_parameters(reestimated, calibration.intrinsics, calibration.std)
+    findings = [given_error(verdict, calibration.rmse_px, calibration.points, given)]
+    return with_findings(verdict, [*findings, *given_camera(calibration, given.fit)])
+
+
+def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Finding]:
+    """Findings about the camera from views whose poses were fitted with it."""
+    if fit is None:
+        return []
+    return list(given_parameters(gather_evidence(fit).reestimated, calibration.intrinsics, calibration.std))
+
+
+def with_findings(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:
+    """Add findings to a verdict, which becomes no better."""
     found = verdict_of(findings, {})
     return replace(
         verdict,
@@ -66,7 +77,27 @@ def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoi
     )
 
 
-def _error(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Finding:
+def given_error(
+    verdict: Verdict,
+    rmse_px: float,
+    own_points: Correspondences,
+    given: GivenPoints,
+    same: str = "camera at the same zoom and focus",
+) -> Finding:
+    """The finding about the error on given points.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        Of the calibration.
+    rmse_px : float [px]
+        Reprojection error of the calibration.
+    own_points : Correspondences
+        From which it was calibrated.
+    given : GivenPoints
+    same : str
+        What should not have changed, for the advice.
+    """
     error, seen = given.rmse_px, given.n_points - given.n_behind
     if 2 * seen < given.n_points:
         return (
@@ -76,15 +107,14 @@ def _error(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Fi
         )
     # With few points, the error of a calibration on its own points is too small, so use cross-validation.
     held_out = verdict.measures.get("held_out_px", np.nan)
-    own = float(np.fmax(calibration.rmse_px, held_out))
-    own = max(own, _ROUNDING * pixel_spread(calibration.points))
+    own = float(np.fmax(rmse_px, held_out))
+    own = max(own, _ROUNDING * pixel_spread(own_points))
     # The relative standard deviation of an rms error of n numbers is 1 / sqrt(2 n); a point has two.
     ratio = error / (own * (1 + _CHANCE / np.sqrt(4 * seen)))
-    grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(calibration.points)))
+    grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
     return (
         grade,
-        f"the rms error of {error:.3g} px on the given points is {error / own:.2g} times the "
+        f"the rms error of {error:.3g} px on the given points is {float(f'{error / own:.2g}'):g} times the "
         f"{own:.3g} px of the calibration",
-        "check that the given points are of the same camera at the same zoom and focus; look at the views "
-        "with the largest errors",
+        f"check that the given points are of the same {same}; look at the views with the largest errors",
     )
