@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from support.distorted import through
 from support.scenes import random_flat_set
 from support.slow_cases import slow_but
+from support.targets import photographed
 from support.wrong_inputs import flat
 
 from neurocal_cli import Correspondences, Intrinsics, calibrate
@@ -56,6 +57,41 @@ def test_a_camera_that_is_given_truly_is_within_five_standard_deviations(trials:
         found = calibrate(scene.points(noise, rng), **scene.given(3))
         asked = gather_evidence(found).reestimated
         assert all(abs(one.found - one.given) < 5 * one.std for one in asked)
+
+
+@pytest.mark.parametrize("trials", slow_but([2], [2, 12]))
+def test_neither_tangential_distortion_nor_a_bent_target_hides_a_wrong_centre(trials: int) -> None:
+    """12 px of 1280: with p1, p2 and the target estimated, the error is that of the noise."""
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, 13])
+        scene = random_flat_set(rng, 8, False, cols=9, rows=6, f=1000.0, width=1280)
+        points, (u0, v0) = scene.points(0.2, rng), scene.given(2)["image_center"]
+        wrong = calibrate(points, type=2, image_center=(u0 + 12.0, v0 - 8.0)).verdict
+        right = calibrate(points, type=2, image_center=(u0, v0)).verdict
+        assert wrong is not None
+        assert right is not None
+        assert any(f"u0 = {u0 + 12:.5g} is given" in reason for reason in wrong.reasons)
+        assert not any("is given, but" in reason for reason in right.reasons)
+
+
+@pytest.mark.parametrize("seeds", slow_but([2], [2, 12]))
+def test_a_bent_board_does_not_make_a_true_centre_wrong(seeds: int) -> None:
+    for seed in range(seeds):
+        points, truth = photographed("parabola", seed, 12, 0.5)
+        found = calibrate(points, type=2, image_center=(truth.K[0, 2], truth.K[1, 2]), distortion="k1k2")
+        assert found.target is not None
+        assert found.verdict is not None
+        assert not any("is given, but" in reason for reason in found.verdict.reasons)
+
+
+def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
+    points = flat()
+    assert points.image_size is not None
+    width, height = points.image_size
+    verdict = calibrate(points, type=2, image_center=((width - 1) / 2, (height - 1) / 2)).verdict
+    assert verdict is not None
+    assert verdict.word != "good"
+    assert any("middle of the image" in reason for reason in verdict.reasons)
 
 
 def test_one_flat_view_does_not_tell_what_it_would_ask_for() -> None:

@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.target_shape.find import Found, evidence_as_given
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
-from neurocal_cli.verdict.given_parameters import reestimate_given
+from neurocal_cli.verdict.given_parameters import AS_WELL, reestimate_centre, reestimate_given
 from neurocal_cli.verdict.noise import stated_noise
 from neurocal_cli.verdict.view_change import view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
@@ -39,10 +39,26 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         return True
     if not problem.free_poses:
         return False
-    asked = reestimate_given(problem.views, solution.state, problem.fixed, problem.free_poses)
-    if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
-        return True
-    return _are_two_cameras(solution, found) or _changes_between_views(solution, found)
+    return (
+        _given_is_wrong(solution, found)
+        or _are_two_cameras(solution, found)
+        or _changes_between_views(solution, found)
+    )
+
+
+def _given_is_wrong(solution: Solution, found: Found) -> bool:
+    """Whether other values of the given parameters explain the points as well as the found target does."""
+    problem, (_, after) = solution.problem, found.fits[0]
+    views, given, free_poses = problem.views, problem.fixed, problem.free_poses
+    unknowns = int(problem.free_camera.sum()) + 6 * views.n_views
+    variance = float(after.cost.sum()) / max(views.n_equations - unknowns, 1)
+    for asked in (
+        reestimate_given(views, solution.state, given, free_poses, variance=AS_WELL * variance),
+        reestimate_centre(views, solution.state, given, free_poses, variance),
+    ):
+        if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
+            return True
+    return False
 
 
 def _are_two_cameras(solution: Solution, found: Found) -> bool:

@@ -54,7 +54,7 @@ from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
-from neurocal_cli.verdict.given_parameters import reestimate_given
+from neurocal_cli.verdict.given_parameters import Reestimated, reestimate_centre, reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.verdict.pixel_values import repeated_views
@@ -199,7 +199,7 @@ class _AtMinimum:
             change=self._change(noise),
             board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
-            reestimated=reestimate_given(views, self.state, self.calibration.fixed, self.free_poses),
+            reestimated=self._reestimated(),
             noise=(
                 *stated,
                 *stated_survey(self.calibration.target),
@@ -208,6 +208,23 @@ class _AtMinimum:
             groups=None if stated else self._groups(),
             missing=self._missing(),
         )
+
+    def _reestimated(self) -> tuple[Reestimated, ...]:
+        """Given parameters as the points have them; of two estimates of a centre, the farther one."""
+        given = self.calibration.fixed
+        found = reestimate_given(self.views, self.state, given, self.free_poses)
+        target, p = self.calibration.target, {"p1", "p2"} - given
+        if target is None and p.isdisjoint(coefficient_names(self.state.model)):
+            return found
+        views = self.views if target is None else arrange(target.as_given(self.points))
+        simpler = reestimate_centre(
+            views, normalised(self.given, views), given, self.free_poses, self.cost / self.spare
+        )
+        farther = {a.name: a for a in simpler}
+        for a in found:
+            if a.name not in farther or abs(a.found - a.given) > abs(farther[a.name].found - a.given):
+                farther[a.name] = a
+        return tuple(farther.values())
 
     def _residuals(self) -> Array:
         """(N, 2) predicted minus observed [px], in the order of the points."""

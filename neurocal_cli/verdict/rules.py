@@ -38,7 +38,7 @@ _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
-_GIVEN = Limit(0.01, 0.05)  # difference over alpha
+_GIVEN = Limit(0.002, 0.05)  # difference over alpha
 _TOLD_APART = 5.0  # standard deviations; 100 cameras with correctly given parameters stay below
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
@@ -209,6 +209,13 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
+    if calibration.type == 2 and _is_middle(calibration):
+        yield (
+            1,
+            "the given image centre is the middle of the image, from which those of real cameras differ by "
+            "tens of pixels; the rotations have that error",
+            "give the centre of this camera, or estimate it: --type 1",
+        )
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
@@ -236,6 +243,11 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "hardly any camera has such axes; check the target, or give --no-skew",
         )
     yield from off_centre
+
+
+def _is_middle(calibration: Calibration) -> bool:
+    A, size = calibration.intrinsics, calibration.image_size
+    return size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
 def _oblong(calibration: Calibration) -> bool:
