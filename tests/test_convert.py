@@ -429,6 +429,14 @@ def test_the_command_says_what_is_lost(camera_file: Path, tmp_path: Path) -> Non
     assert (tmp_path / "camera.xml").read_text().startswith("<?xml")
 
 
+@pytest.mark.parametrize("target", ["ros", "kalibr", "mrcal"])
+def test_poses_that_a_format_lacks_are_named(target: str, camera_file: Path, tmp_path: Path) -> None:
+    result = run("convert", camera_file, "--to", target, "-o", tmp_path / "camera")
+    views = len(read_calibration(camera_file).views)
+    assert f"has no place for the poses of {views} views" in result.stderr
+    assert "the poses" not in run("convert", tmp_path / "camera", "--to", target).stderr
+
+
 def test_a_camera_that_was_converted_serves_as_a_calibration(camera_file: Path, tmp_path: Path) -> None:
     for words in (["--to", "npz", "-o", tmp_path / "a.npz"], ["--to", "matlab", "-o", tmp_path / "a.mat"]):
         assert run("convert", camera_file, *words).exit_code == 0
