@@ -461,6 +461,14 @@ def test_a_rig_that_was_converted_serves_as_a_rig(tmp_path: Path) -> None:
     assert "nan" not in result.stdout
 
 
+def test_a_rig_without_a_baseline_is_refused(tmp_path: Path) -> None:
+    A, R = [[500, 0, 300], [0, 500, 200], [0, 0, 1]], np.eye(3).tolist()
+    (tmp_path / "rig.json").write_text(json.dumps({"M1": A, "M2": A, "R": R, "T": [0, 0, 0]}))
+    result = run("convert", tmp_path / "rig.json", "--to", "neurocal", "-o", tmp_path / "rig.yaml")
+    assert (result.exit_code, (tmp_path / "rig.yaml").exists()) == (1, False)
+    assert "the baseline of the rig in OpenCV's file is 0; give the translation" in result.stderr
+
+
 def test_two_files_of_opencv_s_stereo_sample_are_one_rig(tmp_path: Path) -> None:
     given = CameraSet((lens("k1"), lens("none")), (RIGHT,))
     (place,) = written(given, "json", tmp_path)
