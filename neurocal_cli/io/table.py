@@ -77,7 +77,8 @@ class Table:
         return columns
 
     def note_unknown(self, notes: list[str]) -> None:
-        """Append a remark that names the ignored columns."""
+        """Append remarks that name the ignored columns and misspelt metadata."""
+        notes += self.metadata.misspelt
         if self.unknown:
             names = ", ".join(repr(name[:40]) for name in self.unknown)
             notes.append(f"{self.source}: column{'s' * (len(self.unknown) > 1)} not used: {names}")

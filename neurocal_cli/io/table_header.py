@@ -22,6 +22,8 @@ is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
 _METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", re.DOTALL)
+_KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
+_ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
@@ -65,17 +67,25 @@ class Metadata:
     image_center : (u0, v0), optional [px]
     unit : str, optional
     distances : tuple of Distance, optional
+    misspelt : list of str
+        Remarks about lines that are nearly metadata.
     """
 
     image_size: tuple[int, int] | None = None
     image_center: tuple[float, float] | None = None
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
+    misspelt: list[str] = field(default_factory=list)
 
     def take(self, line: str, source: str, number: int) -> None:
         """Read a ``# key: value`` line; other comments are ignored."""
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
+            key = _meant(line)
+            if key:
+                self.misspelt.append(
+                    f"{source}:{number}: {line[:40]!r} is not used; for {key}, write {_VALUES[key][1]}"
+                )
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
         read, hint = _VALUES[key]
@@ -85,6 +95,17 @@ class Metadata:
         if getattr(self, key) not in (None, value):
             raise FormatError(f"{key} is given twice and differs; keep one", source, number)
         setattr(self, key, value)
+
+
+def _meant(line: str) -> str | None:
+    """The key of the metadata that a comment nearly is."""
+    match = _KEY_LIKE.fullmatch(line)
+    if match is None:
+        return None
+    from difflib import get_close_matches
+
+    word = re.sub("[ -]", "_", match[1].lower())
+    return next(iter(get_close_matches(word, _VALUES, 1, _ALIKE)), None)
 
 
 def _size(text: str) -> tuple[int, int] | None:
