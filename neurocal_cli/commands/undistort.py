@@ -39,7 +39,7 @@ from neurocal_cli.errors import UsageError
     without="a plane keeps the scale of the middle, the others show the image from left to right",
 )
 @options.count(
-    "--size", "W H", "Size of the result in pixels.", without="that of the images", least=2, most=32767
+    "--size", "W H", "Size of the result in pixels.", without="that of the images", least=2, most=32766
 )
 @options.alpha("keep the camera matrix")
 @options.interpolation
