@@ -169,7 +169,10 @@ def calibrate(
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:
-            text += f"; the rows of {len(copies)} of {points.n_views} views are those of another view"
+            text += (
+                f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
+                "or in another one"
+            )
         # The code that raised this does not know the points' file, so its name is added here.
         if points.lines is not None and not text.startswith(points.source):
             text = f"{points.source}: {text}"

@@ -160,12 +160,14 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     yield from views_of_another_scale(calibration.points)
     yield from e.noise
     if e.repeated:
-        yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
+        twice = "the rows are given twice, in the view itself or in another one"
+        yield 1, f"{name_some(e.repeated)}: {twice}", "give each view once"
     views = len(calibration.views)
     if e.poses < min(views, _FEW_POSES):
         yield (
             1,
-            f"{views} views show only {e.poses} different poses; views that repeat a pose count as one",
+            f"{views} views show only {e.poses} different pose{'s' * (e.poses != 1)}; views that repeat a pose "
+            "count as one",
             "add views of other poses instead of more frames of the same ones",
         )
     if e.mirrored:
