@@ -127,6 +127,18 @@ def test_five_columns_without_a_header_are_x_y_z_u_v(read):
     assert read("1 2 3 4 5\n6 7 8 9 10").pixels.tolist() == [[4, 5], [9, 10]]
 
 
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("X,Y,Z,u,v\n1,5,2,5,3,5,4,5,5,5\n", "found 10; write decimal points"),
+        ("1,5,2,5,3,5,4,5,5,5\n", "found 10; write decimal points"),
+        ("x,Y,Z,px,v\n", "write x as X, and name the column u"),
+    ],
+)
+def test_the_advice_fits_the_cause(read, text, advice):
+    assert advice in complaint(read, text)
+
+
 def test_a_commented_header_in_another_order_is_not_ignored(read):
     assert "remove its #" in complaint(read, "# u v X Y Z\n1 2 3 4 5\n")
 
