@@ -491,6 +491,7 @@ def test_a_wrong_request_is_refused(words: list[str], code: int, message: str, c
     result = run("convert", camera_file, *words)
     assert (result.exit_code, result.stdout) == (code, "")
     assert message in result.stderr
+    assert "note:" not in result.stderr
 
 
 def test_an_input_is_never_overwritten(camera_file: Path) -> None:

@@ -156,9 +156,9 @@ def _write_cameras(
     wanted = FORMATS[target]
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
+    _write(contents, output, target)
     note(adapted.remarks)
     warn(adapted.losses)
-    _write(contents, output, target)
     written = [
         {
             "name": camera.name,
