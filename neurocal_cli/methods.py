@@ -48,7 +48,7 @@ def calibrate(
     type: int = 1,
     image_center: tuple[float, float] | None = None,
     intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
-    extrinsics: Mapping[str, Pose] | None = None,
+    extrinsics: Mapping[str, Pose] | Calibration | None = None,
     method: str = "neuro",
     trainer: str = "lm",
     distortion: str = "auto",
@@ -76,8 +76,8 @@ def calibrate(
         For type 2. Default: that of the points, else the middle of their image size.
     intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
         For type 3. A Camera or Calibration includes its distortion.
-    extrinsics : dict of Pose by view name, optional
-        For type 4.
+    extrinsics : dict of Pose by view name or Calibration, optional
+        For type 4. Of a Calibration, the poses of its views.
     method : {"neuro", "linear", "nonlinear", "tsai"}
         The network, or one of the methods that the paper compares it with (`baselines`). These use all
         points, including outliers, and have no random starts.
@@ -128,6 +128,8 @@ def calibrate(
         points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
     known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
+    if isinstance(extrinsics, Calibration):
+        extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
     type_3 = isinstance(type, (int, np.integer)) and type == 3
     if method != "neuro" and not type_3:
         distortion = _distortion_of(method, distortion)
@@ -167,7 +169,10 @@ def calibrate(
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:
-            text += f"; the rows of {len(copies)} of {points.n_views} views are those of another view"
+            text += (
+                f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
+                "or in another one"
+            )
         # The code that raised this does not know the points' file, so its name is added here.
         if points.lines is not None and not text.startswith(points.source):
             text = f"{points.source}: {text}"

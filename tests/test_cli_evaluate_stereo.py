@@ -141,7 +141,7 @@ def test_swapped_files_are_refused_by_their_views_names(cameras: tuple[Path, Pat
 def test_files_that_are_no_cameras_are_refused(cameras: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("a: 1\n")
     one_line_error(evaluate(cameras[0], tmp_path / "a.yaml"), f"{tmp_path / 'a.yaml'}: has no neurocal block")
-    one_line_error(evaluate(tmp_path / "a.yaml"), "is not a rig")
+    one_line_error(evaluate(tmp_path / "a.yaml"), "is not a rig of neurocal", "convert --to neurocal")
     one_line_error(evaluate(cameras[0]), "is the calibration of one camera")
     one_line_error(evaluate(cameras[0], tmp_path / "none.yaml"), "there is no such file")
     rig = fit_rig(*(read_calibration(path) for path in cameras))
@@ -187,6 +187,7 @@ def test_opencvs_cameras_are_judged_by_points_with_fitted_poses(tmp_path: Path) 
     result = evaluate(*words, "--points", tmp_path / "0.csv", tmp_path / "1.csv", "--json")
     assert result.exit_code == 0, result.stderr
     assert result.stderr.count("note: only the intrinsic parameters and the distortion are used") == 2
+    assert "--intrinsics" not in result.stderr
     values = json.loads(result.stdout)
     assert values["rig"]["epipolar_px"] == pytest.approx(0.2, rel=0.2)
     assert values["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.real_data import RealFiles
+from support.rigs import random_rig, sides
 from support.wide_cameras import WIDE_LENSES, wide_camera, wide_points
 
 from neurocal_cli import (
@@ -22,6 +23,7 @@ from neurocal_cli import (
     read_points,
     read_rig,
     write_points,
+    write_rig,
 )
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.camera.distortion import Distortion
@@ -29,6 +31,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet
 from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.exchange.reading import FORMATS
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.rectified_pair import rectified_pair, rectify_points, row_error
 from neurocal_cli.stereo.report import rig_report
 
@@ -199,6 +202,18 @@ def test_points_files_are_rectified(rig_file: Path, tmp_path: Path) -> None:
     rms = np.sqrt(np.mean((left.pixels[:, 1] - right.pixels[:, 1]) ** 2))
     assert 0.08 < rms < 0.25
     assert f"rows of the 60 points given differ by {rms:.3g} px rms" in result.stderr
+
+
+def test_points_that_do_not_fit_the_rig_are_warned_of(tmp_path: Path) -> None:
+    left, right = sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1)
+    write_rig(calibrate_stereo(left, right, skew=False), tmp_path / "rig.yaml")
+    for name, points in (("left", left), ("right", right), ("twice", replace(left, view=right.view))):
+        write_points(points, tmp_path / f"{name}.csv")
+    for other, said in (("right", False), ("twice", True)):
+        files = tmp_path / "left.csv", tmp_path / f"{other}.csv"
+        result = run("rectify", tmp_path / "rig.yaml", *files, "-o", tmp_path / "out")
+        assert result.exit_code == 0, result.stderr
+        assert ("warning: most points do not fit the rig" in result.stderr) == said
 
 
 @pytest.mark.parametrize(

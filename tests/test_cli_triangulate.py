@@ -199,6 +199,13 @@ def test_cameras_that_do_not_belong_together_are_refused(folder: Path, tmp_path:
     one_line_error(run("triangulate", matches, matches), "not a rig")
 
 
+def test_a_rig_without_noise_takes_half_a_pixel_and_says_so(folder: Path, tmp_path: Path) -> None:
+    write_rig(replace(read_rig(folder / "rig.yaml"), rmse_px=float("nan")), tmp_path / "rig.yaml")
+    result = run("triangulate", tmp_path / "rig.yaml", folder / "matches.csv")
+    assert "note: the rig does not say how accurate its pixels are; 0.5 px is assumed" in result.stderr
+    assert "# sigma: 0.5" in result.stdout
+
+
 def test_wrong_usage(folder: Path) -> None:
     assert run("triangulate", folder / "rig.yaml").exit_code == 2
     assert run("triangulate", "-", "-").exit_code == 2

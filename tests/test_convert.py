@@ -429,6 +429,14 @@ def test_the_command_says_what_is_lost(camera_file: Path, tmp_path: Path) -> Non
     assert (tmp_path / "camera.xml").read_text().startswith("<?xml")
 
 
+@pytest.mark.parametrize("target", ["ros", "kalibr", "mrcal"])
+def test_poses_that_a_format_lacks_are_named(target: str, camera_file: Path, tmp_path: Path) -> None:
+    result = run("convert", camera_file, "--to", target, "-o", tmp_path / "camera")
+    views = len(read_calibration(camera_file).views)
+    assert f"has no place for the poses of {views} views" in result.stderr
+    assert "the poses" not in run("convert", tmp_path / "camera", "--to", target).stderr
+
+
 def test_a_camera_that_was_converted_serves_as_a_calibration(camera_file: Path, tmp_path: Path) -> None:
     for words in (["--to", "npz", "-o", tmp_path / "a.npz"], ["--to", "matlab", "-o", tmp_path / "a.mat"]):
         assert run("convert", camera_file, *words).exit_code == 0
@@ -453,6 +461,14 @@ def test_a_rig_that_was_converted_serves_as_a_rig(tmp_path: Path) -> None:
     assert "nan" not in result.stdout
 
 
+def test_a_rig_without_a_baseline_is_refused(tmp_path: Path) -> None:
+    A, R = [[500, 0, 300], [0, 500, 200], [0, 0, 1]], np.eye(3).tolist()
+    (tmp_path / "rig.json").write_text(json.dumps({"M1": A, "M2": A, "R": R, "T": [0, 0, 0]}))
+    result = run("convert", tmp_path / "rig.json", "--to", "neurocal", "-o", tmp_path / "rig.yaml")
+    assert (result.exit_code, (tmp_path / "rig.yaml").exists()) == (1, False)
+    assert "the baseline of the rig in OpenCV's file is 0; give the translation" in result.stderr
+
+
 def test_two_files_of_opencv_s_stereo_sample_are_one_rig(tmp_path: Path) -> None:
     given = CameraSet((lens("k1"), lens("none")), (RIGHT,))
     (place,) = written(given, "json", tmp_path)
@@ -475,6 +491,7 @@ def test_a_wrong_request_is_refused(words: list[str], code: int, message: str, c
     result = run("convert", camera_file, *words)
     assert (result.exit_code, result.stdout) == (code, "")
     assert message in result.stderr
+    assert "note:" not in result.stderr
 
 
 def test_an_input_is_never_overwritten(camera_file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -292,6 +293,21 @@ def test_mid_points_are_not_passed_on_silently(tmp_path: Path) -> None:
     assert len(json.loads((tmp_path / "a.json").read_text())["image_points"][0]) == 4
     result = run("convert", tmp_path / "points.csv", "--to", "mrcal")
     assert "mrcal takes the vertices of one flat board" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("target", "lost"),
+    [
+        ("json", "the image centre, sX,sY,sZ"),
+        ("matlab", "the image centre, the ids of the points, sX,sY,sZ"),
+        ("mrcal", "X,Y,Z, the unit, the image size, the image centre, sX,sY,sZ"),
+    ],
+)
+def test_data_that_a_format_of_points_lacks_are_named(target: str, lost: str, tmp_path: Path) -> None:
+    given = replace(points(pixels()), image_center=(320, 240), world_std=np.full((60, 3), 0.1))
+    write_points(given, tmp_path / "points.csv")
+    result = run("convert", tmp_path / "points.csv", "--to", target, "-o", tmp_path / "points.out")
+    assert f"note: a file of points of {target} has no place for {lost}\n" in result.stderr
 
 
 @settings(max_examples=100, deadline=None)

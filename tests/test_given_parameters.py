@@ -114,6 +114,8 @@ def test_given_poses_are_not_turned(seed: int) -> None:
         for name, R in known.rotations.items()
     }
     found = calibrate(points, type=4, extrinsics=given, distortion="k1", outliers="keep", target="given")
+    again = calibrate(points, type=4, extrinsics=found, distortion="k1", outliers="keep", target="given")
+    assert again.K.tolist() == found.K.tolist()
     R, t = (np.array([getattr(given[name], part) for name in points.view_names]) for part in ("R", "t"))
     in_camera = np.einsum("nij,nj->ni", R[points.view_index], points.world) + t[points.view_index]
     errors = points.pixels - found.camera.project(in_camera)[0]

@@ -77,5 +77,5 @@ def test_residuals_that_differ_by_direction_or_view_are_named() -> None:
 
 def test_copies_are_named_where_boards_are_parallel() -> None:
     pixels = np.tile(POINTS.pixels[POINTS.view_index == 2], (10, 1))
-    with pytest.raises(NeurocalError, match="the rows of 9 of 10 views are those of another view"):
+    with pytest.raises(NeurocalError, match="the rows of 9 of 10 views are given twice"):
         calibrate(moved(POINTS, pixels=pixels), distortion="none")

@@ -104,8 +104,39 @@ def test_columns_are_found_by_name_and_unknown_ones_left_out_with_a_note(read):
     assert "'quality'" in notes[0]
 
 
+@pytest.mark.parametrize(
+    ("comment", "noted"),
+    [
+        ("# units: cm", "for unit, write a name as in `# unit: mm`"),
+        ("# unit = cm", "for unit, write"),
+        ("# Image size: 640 480", "for image_size, write two whole numbers"),
+        ("# image_centre: 320 240", "for image_center, write two numbers"),
+        ("# image_file: left.png", ""),
+        ("# measured by hand, with care: twice", ""),
+    ],
+)
+def test_comments_that_are_nearly_metadata_are_noted(comment, noted, read):
+    notes = []
+    points = read(f"{comment}\nX,Y,Z,u,v\n1,2,3,4,5\n", notes=notes)
+    assert (points.unit, points.image_size, points.image_center) == ("mm", None, None)
+    assert len(notes) == bool(noted)
+    assert noted in "".join(notes)
+
+
 def test_five_columns_without_a_header_are_x_y_z_u_v(read):
     assert read("1 2 3 4 5\n6 7 8 9 10").pixels.tolist() == [[4, 5], [9, 10]]
+
+
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("X,Y,Z,u,v\n1,5,2,5,3,5,4,5,5,5\n", "found 10; write decimal points"),
+        ("1,5,2,5,3,5,4,5,5,5\n", "found 10; write decimal points"),
+        ("x,Y,Z,px,v\n", "write x as X, and name the column u"),
+    ],
+)
+def test_the_advice_fits_the_cause(read, text, advice):
+    assert advice in complaint(read, text)
 
 
 def test_a_commented_header_in_another_order_is_not_ignored(read):

@@ -47,7 +47,7 @@ def test_pairs_come_in_the_left_cameras_order() -> None:
 )
 def test_names_that_do_not_pair_are_refused_with_what_to_do(left: list[str], right: list[str]) -> None:
     with pytest.raises(
-        InputError, match=r"no view of the left camera has a partner.*give views taken together"
+        InputError, match=r"no view of the left camera has a partner.*left and right touch no other letter"
     ):
         pair_views(left, right)
 

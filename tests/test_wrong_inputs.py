@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from support.slow_cases import slow_but
-from support.wrong_inputs import CAUSES, FLAT, FOLDED, SLOW, UNNAMED, flat, folded, outcome
+from support.wrong_inputs import CAUSES, FLAT, FOLDED, SIZE, SLOW, UNNAMED, flat, folded, outcome
 from wrong_inputs_table import words
 
 from neurocal_cli import calibrate
@@ -38,6 +40,12 @@ def test_no_wrong_input_ends_as_good_and_its_cause_is_named(name: str) -> None:
     assert ROWS[name] == found.word
     assert bool(found.named) == (name not in UNNAMED), found.reasons
     assert sum(words in reason for reason in found.reasons for words in DIFFERENT) <= 1, found.reasons
+
+
+def test_coordinates_that_are_no_pixels_are_the_only_reason() -> None:
+    assert len(outcome("pixels from 0 to 1").reasons) == 1
+    found = calibrate(replace(flat(1), pixels=flat(1).pixels / SIZE))
+    assert not any("poses" in text for text in found.warnings)
 
 
 def test_the_table_has_every_wrong_input() -> None:

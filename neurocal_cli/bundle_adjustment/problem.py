@@ -342,6 +342,9 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
         raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
+    wrong = "the extrinsics must be a dict with a Pose for each view"
+    if not isinstance(extrinsics, Mapping):
+        raise UsageError(wrong)
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
@@ -350,5 +353,5 @@ def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> di
             f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
         )
     if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
-        raise UsageError("the extrinsics must be a dict with a Pose for each view")
+        raise UsageError(wrong)
     return {name: extrinsics[name] for name in points.view_names}

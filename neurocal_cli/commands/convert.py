@@ -156,9 +156,9 @@ def _write_cameras(
     wanted = FORMATS[target]
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
+    _write(contents, output, target)
     note(adapted.remarks)
     warn(adapted.losses)
-    _write(contents, output, target)
     written = [
         {
             "name": camera.name,
@@ -217,10 +217,12 @@ def _write_points(points: Correspondences, target: str, output: str) -> dict[str
     from neurocal_cli.io.writing import write_whole
 
     text = corner_text(points, target, os.path.splitext(output)[1].lower())
-    lost = points_lost(points, target)
-    warn(lost)
+    losses, remarks = points_lost(points, target)
+    note(remarks)
+    warn(losses)
     write_whole(output, text)
-    return {"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": lost}
+    told = {"to": target, "n_points": len(points), "n_views": points.n_views}
+    return {**told, "warnings": [*losses, *remarks]}
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:

@@ -174,7 +174,8 @@ def stereo(
     views. The error of the rig is what to expect for new points.
 
     Two views are a pair if their names are equal, or equal without left, l, cam0 and right, r, cam1 (such
-    as left01 and right01). Points are paired by their ids, else by X, Y, Z.
+    as left01 and right01, but not leftnew01: the word must not touch other letters). Points are paired by
+    their ids, else by X, Y, Z.
 
     Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
     With --points the poses of images that are not in the calibrations are fitted, also of one that only has

@@ -16,10 +16,13 @@ from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
-    from neurocal_cli.stereo.rectified_pair import RectifiedPair
+    from neurocal_cli.stereo.rectified_pair import RectifiedPair, RowError
     from neurocal_cli.stereo.rig import Rig
 
 _SIDES = ("left", "right")
+# Median difference of rows, as a multiple of that of the rig's own points, and in px: 1 for other points of
+# the rig, 5 if one file is given twice; tests/test_cli_rectify.py.
+_MISFIT, _NO_MISFIT = 3.0, 0.1
 
 
 @click.command(cls=options.Command)
@@ -161,6 +164,7 @@ class _Work:
     pair: RectifiedPair = field(init=False)
     remappings: list[Remapping] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
+    own_rows: RowError | None = None
 
     def __post_init__(self) -> None:
         from neurocal_cli.stereo.rectified_pair import rectified_pair
@@ -173,7 +177,7 @@ class _Work:
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import row_error_of_rig
 
-        error = row_error_of_rig(self.rig, self.pair)
+        error = self.own_rows = row_error_of_rig(self.rig, self.pair)
         if error is not None:
             along = self.summary["along"]
             self._tell(
@@ -215,6 +219,13 @@ class _Work:
             f"{self.summary['along']} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
             f"rms, {error.max_px:.3g} px at most"
         )
+        if self.own_rows and error.median_px > max(_MISFIT * self.own_rows.median_px, _NO_MISFIT):
+            warn(
+                [
+                    "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
+                    "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
+                ]
+            )
 
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify all pairs; those that fail are named and left out."""

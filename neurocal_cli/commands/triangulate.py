@@ -36,7 +36,7 @@ _MANY_OFF = 0.5  # share of the points that chance does not explain
     "--sigma",
     "PX",
     "Standard deviation of the pixels, in u and in v, for the covariances.",
-    without="the noise of the calibration's points",
+    without="the noise of the rig's own points, or 0.5 if it does not state any",
     positive=True,
 )
 @options.number(

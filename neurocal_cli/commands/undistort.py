@@ -14,6 +14,8 @@ from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, ch
 from neurocal_cli.commands.streams import is_terminal, print_summary, say
 from neurocal_cli.errors import UsageError
 
+_NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
+
 
 @click.command(cls=options.Command)
 @options.argument("camera", "CAMERA.yaml", "The camera, a neurocal, ROS or OpenCV file; - is standard input.")
@@ -39,7 +41,7 @@ from neurocal_cli.errors import UsageError
     without="a plane keeps the scale of the middle, the others show the image from left to right",
 )
 @options.count(
-    "--size", "W H", "Size of the result in pixels.", without="that of the images", least=2, most=32767
+    "--size", "W H", "Size of the result in pixels.", without="that of the images", least=2, most=32766
 )
 @options.alpha("keep the camera matrix")
 @options.interpolation
@@ -179,6 +181,14 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
         return None
     if os.path.exists(output) and not os.path.isdir(output):
         raise UsageError(f"-o {output} is a file; give a folder")
+    file = is_image(output) or output.lower().endswith((*_NOT_WRITTEN, ".csv"))
+    if file and not (os.path.isdir(output) or output.endswith(os.sep)):
+        raise UsageError(
+            f"several files cannot go to one file, {output}; give a folder, -o DIR"
+            if several
+            else f"-o {output} is no image that can be written; give .png, .jpg, .tif, .bmp, .pgm or .ppm, "
+            "or a folder"
+        )
     return output
 
 

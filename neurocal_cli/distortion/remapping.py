@@ -25,7 +25,7 @@ INTERPOLATIONS = {
 
 _AT_ONCE = 1 << 20  # pixels whose sources are computed at a time: memory
 _KEPT = 1 << 25  # largest image whose sources are kept for the next one, at 8 bytes a pixel
-_LONGEST = 32767  # px; OpenCV's remap counts a side in 16 bits
+_LONGEST = 32766  # px; OpenCV's remap counts a side in 16 bits
 _NOWHERE = -1e6  # a source outside every image, which gives black
 
 Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]

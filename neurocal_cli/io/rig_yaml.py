@@ -133,7 +133,10 @@ def rig_from_field(root: Field) -> Rig:
     if not isinstance(root.value, dict) or "stereo" not in root:
         if "neurocal" in root:
             root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
-        root.refuse("is not a rig; give a file that neurocal stereo wrote")
+        root.refuse(
+            "is not a rig of neurocal; give a file that neurocal stereo wrote, or make one of another "
+            "program's rig with neurocal convert --to neurocal"
+        )
     block = root["stereo"]
     if block["format"].integer() != FORMAT:
         root.refuse(f"stereo.format is {block['format'].integer()}, not {FORMAT}; update neurocal")

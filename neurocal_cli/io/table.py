@@ -26,6 +26,7 @@ from neurocal_cli.io.table_header import (
     Layout,
     Metadata,
     Schema,
+    decimal_commas,
     find_layout,
     is_decimal_comma,
     is_number,
@@ -77,7 +78,8 @@ class Table:
         return columns
 
     def note_unknown(self, notes: list[str]) -> None:
-        """Append a remark that names the ignored columns."""
+        """Append remarks that name the ignored columns and misspelt metadata."""
+        notes += self.metadata.misspelt
         if self.unknown:
             names = ", ".join(repr(name[:40]) for name in self.unknown)
             notes.append(f"{self.source}: column{'s' * (len(self.unknown) > 1)} not used: {names}")
@@ -260,9 +262,10 @@ def _rows(data: bytes, source: str, layout: Layout) -> Iterator[tuple[int, list[
             continue
         fields = split_fields(line, layout.separator, source, number)
         if len(fields) != expected:
+            advice = decimal_commas(len(fields), expected, layout.separator) or "complete or remove the row"
             raise FormatError(
                 f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
-                "complete or remove the row",
+                f"{advice}",
                 source,
                 number,
             )

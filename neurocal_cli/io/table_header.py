@@ -22,6 +22,9 @@ is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
 _METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", re.DOTALL)
+_KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
+_ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
+_COMMAS = 1.6  # values over those expected; u,v and most of X,Y,Z have decimals, labels have none
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
@@ -65,17 +68,25 @@ class Metadata:
     image_center : (u0, v0), optional [px]
     unit : str, optional
     distances : tuple of Distance, optional
+    misspelt : list of str
+        Remarks about lines that are nearly metadata.
     """
 
     image_size: tuple[int, int] | None = None
     image_center: tuple[float, float] | None = None
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
+    misspelt: list[str] = field(default_factory=list)
 
     def take(self, line: str, source: str, number: int) -> None:
         """Read a ``# key: value`` line; other comments are ignored."""
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
+            key = _meant(line)
+            if key:
+                self.misspelt.append(
+                    f"{source}:{number}: {line[:40]!r} is not used; for {key}, write {_VALUES[key][1]}"
+                )
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
         read, hint = _VALUES[key]
@@ -85,6 +96,17 @@ class Metadata:
         if getattr(self, key) not in (None, value):
             raise FormatError(f"{key} is given twice and differs; keep one", source, number)
         setattr(self, key, value)
+
+
+def _meant(line: str) -> str | None:
+    """The key of the metadata that a comment nearly is."""
+    match = _KEY_LIKE.fullmatch(line)
+    if match is None:
+        return None
+    from difflib import get_close_matches
+
+    word = re.sub("[ -]", "_", match[1].lower())
+    return next(iter(get_close_matches(word, _VALUES, 1, _ALIKE)), None)
 
 
 def _size(text: str) -> tuple[int, int] | None:
@@ -168,7 +190,7 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
             separator = _find_separator(line)
             fields = split_fields(line, separator, source, number)
             if all(is_number(text) for text in fields):
-                names = _headerless_names(fields, comments, source, number, schema)
+                names = _headerless_names(fields, separator, comments, source, number, schema)
                 return Layout(separator, names, start, number - 1, metadata)
             for text in fields:
                 if is_decimal_comma(text):
@@ -239,16 +261,26 @@ def _find_separator(line: str) -> str | None:
     return None
 
 
+def decimal_commas(found: int, expected: int, separator: str | None) -> str:
+    """Advice for a row with too many values because its decimal commas separate them too; "" for others."""
+    if separator != "," or found < _COMMAS * expected:
+        return ""
+    return "write decimal points if these are decimal commas, or separate the values by semicolons"
+
+
 def _headerless_names(
-    fields: list[str], comments: list[str], source: str, number: int, schema: Schema
+    fields: list[str], separator: str | None, comments: list[str], source: str, number: int, schema: Schema
 ) -> tuple[str, ...]:
     expected = schema.headerless
     if not expected:
         raise FormatError(f"the header is missing; begin with {','.join(schema.required)}", source, number)
     if len(fields) != len(expected):
+        advice = (
+            decimal_commas(len(fields), len(expected), separator) or "add a header that names the columns"
+        )
         raise FormatError(
             f"there is no header, so {len(expected)} columns {','.join(expected)} are expected, found "
-            f"{len(fields)}; add a header that names the columns",
+            f"{len(fields)}; {advice}",
             source,
             number,
         )
@@ -280,6 +312,9 @@ def _check_names(names: list[str], source: str, number: int, schema: Schema) -> 
     lower = {name.lower(): name for name in names}
     similar = [f"{lower[name.lower()]} as {name}" for name in missing if name.lower() in lower]
     hint = f"write {', '.join(similar)}" if similar else f"name the columns {','.join(schema.required)}"
+    others = [name for name in missing if name.lower() not in lower]
+    if similar and others:
+        hint += f", and name the column{'s' * (len(others) > 1)} {','.join(others)}"
     if len(missing) == len(schema.required) and not similar:
         hint += schema.instead
     found = ",".join(names)

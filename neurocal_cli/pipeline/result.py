@@ -25,6 +25,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
+from neurocal_cli.verdict.pixel_values import normalised
 
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
@@ -103,7 +104,7 @@ def calibration_of(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
             *_xi_warning(solution.ambiguity, problem.distortion.model),
             *_corner_warning(problem),
-            *_repeated_warning(repeated),
+            *(() if normalised(problem.points) else _repeated_warning(repeated)),
             *filter(None, [scale_of(problem.points).contradiction]),
             *_mirrored_warning(seen_from_behind(views, state)),
             *_rejection_warnings(rejected, len(problem.points)),
@@ -199,8 +200,8 @@ def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
     if repeated.none:
         return ()
     return (
-        f"{len(repeated.group)} views show {repeated.n_poses} different poses; views that repeat a pose "
-        "count as one",
+        f"{len(repeated.group)} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
+        "views that repeat a pose count as one",
     )
 
 

@@ -86,7 +86,8 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     if not both:
         raise InputError(
             f"no view of the left camera has a partner in the right one: left has {_listed(left)}, right has "
-            f"{_listed(right)}; give views taken together the same name, or names such as left01 and right01"
+            f"{_listed(right)}; give views taken together the same name, or names such as left01 and "
+            "right01, in which left and right touch no other letter"
         )
     paired = set(sum(both, ()))
     return ViewPairs(

@@ -47,6 +47,7 @@ class RectifiedPair:
 class RowError:
     """Distance between the rows (or columns) of corresponding points [px]."""
 
+    median_px: float
     rms_px: float
     max_px: float
     n_points: int
@@ -126,7 +127,8 @@ def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences
             kept &= ~n.any(axis=1) | (np.abs(n[:, across]) > _ACROSS)
     if kept.any():
         difference = difference[kept]
-    return RowError(float(np.sqrt(np.mean(difference**2))), float(np.abs(difference).max()), len(difference))
+    rms, size = float(np.sqrt(np.mean(difference**2))), np.abs(difference)
+    return RowError(float(np.median(size)), rms, float(size.max()), len(size))
 
 
 def row_error_of_rig(rig: Rig, pair: RectifiedPair) -> RowError | None:

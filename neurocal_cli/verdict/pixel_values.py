@@ -21,17 +21,22 @@ _SAME = 1e-3  # px by which a copy of a view may differ
 _NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 
 
+def normalised(points: Correspondences) -> bool:
+    """Whether the pixels are normalised coordinates."""
+    return bool(np.abs(points.pixels).max() < _NORMALISED)
+
+
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     """Findings about the pixels as numbers."""
-    first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
-    pixels = points.pixels[first]
-    if np.abs(pixels).max() < _NORMALISED:
+    if normalised(points):
         yield (
             2,
             "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",
             "multiply u,v by the width and the height of the image",
         )
         return
+    first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
+    pixels = points.pixels[first]
     step = _step(pixels)
     if step:
         to = "whole numbers" if step == 1 else f"multiples of {step} px"

@@ -13,7 +13,7 @@ from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import Reestimated
-from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
+from neurocal_cli.verdict.pixel_values import normalised, odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale
 
@@ -72,6 +72,9 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
+    if normalised(calibration.points):  # the other rules are in pixels
+        yield from odd_pixels(calibration.points)
+        return
     if _oblong(calibration):  # a target stretched in one direction makes views differ as well
         evidence = replace(evidence, groups=None)
     if not calibration.converged:
@@ -160,12 +163,14 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     yield from views_of_another_scale(calibration.points)
     yield from e.noise
     if e.repeated:
-        yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
+        twice = "the rows are given twice, in the view itself or in another one"
+        yield 1, f"{name_some(e.repeated)}: {twice}", "give each view once"
     views = len(calibration.views)
     if e.poses < min(views, _FEW_POSES):
         yield (
             1,
-            f"{views} views show only {e.poses} different poses; views that repeat a pose count as one",
+            f"{views} views show only {e.poses} different pose{'s' * (e.poses != 1)}; views that repeat a "
+            "pose count as one",
             "add views of other poses instead of more frames of the same ones",
         )
     if e.mirrored:

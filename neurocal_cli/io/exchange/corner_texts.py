@@ -43,10 +43,10 @@ def corner_text(points: Correspondences, target: str, ending: str) -> str | byte
     return _TEXTS[target](points, ending)
 
 
-def points_lost(points: Correspondences, target: str) -> list[str]:
-    """Remarks about properties of the points that are lost in the file."""
+def points_lost(points: Correspondences, target: str) -> tuple[list[str], list[str]]:
+    """Losses of the points' accuracy, for warnings, and data that are not in the file, for notes."""
     if target == "neurocal":
-        return []
+        return [], []
     lost = []
     if points.across is not None:
         lost.append(
@@ -55,7 +55,18 @@ def points_lost(points: Correspondences, target: str) -> list[str]:
         )
     elif points.covariance is not None:
         lost.append("the covariances of the points are not in the file")
-    return lost
+    mrcal = target == "mrcal"
+    left_out = {
+        "X,Y,Z": mrcal,
+        "the unit": mrcal,
+        "the image size": mrcal and points.image_size is not None,
+        "the image centre": points.image_center is not None,
+        "the ids of the points": target == "matlab" and points.point is not None,
+        "sX,sY,sZ": points.world_std is not None,
+        "the distances": bool(points.distances),
+    }
+    names = [name for name, lacks in left_out.items() if lacks]
+    return lost, [f"a file of points of {target} has no place for {', '.join(names)}"] if names else []
 
 
 def _array(points: Correspondences) -> tuple[Array, list[str], Array]:

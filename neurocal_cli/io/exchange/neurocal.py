@@ -8,6 +8,7 @@ from neurocal_cli.calibration import Calibration, ViewResult
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.errors import InputError
 from neurocal_cli.io.calibration_tree import (
     calibration_from_field,
     distortion_from_field,
@@ -55,12 +56,23 @@ def camera_set(result: Calibration | Rig) -> CameraSet:
 
 
 def as_rig(cameras: CameraSet) -> Rig:
-    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal."""
+    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal.
+
+    Raises
+    ------
+    InputError
+        The baseline is zero.
+    """
     if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
         return cameras.origin
+    (pose,) = cameras.relative
+    if not pose.t.any():
+        raise InputError(
+            f"the baseline of the rig in {cameras.program}'s file is 0; give the translation between the "
+            "cameras, or the files of the single cameras"
+        )
     left, right = (_calibration(cameras, k) for k in range(2))
     unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
-    (pose,) = cameras.relative
     return Rig(
         left,
         right,
