@@ -11,6 +11,7 @@ from support.command_line import run
 from support.distorted import bent_set
 from support.real_data import RealFiles
 from support.scenes import Scene, pinhole, random_flat_set, table_1
+from support.targets import board, views_of
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
@@ -155,3 +156,18 @@ def test_two_real_cameras_are_not_good(tmp_path: Path, real_files: RealFiles) ->
     for distortion in ("k1k2", "auto"):
         assert calibrate(points, distortion=distortion).verdict.word != "good"
         assert calibrate(points.select(right), distortion=distortion).verdict.word != "poor"
+
+
+@pytest.mark.parametrize("shear", [0.006, 0.01])
+def test_a_leaning_board_is_not_good(shear: float) -> None:
+    """It stands upright in all views, so that it cannot be told from leaning image axes."""
+    K = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]])
+    lean = board()[:, [1, 0, 2]] * [shear, 0, 0]
+    for seed in range(2):
+        points, *_ = views_of(
+            K, np.zeros(0), "none", lambda: lean, 10, 0.2, np.random.default_rng(seed), 0.15
+        )
+        verdict = calibrate(points).verdict
+        assert verdict is not None
+        assert verdict.word == "usable"
+        assert any("perpendicular" in reason or "off a right angle" in reason for reason in verdict.reasons)

@@ -114,13 +114,17 @@ def views_of(
     n_views: int,
     sigma: float,
     rng: np.random.Generator,
+    roll: float = 3.0,
 ) -> tuple[Correspondences, Array, Array, Array]:
-    """Views of the board with offsets (63, 3), asked for anew for each; R, t and offsets of each."""
+    """Views of the board with offsets (63, 3), asked for anew for each; R, t and offsets of each.
+
+    The board is rolled by up to `roll` [rad] to both sides.
+    """
     given, f = board(), K[0, 0]
     rows, poses = [], []
     while len(rows) < n_views:
         bend = bent()
-        R = rotation_step(np.append(rng.uniform(-0.7, 0.7, 2), rng.uniform(-3, 3))[None])[0]
+        R = rotation_step(np.append(rng.uniform(-0.7, 0.7, 2), rng.uniform(-roll, roll))[None])[0]
         depth = f * 200 / rng.uniform(500, 1000)
         aim = rng.uniform(-0.3, 0.3, 2) * np.array(SIZE) / f * depth
         t = np.append(aim, depth) - R @ given.mean(axis=0)
