@@ -13,6 +13,7 @@ from neurocal_cli.distances import Distance
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import checked_size, real_array
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
@@ -121,16 +122,12 @@ class Correspondences:
         if self.across is not None:
             self._check_across(_matrix("across", self.across, 2))
         if self.image_size is not None:
-            width, height = _pair(self.image_size)
-            if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
-                raise InputError(f"{self.source}: image_size must be two positive whole numbers")
-            width, height = int(width), int(height)
-            self._set(image_size=(width, height))
+            self._set(image_size=checked_size(self.image_size))
         if self.image_center is not None:
-            u0, v0 = _pair(self.image_center)
-            if not np.isfinite([u0, v0]).all():
+            centre = real_array("image_center", self.image_center)
+            if centre.shape != (2,) or not np.isfinite(centre).all():
                 raise InputError(f"{self.source}: image_center must be two finite numbers")
-            self._set(image_center=(u0, v0))
+            self._set(image_center=tuple(centre.tolist()))
 
     @classmethod
     def none(cls, image_size: tuple[int, int] | None = None, unit: str = "mm") -> Correspondences:
@@ -245,24 +242,13 @@ class Correspondences:
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
-    try:
-        # Copy the array, unless nobody else can write to it: it may have a million rows.
-        shared = not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None
-        array = np.array(values, dtype=float) if shared else np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be an array of numbers, shape (N, {columns})") from error
+    array = real_array(name, values)
+    # Copy the array, unless nobody else can write to it: it may have a million rows.
+    if not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None:
+        array = array.copy()
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{name} must have the shape (N, {columns}), found {array.shape}")
     return array
-
-
-def _pair(values: ArrayLike) -> tuple[float, float]:
-    """Convert to two numbers; nan if that fails."""
-    try:
-        first, second = np.array(values, dtype=float)
-        return float(first), float(second)
-    except (TypeError, ValueError):
-        return float("nan"), float("nan")
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -28,6 +28,7 @@ from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import checked_size
 
 
 @frozen_dataclass(eq=False)
@@ -47,7 +48,7 @@ class Camera:
     Raises
     ------
     InputError
-        An image without pixels.
+        Sides of the image that are not whole numbers from 1 to a million.
 
     Examples
     --------
@@ -67,10 +68,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.image_size is not None:
-            width, height = (int(side) for side in self.image_size)
-            if width <= 0 or height <= 0:
-                raise InputError(f"image_size must be two positive whole numbers, found {self.image_size}")
-            object.__setattr__(self, "image_size", (width, height))
+            object.__setattr__(self, "image_size", checked_size(self.image_size))
 
     @cached_property
     def A(self) -> Array:
