@@ -14,6 +14,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.given_values import checked_size, real_array
+from neurocal_cli.repeated_ids import first_repeat
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
@@ -35,7 +36,7 @@ class Correspondences:
     image_center : (u0, v0), optional [px]
         The image centre as given with the data, for type 2.
     point : (N,) labels, optional
-        An id that is the same for the same physical point in all images.
+        An id that is the same for the same physical point in all images, and occurs once in each.
     covariance : (N, 3) array, optional [px^2]
         Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
         noise level itself is estimated from the residuals.
@@ -67,8 +68,8 @@ class Correspondences:
     Raises
     ------
     InputError
-        Shapes do not match, there are no rows, a number is not finite (or beyond 1e100), or a covariance is
-        not positive definite.
+        Shapes do not match, there are no rows, a number is not real and finite (or beyond 1e100), a view has
+        a point twice, or a covariance is not positive definite.
     """
 
     world: Array
@@ -110,6 +111,8 @@ class Correspondences:
         self._check_finite()
         names, index = _factorise(self.view, n)
         self._set(view_names=names, view_index=_frozen(index))
+        if self.point is not None:
+            self._check_ids(np.asarray(self.point))
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
         if self.distances and self.point is None:
@@ -201,6 +204,18 @@ class Correspondences:
 
         if 0 < max(-self.world.min(), self.world.max()) < 1 / _LARGEST:
             raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
+
+    def _check_ids(self, ids: NDArray[Any]) -> None:
+        repeat = first_repeat(self.view_index, ids)
+        if repeat is None:
+            return
+        row, earlier = repeat
+        where = f"in row {earlier + 1}" if self.lines is None else f"on line {self.lines[earlier]}"
+        view = "" if self.view is None else f" in the view {self.view_names[self.view_index[row]][:60]!r}"
+        raise InputError(
+            f"{self.place(row)}: the point {str(ids[row])[:60]!r} is already {where}{view}; remove one of "
+            "the rows"
+        )
 
     def _check_covariance(self, covariance: Array) -> None:
         suu, suv, svv = covariance.T

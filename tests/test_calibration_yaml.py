@@ -117,7 +117,7 @@ def calibrations(draw):
         labels,
         image_size=draw(st.none() | st.just((640, 480))),
         image_center=draw(st.none() | st.tuples(COORDINATES, COORDINATES)),
-        point=draw(st.none() | st.lists(NAMES, min_size=n, max_size=n)),
+        point=draw(st.none() | st.lists(NAMES, min_size=n, max_size=n, unique=True)),
         covariance=draw(st.none() | st.just(np.tile([0.1 + 0.2, 1e-5, 1.0], (n, 1)))),
         across=draw(st.none() | st.just(np.tile([0.1 + 0.2, -1e-5], (n, 1)))),
         unit=draw(NAMES),
