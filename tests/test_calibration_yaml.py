@@ -52,7 +52,8 @@ NAMES = st.text(
     ]
 )
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-COORDINATES = st.floats(-1e90, 1e90)
+# Smaller worlds are refused.
+COORDINATES = st.floats(-1e90, 1e90).map(lambda x: x if abs(x) > 1e-90 else 0.0)
 UNKNOWN = st.floats(0, 1e300) | st.just(float("nan"))
 
 
