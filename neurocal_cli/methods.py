@@ -124,6 +124,12 @@ def calibrate(
     known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed)
+    if preferred:
+        check_choice("preferred", preferred, tuple(MODELS))
+    if skew not in (True, False):
+        raise UsageError(f"skew must be True or False, not {skew!r}")
+    if backprop is not None and trainer != "backprop":
+        raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
     if known_target is not None:
         points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)

@@ -13,6 +13,8 @@ from neurocal_cli.distances import Distance
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import checked_size, real_array
+from neurocal_cli.repeated_ids import first_repeat
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
@@ -34,7 +36,7 @@ class Correspondences:
     image_center : (u0, v0), optional [px]
         The image centre as given with the data, for type 2.
     point : (N,) labels, optional
-        An id that is the same for the same physical point in all images.
+        An id that is the same for the same physical point in all images, and occurs once in each.
     covariance : (N, 3) array, optional [px^2]
         Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
         noise level itself is estimated from the residuals.
@@ -66,8 +68,8 @@ class Correspondences:
     Raises
     ------
     InputError
-        Shapes do not match, there are no rows, a number is not finite (or beyond 1e100), or a covariance is
-        not positive definite.
+        Shapes do not match, there are no rows, a number is not real and finite (or beyond 1e100), a view has
+        a point twice, or a covariance is not positive definite.
     """
 
     world: Array
@@ -109,6 +111,8 @@ class Correspondences:
         self._check_finite()
         names, index = _factorise(self.view, n)
         self._set(view_names=names, view_index=_frozen(index))
+        if self.point is not None:
+            self._check_ids(np.asarray(self.point))
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
         if self.distances and self.point is None:
@@ -121,16 +125,12 @@ class Correspondences:
         if self.across is not None:
             self._check_across(_matrix("across", self.across, 2))
         if self.image_size is not None:
-            width, height = _pair(self.image_size)
-            if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
-                raise InputError(f"{self.source}: image_size must be two positive whole numbers")
-            width, height = int(width), int(height)
-            self._set(image_size=(width, height))
+            self._set(image_size=checked_size(self.image_size))
         if self.image_center is not None:
-            u0, v0 = _pair(self.image_center)
-            if not np.isfinite([u0, v0]).all():
+            centre = real_array("image_center", self.image_center)
+            if centre.shape != (2,) or not np.isfinite(centre).all():
                 raise InputError(f"{self.source}: image_center must be two finite numbers")
-            self._set(image_center=(u0, v0))
+            self._set(image_center=tuple(centre.tolist()))
 
     @classmethod
     def none(cls, image_size: tuple[int, int] | None = None, unit: str = "mm") -> Correspondences:
@@ -205,6 +205,18 @@ class Correspondences:
         if 0 < max(-self.world.min(), self.world.max()) < 1 / _LARGEST:
             raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
 
+    def _check_ids(self, ids: NDArray[Any]) -> None:
+        repeat = first_repeat(self.view_index, ids)
+        if repeat is None:
+            return
+        row, earlier = repeat
+        where = f"in row {earlier + 1}" if self.lines is None else f"on line {self.lines[earlier]}"
+        view = "" if self.view is None else f" in the view {self.view_names[self.view_index[row]][:60]!r}"
+        raise InputError(
+            f"{self.place(row)}: the point {str(ids[row])[:60]!r} is already {where}{view}; remove one of "
+            "the rows"
+        )
+
     def _check_covariance(self, covariance: Array) -> None:
         suu, suv, svv = covariance.T
         with np.errstate(over="ignore", invalid="ignore"):
@@ -245,24 +257,13 @@ class Correspondences:
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
-    try:
-        # Copy the array, unless nobody else can write to it: it may have a million rows.
-        shared = not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None
-        array = np.array(values, dtype=float) if shared else np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be an array of numbers, shape (N, {columns})") from error
+    array = real_array(name, values)
+    # Copy the array, unless nobody else can write to it: it may have a million rows.
+    if not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None:
+        array = array.copy()
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{name} must have the shape (N, {columns}), found {array.shape}")
     return array
-
-
-def _pair(values: ArrayLike) -> tuple[float, float]:
-    """Convert to two numbers; nan if that fails."""
-    try:
-        first, second = np.array(values, dtype=float)
-        return float(first), float(second)
-    except (TypeError, ValueError):
-        return float("nan"), float("nan")
 
 
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:

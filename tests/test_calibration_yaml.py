@@ -52,7 +52,8 @@ NAMES = st.text(
     ]
 )
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-COORDINATES = st.floats(-1e90, 1e90)
+# Smaller worlds are refused.
+COORDINATES = st.floats(-1e90, 1e90).map(lambda x: x if abs(x) > 1e-90 else 0.0)
 UNKNOWN = st.floats(0, 1e300) | st.just(float("nan"))
 
 
@@ -117,7 +118,7 @@ def calibrations(draw):
         labels,
         image_size=draw(st.none() | st.just((640, 480))),
         image_center=draw(st.none() | st.tuples(COORDINATES, COORDINATES)),
-        point=draw(st.none() | st.lists(NAMES, min_size=n, max_size=n)),
+        point=draw(st.none() | st.lists(NAMES, min_size=n, max_size=n, unique=True)),
         covariance=draw(st.none() | st.just(np.tile([0.1 + 0.2, 1e-5, 1.0], (n, 1)))),
         across=draw(st.none() | st.just(np.tile([0.1 + 0.2, -1e-5], (n, 1)))),
         unit=draw(NAMES),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation
+
+FLAT = Intrinsics(500.0, 500.0, 320.0, 240.0)
 
 quick = settings(max_examples=60, deadline=None)
 focal = st.floats(10, 1e5)
@@ -298,9 +301,38 @@ def test_a_cropped_camera_sees_every_point_moved(model: str, theta: float) -> No
     assert cropped.image_size == (320, 200)
 
 
-def test_wrong_sizes_and_scales_are_refused() -> None:
-    with pytest.raises(InputError, match="image_size must be two positive whole numbers"):
-        Camera(Intrinsics(500, 500, 0, 0), image_size=(0, 5))
+@pytest.mark.parametrize("size", [(0, 5), (1.5, 2), (np.nan, 2), (np.inf, 2), (1,), (10**7, 2), "ab"])
+def test_wrong_sizes_of_the_image_are_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(InputError, match="image_size must be"):
+        Camera(Intrinsics(500, 500, 0, 0), image_size=size)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Camera(FLAT.A), "Intrinsics.from_matrix makes of a 3 x 3 matrix"),
+        (lambda: Camera(FLAT, [0.1]), "a Distortion, such as"),
+        (
+            lambda: Camera(FLAT).project(np.zeros((3, 2))),
+            r"points must have the shape \(..., 3\), found \(3, 2\)",
+        ),
+        (lambda: Camera(FLAT).sees(np.float64(1)), r"points must have the shape"),
+        (lambda: Camera(FLAT).unproject(np.zeros((3, 3))), r"pixels must have the shape \(..., 2\)"),
+        (lambda: Camera(FLAT).unproject([["a", "b"]]), "pixels must be an array of real numbers"),
+        (lambda: Distortion("k1", ["a"]), "coefficients must be an array of real numbers"),
+        (lambda: Distortion("k1", [np.nan]), "k1 needs 1 finite coefficients"),
+        (lambda: Intrinsics("a", 1, 1, 1), "intrinsic parameters must be an array of real numbers"),
+        (lambda: Intrinsics([1], [1], [1], [1], [1]), "intrinsic parameters must be finite numbers"),
+        (lambda: Intrinsics.from_matrix(FLAT.A.astype(complex)), "matrix must be an array of real numbers"),
+        (lambda: Pose("a", "b"), "R must be an array of real numbers"),
+    ],
+)
+def test_arrays_that_fit_no_camera_are_refused(make: Callable[[], Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_wrong_scales_are_refused() -> None:
     for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="scale of an image must be positive"):
             camera_with("k1").rescaled(scale)

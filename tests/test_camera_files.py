@@ -192,6 +192,7 @@ FAULTS = {
     f"K: {FLAT}\ndistortion_model: odd\nD: [1, 2, 3, 4]\n": ": distortion model 'odd' is unknown",
     f"K: {FLAT}\ndistortion_model: equidistant\nD: [1, 2, 3, 4, 5]\n": ": an equidistant",
     f"K: {FLAT}\nimage_width: wide\nimage_height: 2\n": ": image_width must be a whole number",
+    f"K: {FLAT}\nimage_width: 5000000\nimage_height: 2\n": ": image_size must be two positive whole numbers",
     f"K: {FLAT}\nimage_width: -4\nimage_height: 2\n": ": image_width must be a whole number, 0 or more",
     f"K: {FLAT}\nK: {FLAT}\n": ":2: the key 'K' appears twice",
     "K: [\n": ":2: is not valid YAML",

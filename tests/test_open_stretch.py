@@ -123,12 +123,14 @@ def test_what_is_negligible_or_no_print_leaves_standard_deviations_as_they_are()
     assert spread_of_stretch(S, np.array([0.0, 1e12 * 0.03, 0.0]), 1.0) is None
 
 
-@pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
-def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows: int) -> None:
+@pytest.mark.parametrize(
+    ("rows", "unit"), [(2, 1.0), (3, 1.0), (4, 1.0), (5, 1.0), (7, 1.0), (5, 1e90), (5, 1e-90)]
+)
+def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows: int, unit: float) -> None:
     x, y = np.meshgrid(np.arange(7.0), np.arange(float(rows)))
     board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     turn = random_rotation(np.random.default_rng(rows))
-    along, leaning = turn.T @ stretches(board @ turn.T + [100.0, -200.0, 300.0]) @ turn
+    along, leaning = turn.T @ stretches(unit * (board @ turn.T + [100.0, -200.0, 300.0])) @ turn
     sign = np.sign(along[0, 0]), np.sign(leaning[0, 1])
     assert sign[0] * along == pytest.approx(np.diag([1.0, -1.0, 0.0]), abs=1e-12)
     assert sign[1] * leaning == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]]), abs=1e-12)

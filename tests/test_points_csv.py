@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -286,6 +287,11 @@ def test_accuracy_must_be_given_for_all_files_or_none(read):
 def test_no_files_are_an_input_error():
     with pytest.raises(InputError, match="no files"):
         read_points([])
+
+
+def test_a_path_may_be_bytes(tmp_path):
+    (tmp_path / "a.csv").write_text(CONTRACT)
+    assert len(read_points(os.fsencode(tmp_path / "a.csv"))) == len(read_points(tmp_path / "a.csv"))
 
 
 def test_a_label_with_a_line_break_is_not_written():

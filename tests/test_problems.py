@@ -66,6 +66,11 @@ def test_what_does_not_go_with_a_type_is_wrong_usage(type: Any, given: dict[str,
     assert "\n" not in str(error.value)
 
 
+def test_no_points_are_refused() -> None:
+    with pytest.raises(InputError, match="there are no points to calibrate from"):
+        calibrate(Correspondences.none())
+
+
 def test_type_2_without_a_centre_says_where_to_put_it() -> None:
     points = Correspondences(SCENE.world, SCENE.pixels)
     with pytest.raises(UsageError, match="type 2 needs the image centre; give it, or put image_center"):

@@ -14,6 +14,7 @@ from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
+from neurocal_cli.training.backprop import BackpropOptions
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)
 BOARD = np.array([(30.0 * x, 30.0 * y, 0.0) for y in range(6) for x in range(9)]) - [120.0, 75.0, 0.0]
@@ -311,6 +312,9 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
         ({"trainer": "adam"}, "trainer must be one of lm, backprop, not 'adam'"),
         ({"distortion": "round"}, "distortion must be one of auto"),
         ({"outliers": "eat"}, "outliers must be one of reject"),
+        ({"skew": "no"}, "skew must be True or False, not 'no'"),
+        ({"preferred": "round"}, "preferred must be one of none, k1"),
+        ({"backprop": BackpropOptions()}, "backprop needs the trainer backprop, but the trainer is lm"),
         ({"type": 7}, "type must be 1, 2, 3 or 4"),
         ({"type": 4, "extrinsics": {"view": (np.eye(3), np.zeros(3))}}, "a Pose for each view"),
         ({"type": 2}, "type 2 needs the image centre"),

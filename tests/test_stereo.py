@@ -245,6 +245,9 @@ def test_what_makes_no_sense_is_refused() -> None:
     points = sides(flat(), 0.2)
     with pytest.raises(UsageError, match="type 4"):
         calibrate_stereo(*points, type=4)
+    for wrong in ({"left_options": {"skwe": False}}, {"skwe": False}):
+        with pytest.raises(UsageError, match="calibrate has no option 'skwe'"):
+            calibrate_stereo(*points, **wrong)
     with pytest.raises(UsageError, match="type 3 needs the intrinsics"):
         calibrate_stereo(*points, type=3)
     with pytest.raises(InputError, match="same coordinates and unit"):

@@ -191,4 +191,6 @@ def test_wrong_arguments_are_refused() -> None:
         through(scene, two, two, "guess")
     with pytest.raises(InputError, match="several rigs"):
         triangulate(scene.camera(0), scene.camera(1), [scene.rig, scene.rig], two, two)
+    with pytest.raises(InputError, match="must be a Pose"):
+        triangulate(scene.camera(0), scene.camera(1), scene.rig.D, two, two)
     assert len(through(scene, np.zeros((0, 2)), np.zeros((0, 2))).points) == 0

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from support.distorted import LENSES, through
 from support.real_data import RealFiles
 from support.scenes import random_flat_set
@@ -303,6 +305,29 @@ def test_an_image_of_another_size_is_refused() -> None:
         undistort_image(np.zeros((50, 100), np.uint8), camera("k1"))
     with pytest.raises(InputError, match="interpolation must be one of"):
         undistort_image(smooth(), camera("k1"), interpolation="best")
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32", "float64"])
+def test_images_keep_their_type(dtype: str) -> None:
+    assert undistort_image(smooth().astype(dtype), camera("k1")).dtype == dtype
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        smooth() > 0,
+        smooth().astype(int),
+        smooth() + 1j,
+        smooth().astype(">u2"),
+        np.zeros(5),
+        np.zeros((0, 0), np.uint8),
+        np.zeros((*SIZE[::-1], 5), np.uint8),
+    ],
+)
+@pytest.mark.parametrize("size", [SIZE, None])
+def test_what_opencv_cannot_interpolate_is_refused(image: NDArray[Any], size: tuple[int, int] | None) -> None:
+    with pytest.raises(InputError, match=r"an image must be .* array of uint8, uint16, .* found"):
+        undistort_image(image, replace(camera("k1"), image_size=size))
 
 
 def test_images_too_long_for_opencv_are_refused() -> None:

@@ -299,6 +299,9 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     for name in ("distortion", "training", "outliers", "camera"):
         with pytest.raises(UsageError, match=name):
             fit_lens(points, **{name: "other"})
+    for topologies in (5, (2, 2), ((-1, 2),), ((2.5, 2),), ((1, 2), (3,))):
+        with pytest.raises(UsageError, match="topologies must be pairs"):
+            fit_lens(points, topologies=topologies)
     with pytest.raises(NeurocalError, match="settings cannot be calibrated"):
         fit_lens(flat(points), distortion="none")
 

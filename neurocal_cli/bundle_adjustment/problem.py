@@ -211,12 +211,15 @@ def problem_for(
     UsageError
         The type does not exist, a parameter that it needs is missing, or one that it does not use is given.
     InputError
-        A value is not finite, the extrinsics lack a view, or the given distortion maps no ray to a pixel.
+        There are no points, a value is not finite, the extrinsics lack a view, or the given distortion maps
+        no ray to a pixel.
     DegenerateGeometryError
         All pixels coincide.
     """
     if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
         raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
+    if not len(points):
+        raise InputError(f"{points.source}: there are no points to calibrate from; give some")
     for name, value, wanted in (
         ("image_center", image_center, 2),
         ("intrinsics", intrinsics, 3),

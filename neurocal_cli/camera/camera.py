@@ -28,6 +28,7 @@ from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import checked_size, real_array
 
 
 @frozen_dataclass(eq=False)
@@ -47,7 +48,8 @@ class Camera:
     Raises
     ------
     InputError
-        An image without pixels.
+        Intrinsics or a distortion of another type, or sides of the image that are not whole numbers from 1
+        to a million.
 
     Examples
     --------
@@ -66,11 +68,13 @@ class Camera:
     name: str = "camera"
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.intrinsics, Intrinsics) and isinstance(self.distortion, Distortion)):
+            raise InputError(
+                "a camera needs Intrinsics, which Intrinsics.from_matrix makes of a 3 x 3 matrix, and a "
+                "Distortion, such as Distortion('k1', [-0.2])"
+            )
         if self.image_size is not None:
-            width, height = (int(side) for side in self.image_size)
-            if width <= 0 or height <= 0:
-                raise InputError(f"image_size must be two positive whole numbers, found {self.image_size}")
-            object.__setattr__(self, "image_size", (width, height))
+            object.__setattr__(self, "image_size", checked_size(self.image_size))
 
     @cached_property
     def A(self) -> Array:
@@ -104,8 +108,13 @@ class Camera:
             ``nan`` for points that are not in front of the camera, or outside the domain of a wide lens.
         in_front : (...) bool array
             Whether the point has a pixel.
+
+        Raises
+        ------
+        InputError
+            An array of another shape.
         """
-        X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        X, Y, Z = _coordinates("points", points, 3)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             u, v, seen = project_points(self.entries, self.model, self.distortion.coefficients, X, Y, Z)
             pixels = np.stack([u, v], axis=-1)
@@ -113,7 +122,7 @@ class Camera:
 
     def sees(self, points: Array) -> NDArray[np.bool_]:
         """Whether points (..., 3) lie in front of the camera, where its distortion is monotonic."""
-        X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        X, Y, Z = _coordinates("points", points, 3)
         if self.distortion.wide:
             within = np.arctan2(np.hypot(X, Y), Z) < largest_angle(self.distortion)
             return np.asarray(within & self.project(points)[1])
@@ -153,8 +162,13 @@ class Camera:
         -------
         rays : (..., 3) array
             Of unit length, in the camera's frame; ``nan`` for pixels that the camera cannot produce.
+
+        Raises
+        ------
+        InputError
+            An array of another shape.
         """
-        u, v = np.moveaxis(np.asarray(pixels, dtype=float), -1, 0)
+        u, v = _coordinates("pixels", pixels, 2)
         if self.distortion.wide:
             x, y = normalised_points(self.entries, u, v)
             return np.stack(unproject_directions(self.distortion, x, y), axis=-1)
@@ -238,3 +252,11 @@ class Camera:
     def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> Rays:
         """Rays of pixels u, v with derivatives; see `projection.rays_of`."""
         return rays_of(self.entries, self.distortion, u, v, near)
+
+
+def _coordinates(name: str, values: Array, count: int) -> Array:
+    """Coordinates, (count, ...), of points or pixels (..., count)."""
+    array = real_array(name, values)
+    if array.shape[-1:] != (count,):
+        raise InputError(f"{name} must have the shape (..., {count}), found {array.shape}")
+    return np.moveaxis(array, -1, 0)

@@ -18,6 +18,7 @@ from neurocal_cli.camera.polynomial import Coefficients, Distorted, distorted, d
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import real_array
 
 MODELS = {
     "none": (),
@@ -83,7 +84,7 @@ class Distortion:
 
     def __post_init__(self) -> None:
         names = coefficient_names(self.model)
-        values = np.array(self.coefficients, dtype=float).ravel()
+        values = real_array("coefficients", self.coefficients).ravel()
         if values[len(names) :].any() or not np.isfinite(values).all():
             raise InputError(
                 f"the distortion model {self.model} needs {len(names)} finite coefficients; correct them"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
+from neurocal_cli.given_values import real_array
 
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
 POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
@@ -50,11 +51,10 @@ class Intrinsics:
     theta: float = np.pi / 2
 
     def __post_init__(self) -> None:
-        for name in INTRINSIC_NAMES:
-            object.__setattr__(self, name, float(getattr(self, name)))
-        values = np.array([getattr(self, name) for name in INTRINSIC_NAMES])
-        if not np.isfinite(values).all():
+        values = real_array("intrinsic parameters", [getattr(self, name) for name in INTRINSIC_NAMES])
+        if values.shape != (5,) or not np.isfinite(values).all():
             raise InputError("intrinsic parameters must be finite numbers")
+        vars(self).update(zip(INTRINSIC_NAMES, values.tolist(), strict=True))
         if self.alpha_u <= 0 or self.alpha_v <= 0:
             raise InputError("alpha_u and alpha_v must be positive")
         if not 0 < self.theta < np.pi:
@@ -85,7 +85,7 @@ class Intrinsics:
         InputError
             A is not finite or not upper triangular, or its last entry is 0.
         """
-        A = np.asarray(A, dtype=float)
+        A = real_array("a camera matrix", A)
         if A.shape != (3, 3) or not np.isfinite(A).all() or A[2, 2] == 0:
             raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")
         A = A / A[2, 2]
@@ -133,7 +133,7 @@ class Pose:
     t: Array
 
     def __post_init__(self) -> None:
-        R, t = np.array(self.R, dtype=float), np.array(self.t, dtype=float).reshape(-1)
+        R, t = np.array(real_array("R", self.R)), np.array(real_array("t", self.t)).ravel()
         if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
             raise InputError("a pose needs a finite 3 x 3 rotation R and 3 numbers t")
         if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:

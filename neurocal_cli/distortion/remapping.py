@@ -26,6 +26,8 @@ INTERPOLATIONS = {
 _AT_ONCE = 1 << 20  # pixels whose sources are computed at a time: memory
 _KEPT = 1 << 25  # largest image whose sources are kept for the next one, at 8 bytes a pixel
 _LONGEST = 32766  # px; OpenCV's remap counts a side in 16 bits
+_TYPES = ("uint8", "uint16", "float32", "float64")
+_CHANNELS = 4  # most that OpenCV interpolates
 _NOWHERE = -1e6  # a source outside every image, which gives black
 
 Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]
@@ -80,17 +82,18 @@ class Remapping:
         Parameters
         ----------
         image : (height, width) or (height, width, channels) uint8 or uint16 array
+            Also float32 or float64; at most 4 channels.
 
         Raises
         ------
         InputError
-            An image of another size.
+            An image of another size, or an array of another type or shape.
         """
-        height, width = image.shape[:2]
-        if (width, height) != self.size:
+        size = _size(image)
+        if size != self.size:
             raise InputError(
-                f"has {width} x {height} px, but the camera is for {self.size[0]} x {self.size[1]} px; give "
-                "original images of this camera"
+                f"has {size[0]} x {size[1]} px, but the camera is for {self.size[0]} x {self.size[1]} px; "
+                "give original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
         undistorted = np.empty((*self.new_size[::-1], *image.shape[2:]), image.dtype)
@@ -140,6 +143,7 @@ def undistort_image(
     Parameters
     ----------
     image : (height, width) or (height, width, channels) uint8 or uint16 array
+        Also float32 or float64; at most 4 channels.
     camera : Camera or Calibration
     alpha : float, optional
         See `undistortion.new_matrix`; None keeps the camera's own matrix. For a plane without `fov`.
@@ -157,11 +161,21 @@ def undistort_image(
     Raises
     ------
     InputError
-        An image of another size than the camera's.
+        An image of another size than the camera's, or an array of another type or shape.
     """
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation must be one of {', '.join(INTERPOLATIONS)}, not {interpolation!r}")
-    height, width = image.shape[:2]
     camera = camera_of(camera)
-    size = camera.image_size or (width, height)
+    size = camera.image_size or _size(image)
     return Remapping(camera, chosen_view(camera, alpha, to, fov, size), size, interpolation)(image)
+
+
+def _size(image: NDArray[Any]) -> tuple[int, int]:
+    """Width and height [px] of an image that OpenCV can interpolate."""
+    flat = image.ndim == 2 or (image.ndim == 3 and 1 <= image.shape[2] <= _CHANNELS)
+    if not flat or not image.size or image.dtype not in _TYPES:
+        raise InputError(
+            f"an image must be a (height, width) array of {', '.join(_TYPES)}, with up to {_CHANNELS} "
+            f"channels on a third axis, found {image.dtype} of the shape {image.shape}; convert it"
+        )
+    return image.shape[1], image.shape[0]

@@ -14,7 +14,9 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import checked_size
 from neurocal_cli.io.camera_info import from_ros
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.tree_fields import Field
 
 # The keys of neurocal and ROS come first; in stereo files of OpenCV's sample the left camera has M1, D1.
@@ -218,4 +220,7 @@ def image_size(root: Field, side: str = "") -> tuple[int, int] | None:
         if len(values) != 2:
             field.fail("two whole numbers, width and height")
         size = values[0].integer(), values[1].integer()
-    return size if size[0] and size[1] else None
+    if 0 in size:
+        return None
+    with value_failures(root.source):
+        return checked_size(size)

@@ -5,6 +5,7 @@ Known cameras are rows of parameters, or of names of calibration files.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -54,7 +55,7 @@ def read_lens_data(
     FormatError, InputError
         An unreadable file, a missing setting, or inconsistent data.
     """
-    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    several = [paths] if isinstance(paths, (str, bytes, os.PathLike)) else list(paths)
     if not several:
         raise InputError("there are no files; give at least one")
     contents = [read_bytes(path) for path in several]

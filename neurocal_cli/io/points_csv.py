@@ -57,7 +57,7 @@ def read_points(
     InputError
         Rows are well formed but contradict each other.
     """
-    several = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
+    several = [paths] if isinstance(paths, (str, bytes, os.PathLike)) else list(paths)
     if not several:
         raise InputError("there are no files of points; give at least one")
     tables = [read_table(path, POINTS) for path in several]

@@ -66,7 +66,7 @@ def _points(tables: list[Table], notes: list[str]) -> NDArray[Any] | None:
     """Ids of the points; None if a table has none."""
     without = [table.source for table in tables if "point" not in table.labels]
     if not without:
-        return _joined([_distinct(table) for table in tables])
+        return _joined([table.labels["point"] for table in tables])
     if len(without) < len(tables):
         notes.append(f"{without[0]}: has no column point, so the point ids of the other files are not used")
     return None
@@ -181,37 +181,3 @@ def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
         return None
     zeros = [np.zeros((len(table), len(names))) for table in tables]
     return _joined([zero if block is None else block for zero, block in zip(zeros, blocks, strict=True)])
-
-
-def _distinct(table: Table) -> NDArray[Any]:
-    """Check that no view has a point id twice, and return the ids."""
-    points = table.labels["point"]
-    views = table.labels.get("view")
-    labels = [points] if views is None else [points, views]
-    hashes = _hashes(labels)
-    ordered = np.sort(hashes)
-    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
-    if len(repeated) == 0:  # nearly always; comparing a million labels directly would take seconds
-        return points
-    seen: dict[tuple[str, ...], int] = {}
-    for row in np.flatnonzero(np.isin(hashes, repeated)):
-        key = tuple(str(column[row]) for column in labels)
-        if key in seen:
-            place = "" if views is None else f" in the view {key[1][:60]!r}"
-            raise InputError(
-                f"{table.source}:{table.lines[row]}: the point {key[0][:60]!r} is already on line "
-                f"{seen[key]}{place}; remove one of the rows"
-            )
-        seen[key] = int(table.lines[row])
-    return points
-
-
-def _hashes(columns: list[NDArray[Any]]) -> NDArray[np.uint64]:
-    """Hash each row of labels to 64 bits, with FNV-1a over the characters."""
-    hashes = np.full(len(columns[0]), 0xCBF29CE484222325, dtype=np.uint64)
-    for column in columns:
-        characters = np.ascontiguousarray(column).view(np.uint32).reshape(len(column), -1)
-        for k in range(characters.shape[1]):
-            hashes ^= characters[:, k]
-            hashes *= np.uint64(0x100000001B3)
-    return hashes

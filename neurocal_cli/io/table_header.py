@@ -111,7 +111,7 @@ def _meant(line: str) -> str | None:
 
 def _size(text: str) -> tuple[int, int] | None:
     words = re.split(r"[ \t,]+", text)
-    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,9}", word) and int(word) for word in words):
+    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,6}", word) and int(word) for word in words):
         return None
     return int(words[0]), int(words[1])
 

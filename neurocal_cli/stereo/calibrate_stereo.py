@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from inspect import signature
 from typing import Any
 
 from neurocal_cli.calibration import Calibration
@@ -59,11 +60,14 @@ def calibrate_stereo(
     Raises
     ------
     UsageError
-        As `calibrate`; type 4, where all poses are known.
+        As `calibrate`; an option that it does not have; type 4, where all poses are known.
     InputError, DegenerateGeometryError
         The points do not determine the rig; the message says why.
     """
     sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
+    unknown = set().union(*sides) - set(signature(calibrate).parameters)
+    if unknown:
+        raise UsageError(f"calibrate has no option {min(unknown)!r}; correct its name or leave it out")
     if any(side.get("type", 1) == 4 for side in sides):
         raise UsageError(
             "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "

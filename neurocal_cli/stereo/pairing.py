@@ -151,8 +151,9 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
         codes = _place_codes(left.world[rows[0]], right.world[rows[1]])
     n_codes = 1 + max(int(code.max(initial=0)) for code in codes)
     keys = [view * n_codes + code for view, code in zip(order, codes, strict=True)]
-    for points, row, key in zip((left, right), rows, keys, strict=True):
-        _refuse_repeated(points, row, key, by_id)
+    if not by_id:  # no view has an id twice
+        for points, row, key in zip((left, right), rows, keys, strict=True):
+            _refuse_repeated(points, row, key)
     common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
     if not common.size or (not by_id and len(common) < _LEAST_COMMON * min(map(len, rows))):
         what, few = "id" if by_id else "X, Y, Z", f"{len(common)} points" if common.size else "no point"
@@ -195,18 +196,16 @@ def _place_codes(left: Array, right: Array) -> list[NDArray[np.intp]]:
     return [codes[: len(left)], codes[len(left) :]]
 
 
-def _refuse_repeated(
-    points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp], by_id: bool
-) -> None:
+def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp]) -> None:
     order = np.argsort(keys, kind="stable")
     repeated = np.flatnonzero(np.diff(keys[order]) == 0)
     if not repeated.size:
         return
     first, second = sorted(int(rows[order[repeated[0] + k]]) for k in (0, 1))
-    what = "has the same id" if by_id else "is at the same X, Y, Z (in the same view)"
-    hint = "" if by_id else ", or give a column point with an id of each point in both files"
     raise InputError(
-        f"{points.place(second)}: the point {what} as {points.place(first)}; remove one of the rows{hint}"
+        f"{points.place(second)}: the point is at the same X, Y, Z (in the same view) as "
+        f"{points.place(first)}; remove one of the rows, or give a column point with an id of each point in "
+        "both files"
     )
 
 

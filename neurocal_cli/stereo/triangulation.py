@@ -20,6 +20,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_values import real_array
 from neurocal_cli.stereo.two_view_points import PointBatch
 from neurocal_cli.stereo.wide_points import WidePointBatch
 
@@ -96,7 +97,7 @@ def triangulate(
     UsageError
         An unknown method.
     InputError
-        Arrays of different lengths.
+        Arrays of different lengths or wrong shapes, or a rig that is no Pose.
     """
     check_choice("method", method, METHODS)
     pixels = _pixels(left_pixels), _pixels(right_pixels)
@@ -104,7 +105,10 @@ def triangulate(
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
     cameras = camera_of(left), camera_of(right)
-    rigs = np.stack([pose.D] if isinstance(pose, Pose) else [one.D for one in pose])
+    poses = [pose] if isinstance(pose, Pose) else pose
+    if not all(isinstance(one, Pose) for one in poses):
+        raise InputError("the rig must be a Pose, such as Pose(R, t), or a sequence of them")
+    rigs = np.stack([one.D for one in poses])
     if len(rigs) == 1:
         which = None
     elif which is None or len(which) != n:
@@ -138,7 +142,7 @@ def _sees_sideways(camera: Camera, pixels: Array) -> bool:
 
 
 def _pixels(values: Array) -> Array:
-    pixels = np.asarray(values, dtype=float)
+    pixels = real_array("pixels", values)
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
     return pixels

@@ -86,7 +86,7 @@ def stretches(world: Array) -> Array:
     """
     centred = world - world.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    z2 = (centred @ (axes[0] + 1j * axes[1])) ** 2
+    z2 = (centred @ (axes[0] + 1j * axes[1]) / np.abs(centred).max()) ** 2  # of any unit, without overflow
     angle = 0.25 * np.angle(5.0 * z2.mean() ** 2 - (z2 * z2).mean())
     x = np.cos(angle) * axes[0] + np.sin(angle) * axes[1]
     y = np.cos(angle) * axes[1] - np.sin(angle) * axes[0]

@@ -17,6 +17,7 @@ from dataclasses import field
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
@@ -52,6 +53,11 @@ class Budget:
     members : int
         Size of the committee.
     schedule : Schedule
+
+    Raises
+    ------
+    UsageError
+        Topologies that are not pairs of whole numbers.
     """
 
     topologies: tuple[tuple[int, int], ...] | None = None
@@ -59,6 +65,17 @@ class Budget:
     best: int = 20
     members: int = 12
     schedule: Schedule = field(default_factory=Schedule)
+
+    def __post_init__(self) -> None:
+        if self.topologies is None:
+            return
+        pairs = np.array(self.topologies, dtype=object)
+        if pairs.shape[1:] != (2,) or not all(
+            isinstance(n, (int, np.integer)) and n >= 0 for n in pairs.flat
+        ):
+            raise UsageError(
+                "topologies must be pairs of whole numbers of at least 0, such as ((2, 0), (2, 2))"
+            )
 
 
 def fit_committee(

@@ -1,0 +1,45 @@
+"""Conversion of values that a caller gives, with the errors of the library."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+_LONGEST = 10**6  # px; longer sides are mistakes
+
+
+def real_array(name: str, values: ArrayLike) -> Array:
+    """Convert to an array of floats, which shares memory with an array of floats.
+
+    Raises
+    ------
+    InputError
+        Text, rows of different lengths, complex numbers, or a masked array with hidden entries.
+    """
+    try:
+        array = np.asarray(values)
+        if np.iscomplexobj(array):  # NumPy would only warn
+            raise TypeError
+        array = np.asarray(array, dtype=float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name} must be an array of real numbers") from error
+    if isinstance(values, np.ndarray) and np.any(getattr(values, "mask", False)):
+        raise InputError(f"{name} has masked entries; leave these rows out")
+    return array
+
+
+def checked_size(size: ArrayLike) -> tuple[int, int]:
+    """Width and height of an image [px] as whole numbers.
+
+    Raises
+    ------
+    InputError
+        They are not two whole numbers from 1 to a million.
+    """
+    sides = real_array("image_size", size)
+    if sides.shape != (2,) or not ((sides >= 1) & (sides <= _LONGEST) & (sides == np.round(sides))).all():
+        raise InputError(f"image_size must be two positive whole numbers up to {_LONGEST} px")
+    return int(sides[0]), int(sides[1])
