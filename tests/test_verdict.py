@@ -158,16 +158,14 @@ def test_two_real_cameras_are_not_good(tmp_path: Path, real_files: RealFiles) ->
         assert calibrate(points.select(right), distortion=distortion).verdict.word != "poor"
 
 
-@pytest.mark.parametrize("shear", [0.006, 0.01])
-def test_a_leaning_board_is_not_good(shear: float) -> None:
-    """It stands upright in all views, so that it cannot be told from leaning image axes."""
+def test_a_leaning_board_is_not_good() -> None:
+    """It stands upright in all views, so that it can hardly be told from leaning image axes."""
     K = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]])
-    lean = board()[:, [1, 0, 2]] * [shear, 0, 0]
+    lean = board()[:, [1, 0, 2]] * [0.01, 0, 0]
     for seed in range(2):
-        points, *_ = views_of(
-            K, np.zeros(0), "none", lambda: lean, 10, 0.2, np.random.default_rng(seed), 0.15
-        )
+        rng = np.random.default_rng(seed)
+        points, *_ = views_of(K, np.zeros(0), "none", lambda: lean, 10, 0.2, rng, roll=0.15)
         verdict = calibrate(points).verdict
         assert verdict is not None
         assert verdict.word == "usable"
-        assert any("perpendicular" in reason or "off a right angle" in reason for reason in verdict.reasons)
+        assert any("off a right angle" in reason for reason in verdict.reasons)

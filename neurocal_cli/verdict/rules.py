@@ -47,7 +47,7 @@ _FEW_POSES = 10  # fewer poses are reported if views repeat them
 _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # rad. From photographs, the image axes of eight cameras are estimated to be off a right angle by up to
 # 0.0018, and the sides of their boards by up to 0.003. A board that leans by 0.006 and stands upright in
-# all views turns theta by as much; test_a_leaning_board_is_not_good repeats it.
+# all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
