@@ -10,7 +10,6 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.target import Target, is_flat
-from neurocal_cli.target_shape.open_stretch import stretches
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
@@ -269,6 +268,8 @@ def _lean(target: Target) -> float:
     """Angle by which the sides of an estimated flat target are off a right angle [rad]; 0 for others."""
     if target.plane.any() or not is_flat(target.given):
         return 0.0
+    from neurocal_cli.target_shape.open_stretch import stretches  # only for estimated targets
+
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]
     return abs(float((stretches(given)[1] * linear).sum()))
