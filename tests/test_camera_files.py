@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -167,7 +168,9 @@ def test_a_neurocal_file_gives_its_camera_and_its_poses(tmp_path):
     write_calibration(cal, tmp_path / "cal.yaml")
     camera = read_intrinsics(tmp_path / "cal.yaml")
     assert camera.intrinsics == cal.intrinsics
-    poses = read_extrinsics(tmp_path / "cal.yaml")
+    with pytest.raises(FormatError, match="its poses are in mm, but the points in cm; give both in one unit"):
+        read_extrinsics(tmp_path / "cal.yaml", "cm")
+    poses = read_extrinsics(tmp_path / "cal.yaml", "mm")
     assert list(poses) == list(cal.views)
     for name, pose in poses.items():
         assert pose.R.tobytes() == cal.views[name].pose.R.tobytes()
@@ -212,7 +215,7 @@ def test_a_fault_is_named_with_its_key_and_remedy(read, text):
 
 def test_poses_need_a_neurocal_file(read):
     with pytest.raises(FormatError, match="it can serve as --intrinsics"):
-        read(ROS, read=read_extrinsics)
+        read(ROS, read=partial(read_extrinsics, unit="mm"))
 
 
 WHOLE = [OPENCV_YAML, OPENCV_XML, ROS, json.dumps({"K": FLAT})]

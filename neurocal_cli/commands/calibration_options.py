@@ -113,7 +113,7 @@ class Estimation:
         elif self.extrinsics is not None:
             from neurocal_cli.io.calibration_tree import read_extrinsics
 
-            arguments["extrinsics"] = read_extrinsics(self.extrinsics)
+            arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
         return points, arguments
 
     def _backprop(self) -> BackpropOptions | None:

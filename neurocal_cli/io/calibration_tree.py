@@ -131,16 +131,25 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     return intrinsics, std, frozenset(fixed)
 
 
-def read_extrinsics(path: str | Path) -> dict[str, Pose]:
+def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
     """Read the pose of each view of a neurocal calibration; ``-`` is stdin.
 
     Raises
     ------
     FormatError
-        The file cannot be read or has no poses.
+        The file cannot be read or has no poses, or they are in another unit than `unit`.
     """
-    views = read_views(neurocal_block(read_tree(path))["views"])
+    block = neurocal_block(read_tree(path))
+    views, own = read_views(block["views"]), _unit(block)
+    if own != unit:
+        raise FormatError(
+            f"its poses are in {own}, but the points in {unit}; give both in one unit", str(path)
+        )
     return {name: view.pose for name, view in views.items()}
+
+
+def _unit(block: Field) -> str:
+    return block.get("unit", "mm").text()
 
 
 def _type(field: Field) -> int:
@@ -210,7 +219,7 @@ def _straight_lines(field: Field) -> StraightLines:
 
 def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
     observations = block["observations"]
-    unit = block.get("unit", "mm").text()
+    unit = _unit(block)
     center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
     points = read_observations(observations, unit, image_size(root), center, none)
     strange = set() if points.view is None else set(points.view_names) - views
