@@ -143,7 +143,7 @@ def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
     views, own = read_views(block["views"]), _unit(block)
     if own != unit:
         raise FormatError(
-            f"its poses are in {own}, but the points in {unit}; give both in one unit", str(path)
+            f"its poses are in {own}, but the points in {unit}; give both in one unit", block.source
         )
     return {name: view.pose for name, view in views.items()}
 
