@@ -227,7 +227,7 @@ def through_fisheye(points: Correspondences) -> np.ndarray:
 def of_points_twice(points: Correspondences) -> Correspondences:
     """A third of one view's points have a second row with other pixels."""
     rows = np.flatnonzero(points.view_index == 3)[:30]
-    both = points.select(np.concatenate([np.arange(len(points)), rows]))
+    both = replace(points, point=None).select(np.concatenate([np.arange(len(points)), rows]))
     pixels = both.pixels.copy()
     pixels[len(points) :] += 25
     return moved(both, pixels=pixels)
@@ -265,7 +265,7 @@ FLAT: dict[str, Spoiler] = {
         p, world=np.tile(p.world, (2, 1)), pixels=np.tile(p.pixels, (2, 1)), point=None,
         view=np.concatenate([np.asarray(p.view), [f"again {name}" for name in np.asarray(p.view)]]),
     ),
-    "every row given twice": lambda p, rng: p.select(np.repeat(np.arange(len(p)), 2)),
+    "every row given twice": lambda p, rng: replace(p, point=None).select(np.repeat(np.arange(len(p)), 2)),
     "boards all parallel": lambda p, rng: seen(
         board(), [Pose(np.eye(3), q.t) for q in poses(10, 1)], CAMERA.A, 5
     ),
