@@ -348,6 +348,8 @@ def test_interpolation_is_that_of_an_independent_library() -> None:
     spline = RectBivariateSpline(z, f, y.reshape(7, 5), kx=3, ky=3).ev(*at.T)
     np.testing.assert_allclose(spline_matrix(axes, at, 3) @ y, spline, atol=1e-6 * np.abs(spline).max())
     np.testing.assert_allclose(thin_plate_matrix(nodes, at) @ y, RBFInterpolator(nodes, y)(at), atol=1e-6)
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens_cameras(LensCameras.of(table), seed=-1)
     assert grid_axes(nodes[1:]) is None
     powers = powers_up_to(nodes, 6)
     assert powers[:, 1].max() == 4  # five values tell no fifth power
@@ -368,6 +370,8 @@ def test_the_simulated_zoom_obeys_its_law() -> None:
     assert (points.points.pixels < [640, 480]).all()
 
 
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens(points, seed=-1)
 @dataclass
 class Held:
     """Errors over the floor at the settings in between, by law."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_seed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Progress
@@ -113,6 +113,7 @@ def fit_lens_cameras(
     """
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
+    check_seed(seed)
     check_settings(distinct, len(cameras.controls), cameras.source)
     low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
     x = scaled_controls(cameras.settings, low, high)
