@@ -193,7 +193,18 @@ def test_settings_outside_are_refused_unless_asked_for() -> None:
         lens.setting_of({"zoom": 3000.0, "focus": 450.0})
     setting, warnings = lens.setting_of({"zoom": 2300.0, "focus": 450.0}, extrapolate=True)
     assert len(warnings) == 1
-    assert camera_at(lens, setting).intrinsics.alpha_u > 0
+    with pytest.raises(InputError, match="outside the calibrated range, 100 to 2100"):
+        camera_at(lens, setting)
+    camera = camera_at(lens, setting, extrapolate=True)
+    assert camera.intrinsics.alpha_u > 0
+    assert list(camera.warnings) == warnings
+    with pytest.raises(InputError, match=r"does not determine the camera|no valid camera"):
+        camera_at(lens, np.array([9000.0, 450.0]), extrapolate=True)
+    for wrong in (1250.0, [], [1250.0], [[1250.0, 400.0]], None, [1250.0, "far"]):
+        with pytest.raises(InputError, match="has 2 controls, zoom and focus; give a list of 2 numbers"):
+            camera_at(lens, wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="give rows of 2 numbers"):
+        lens.predict(setting)
     for values in ({"zoom": 500.0, "focus": None}, {"zoom": None, "focus": 1.0}):
         with pytest.raises(UsageError, match="needs a value"):
             lens.setting_of(values)
