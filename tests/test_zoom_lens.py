@@ -276,6 +276,64 @@ def test_known_cameras_are_followed_and_their_noise_is_told() -> None:
     assert "theta" in camera.fixed
 
 
+def known_cameras(count: int, seed: int) -> tuple[LensCameras, dict[str, np.ndarray], np.ndarray]:
+    """Cameras with 0.2 % of noise in alpha and 1 px in u0 and v0, and the truth at nine zooms."""
+    lens, rng = SimulatedZoom(pitch=0.006, image_size=(1280, 720), wander=8.0), np.random.default_rng(seed)
+    zoom, checked = (np.column_stack([np.linspace(0, 3000, n), np.zeros(n)]) for n in (count, 9))
+    table = {name: lens.parameters(zoom)[name] for name in ("alpha_u", "alpha_v", "u0", "v0")}
+    table["alpha_u"], table["alpha_v"] = np.outer(
+        [1, 0.998], table["alpha_u"] * (1 + 0.002 * rng.normal(size=count))
+    )
+    table |= {name: table[name] + rng.normal(size=count) for name in ("u0", "v0")}
+    cameras = LensCameras.of({"zoom": zoom[:, 0], **table}, image_size=lens.image_size)
+    return cameras, lens.parameters(checked), checked[:, :1]
+
+
+def test_networks_through_all_known_cameras_do_not_make_them_exact() -> None:
+    for seed in range(2):
+        cameras, _, _ = known_cameras(5, seed)
+        lens = fit_lens_cameras(cameras, topologies=((1, 0), (2, 0)))
+        std = lens.predict(cameras.settings).std[:, :4] / [*2 * [0.002 * cameras.local[:, 0].min()], 1, 1]
+        assert (std > 0.2).all()
+        assert (np.median(std, axis=0) < 5).all()
+        assert not lens.warnings
+
+
+def test_a_wrong_number_in_a_table_of_cameras_is_told() -> None:
+    for name, row, factor, reason in (
+        ("alpha_u", 2, 2.0, "the camera at zoom 1500 contradicts"),
+        ("u0", 0, 10.0, "centre at zoom 0 lies outside the image"),
+    ):
+        cameras, _, _ = known_cameras(5, 1)
+        local = cameras.local.copy()
+        local[row, cameras.names.index(name)] *= factor
+        verdict = judge_lens(fit_lens_cameras(replace(cameras, local=local), topologies=((1, 0), (2, 0))))
+        assert verdict.word == "poor"
+        assert any(reason in text for text in verdict.reasons)
+
+
+def test_three_cameras_do_not_tell_their_errors() -> None:
+    lens = fit_lens_cameras(known_cameras(3, 1)[0], topologies=((0, 0),))
+    assert "too few to tell their errors" in lens.warnings[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 4, 5, 7, 12, 20])
+def test_the_errors_of_known_cameras_are_told(count: int) -> None:
+    errors, contradicted = [], 0
+    for seed in range(200, 212):
+        cameras, true, at = known_cameras(count, seed)
+        lens = fit_lens_cameras(cameras)
+        prediction = lens.predict(at)
+        truth_there = np.column_stack([true[name] for name in cameras.names])
+        errors.append((prediction.local - truth_there) / prediction.std[:, :4])
+        contradicted += any("contradicts" in reason for reason in judge_lens(lens).reasons)
+    over_std = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
+    assert (over_std < (1.3 if count < 12 else 1.7)).all()
+    assert (over_std > (0.5 if count > 4 else 0.02)).all()
+    assert contradicted <= 1
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -290,6 +348,8 @@ def test_known_cameras_that_cannot_be_used_are_refused(change: dict, message: st
     table = {name: np.arange(1.0, 6) for name in ("zoom", "alpha_u", "alpha_v", "u0", "v0")}
     with pytest.raises(InputError, match=message):
         LensCameras.of(table | change)
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens_cameras(LensCameras.of(table), seed=-1)
 
 
 def test_points_that_cannot_be_used_are_refused() -> None:
@@ -310,6 +370,8 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     for name in ("distortion", "training", "outliers", "camera"):
         with pytest.raises(UsageError, match=name):
             fit_lens(points, **{name: "other"})
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens(points, seed=-1)
     with pytest.raises(NeurocalError, match="settings cannot be calibrated"):
         fit_lens(flat(points), distortion="none")
 
@@ -359,8 +421,6 @@ def test_interpolation_is_that_of_an_independent_library() -> None:
     spline = RectBivariateSpline(z, f, y.reshape(7, 5), kx=3, ky=3).ev(*at.T)
     np.testing.assert_allclose(spline_matrix(axes, at, 3) @ y, spline, atol=1e-6 * np.abs(spline).max())
     np.testing.assert_allclose(thin_plate_matrix(nodes, at) @ y, RBFInterpolator(nodes, y)(at), atol=1e-6)
-    with pytest.raises(UsageError, match="seed must be"):
-        fit_lens_cameras(LensCameras.of(table), seed=-1)
     assert grid_axes(nodes[1:]) is None
     powers = powers_up_to(nodes, 6)
     assert powers[:, 1].max() == 4  # five values tell no fifth power
@@ -381,8 +441,6 @@ def test_the_simulated_zoom_obeys_its_law() -> None:
     assert (points.points.pixels < [640, 480]).all()
 
 
-    with pytest.raises(UsageError, match="seed must be"):
-        fit_lens(points, seed=-1)
 @dataclass
 class Held:
     """Errors over the floor at the settings in between, by law."""
