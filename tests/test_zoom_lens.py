@@ -408,6 +408,21 @@ def test_a_camera_that_moved_is_told() -> None:
     assert lens.warnings or lens.rejected
 
 
+def test_a_camera_that_moved_a_little_is_told() -> None:
+    """With one view at each setting, `auto` takes the camera to be still."""
+    points = seen("c", grid(5, 1), seed=20, side=5)
+    steps = np.array([3.0, 0.0, 0.0]) * points.point_setting[:, None]
+    moved = LensPoints.grouped(replace(points.points, world=points.points.world + steps), columns(points))
+    lens = fit_lens(moved, distortion="none", topologies=FEW)
+    assert lens.free_pose_px == pytest.approx(FLOOR, rel=0.05)
+    assert lens.noise_floor_px > 1.3 * lens.free_pose_px
+    verdict = judge_lens(lens)
+    assert verdict.word != "good"
+    assert any("moved between the settings" in reason for reason in verdict.reasons)
+    assert any("--camera moving" in advice for advice in verdict.advice)
+    assert smooth().free_pose_px == pytest.approx(smooth().noise_floor_px, rel=0.02)
+
+
 def test_interpolation_is_that_of_an_independent_library() -> None:
     rng = np.random.default_rng(21)
     z, f = np.sort(rng.uniform(-1, 1, 7)), np.sort(rng.uniform(-1, 1, 5))

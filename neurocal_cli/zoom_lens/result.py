@@ -9,7 +9,7 @@ import numpy as np
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
-from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
+from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, free_pose_variance
 from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.setting_normals import Constants
 from neurocal_cli.zoom_lens.settings import describe
@@ -77,7 +77,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
     tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
-    finished = replace(lens, rmse=rmse, left_out_px=left_out)
+    free_pose = float(np.sqrt(2 * free_pose_variance(start)))
+    finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
     return replace(finished, warnings=_warnings(finished, start, tables_rms))
 
 

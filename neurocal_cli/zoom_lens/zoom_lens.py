@@ -100,6 +100,8 @@ class ZoomLens:
         The target estimated from several settings together, to which the lens was fitted.
     target_coupling : (S, L + Q, r) array or None
         Effect of the target's uncertainty on each setting; see `zoom_lens.target_coupling`.
+    free_pose_px : float [px]
+        Of a still camera: the noise floor if each view had a pose of its own; nan where unknown.
     """
 
     controls: tuple[str, ...]
@@ -126,6 +128,7 @@ class ZoomLens:
     warnings: tuple[str, ...] = ()
     target: Target | None = None
     target_coupling: Array | None = None
+    free_pose_px: float = np.nan
 
     @property
     def low(self) -> Array:
