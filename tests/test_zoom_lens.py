@@ -12,7 +12,7 @@ from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
-from neurocal_cli.errors import InputError, NeurocalError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.baseline_models import (
@@ -421,6 +421,15 @@ def test_a_camera_that_moved_a_little_is_told() -> None:
     assert any("moved between the settings" in reason for reason in verdict.reasons)
     assert any("--camera moving" in advice for advice in verdict.advice)
     assert smooth().free_pose_px == pytest.approx(smooth().noise_floor_px, rel=0.02)
+
+
+def test_a_setting_in_another_unit_is_named() -> None:
+    settings = np.column_stack([np.linspace(0, 3000, 9), np.zeros(9)])
+    points = SimulatedZoom().points(settings, 4, 0.15, np.random.default_rng(21))
+    zoom = columns(points)["zoom"]
+    zoom[zoom == 1500] *= 1000
+    with pytest.raises(DegenerateGeometryError, match=r"points: .* zoom 1500000 is far from the others"):
+        fit_lens(LensPoints.grouped(points.points, {"zoom": zoom}), distortion="none", topologies=((0, 0),))
 
 
 def test_interpolation_is_that_of_an_independent_library() -> None:

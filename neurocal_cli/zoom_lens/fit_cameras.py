@@ -15,6 +15,7 @@ from neurocal_cli.zoom_lens.camera_errors import error_variances, too_few
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
+from neurocal_cli.zoom_lens.result import refuse_gaps
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
@@ -110,6 +111,8 @@ def fit_lens_cameras(
     ------
     InputError
         Too few settings.
+    DegenerateGeometryError
+        The networks give no camera between the settings.
     UsageError
         A negative seed.
     """
@@ -138,7 +141,7 @@ def fit_lens_cameras(
             f"{S} cameras are too few to tell their errors from the changes of the lens, so the standard "
             "deviations may be far too large; give at least 5 values of each control"
         )
-    return ZoomLens(
+    lens = ZoomLens(
         controls=cameras.controls,
         settings=cameras.settings,
         names=cameras.names,
@@ -162,6 +165,8 @@ def fit_lens_cameras(
         unit=cameras.unit,
         warnings=tuple(warnings),
     )
+    refuse_gaps(lens, cameras.source)
+    return lens
 
 
 def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Normal:

@@ -13,11 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from neurocal_cli.calibration import Verdict
-from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.findings import Finding, Limit, verdict_of
 from neurocal_cli.zoom_lens.camera_errors import odd_camera
 from neurocal_cli.zoom_lens.parameter_networks import local_to_outputs
-from neurocal_cli.zoom_lens.settings import describe
+from neurocal_cli.zoom_lens.settings import describe, middles
 from neurocal_cli.zoom_lens.zoom_lens import Prediction, ZoomLens
 
 # Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
@@ -62,21 +61,7 @@ def _alpha_share(lens: ZoomLens) -> float:
 
 
 def _everywhere(lens: ZoomLens) -> Prediction:
-    return lens.predict(np.concatenate([lens.settings, _between(lens)]))
-
-
-def _between(lens: ZoomLens) -> Array:
-    """Middles between each setting and its nearest neighbours, one for each control; (M, D)."""
-    scaled = (lens.settings - lens.low) / np.maximum(lens.high - lens.low, 1e-300)
-    apart = np.abs(scaled[:, None] - scaled)
-    middles = [np.zeros((0, len(lens.controls)))]
-    for k in range(len(lens.controls)):
-        # The nearest setting with another value of this control, preferably with the same other value.
-        distance = np.where(apart[..., k] > 0, 2 * apart.sum(axis=2) - apart[..., k], np.inf)
-        nearest = distance.argmin(axis=1)
-        known = np.isfinite(distance.min(axis=1))
-        middles.append(0.5 * (lens.settings + lens.settings[nearest])[known])
-    return np.concatenate(middles)
+    return lens.predict(np.concatenate([lens.settings, middles(lens.settings)]))
 
 
 def _elsewhere(lens: ZoomLens, px: float) -> Finding:
@@ -116,8 +101,8 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
     )
     yield (
         _MOVED.grade(floor / max(lens.free_pose_px, 1e-9)),
-        f"the noise floor is {floor:.3g} px with one pose for all settings, {lens.free_pose_px:.3g} px with a "
-        "pose for each: the camera or the target moved between the settings",
+        f"the noise floor is {floor:.3g} px with one pose for all settings, {lens.free_pose_px:.3g} px with "
+        "a pose for each: the camera or the target moved between the settings",
         "give --camera moving, or keep both where they are",
     )
     contradiction = _CONTRADICTION.grade(lens.rmse_px / max(floor, 1e-9))
