@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.parameter_networks import LensNets, ParameterNet
+from neurocal_cli.zoom_lens.parameter_networks import LensNets, ParameterNet, from_scale
 
 _LEAST_STD = 1e-6  # of a parameter without errors, as a share of the parameter
 # Degrees of freedom that must count: two of five cameras with one control, four of seven or more. Repeated by
@@ -26,8 +26,8 @@ _LEAST_STD = 1e-6  # of a parameter without errors, as a share of the parameter
 _LEAST_FREEDOM, _ENOUGH_FREEDOM = 2.0, 4.0
 _SMOOTH = 3  # weights for each control of a smooth parameter
 _TAU2 = 1e-8 * 10 ** np.arange(0.0, 9.0, 0.125)
-# Limit of a deletion residual with many degrees of freedom, and how it grows with few: about one good
-# table in a hundred exceeds it. Repeated by the same test.
+# Limit of a deletion residual with many degrees of freedom, and how it grows with few: none of 120 good tables
+# exceeds it. Repeated by the same test.
 _ODD, _ODD_GROWTH = 6.0, 10.0
 
 
@@ -37,7 +37,7 @@ def too_few(cameras: int, controls: int) -> bool:
 
 
 def error_variances(members: Sequence[LensNets], x: Array, outputs: Array) -> Array:
-    """Variances of the errors of the networks' targets, (L,).
+    """Variances of the errors of the networks' targets, (S, L).
 
     Parameters
     ----------
@@ -49,11 +49,20 @@ def error_variances(members: Sequence[LensNets], x: Array, outputs: Array) -> Ar
 
     Notes
     -----
-    u0 and v0 are taken to have equal errors, so that two parameters tell their size.
+    The errors of alpha_u are taken to be equal shares of it. u0 and v0 are taken to have equal errors, so
+    that two parameters tell their size.
     """
     variances = np.median(_errors(members, x, outputs)[0], axis=0)
     variances[2:4] = variances[2:4].mean()
-    return np.asarray(variances)
+    return np.asarray(variances * _sizes(members[0].scale, outputs) ** 2)
+
+
+def _sizes(scale: str, outputs: Array) -> Array:
+    """Relative sizes (S, L) of the targets' errors, with a mean square of 1."""
+    sizes = np.ones_like(outputs)
+    alpha, derivative = from_scale(scale, outputs[:, 0])
+    sizes[:, 0] = np.abs(alpha / derivative)
+    return sizes / np.sqrt((sizes**2).mean(axis=0))
 
 
 def odd_camera(members: Sequence[LensNets], x: Array, outputs: Array) -> int | None:
@@ -74,19 +83,24 @@ def odd_camera(members: Sequence[LensNets], x: Array, outputs: Array) -> int | N
 
 def _errors(members: Sequence[LensNets], x: Array, outputs: Array) -> tuple[Array, Array]:
     """sigma^2 and nu (M, L) of each network."""
-    pairs = [[_error(net, x, d) for net, d in zip(nets.nets, outputs.T, strict=True)] for nets in members]
-    found = np.array(pairs)
+    sizes = _sizes(members[0].scale, outputs)
+    found = np.array(
+        [
+            [_error(net, x, *of) for net, *of in zip(nets.nets, outputs.T, sizes.T, strict=True)]
+            for nets in members
+        ]
+    )
     size = np.abs(np.median(outputs, axis=0))
     size[1] = 1.0  # log(alpha_v / alpha_u): a ratio of 1 is 0
     return np.maximum(found[..., 0], (_LEAST_STD * size) ** 2), found[..., 1]
 
 
-def _error(net: ParameterNet, x: Array, targets: Array) -> tuple[float, float]:
+def _error(net: ParameterNet, x: Array, targets: Array, sizes: Array) -> tuple[float, float]:
     y, J = net.output_with_jacobian(x)
-    J = J / net.spread
+    J = J / (net.spread * sizes[:, None])
     w, functions = np.linalg.eigh((J / net.prior) @ J.T)  # P: the precisions of the prior
     # The weights' prior is about 0, so only the network without its linear part is subtracted.
-    parts = functions.T @ ((targets - y) / net.spread + J @ net.weights)
+    parts = functions.T @ ((targets - y) / (net.spread * sizes) + J @ net.weights)
     S, D = x.shape
     wanted = np.clip(S - _SMOOTH * D, min(_LEAST_FREEDOM, S - 2), _ENOUGH_FREEDOM)
     tau2 = np.maximum(_TAU2, net.scatter / net.spread**2)

@@ -172,7 +172,7 @@ def fit_lens_cameras(
 def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Normal:
     """Inverse covariances of the given parameters, from the size of their errors."""
     outputs, by_local = local_to_outputs(members[0].scale, local)
-    H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[:, None])
+    H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[..., None])
     H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, like one read from a file
     S, L = local.shape
     return Normal(H, np.zeros((S, L)), np.zeros(S), True)
