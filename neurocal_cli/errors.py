@@ -7,6 +7,7 @@ its class. A message says what is wrong, where, and what to do.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 
 class NeurocalError(Exception):
@@ -64,3 +65,14 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """
     if value not in choices:
         raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
+
+
+def check_seed(seed: object) -> None:
+    """Refuse a seed that NumPy's generators do not take.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not isinstance(seed, Integral) or int(seed) < 0:  # NumPy's integers are Integral, too
+        raise UsageError("seed must be a whole number of at least 0")

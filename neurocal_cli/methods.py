@@ -15,7 +15,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice
+from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_seed
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options, Progress, options_for
 from neurocal_cli.pipeline.fit import fit
@@ -279,5 +279,4 @@ def _check_options(
         raise UsageError(f"target {target} needs the method neuro, but the method is {method}; leave it out")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
-    if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError("seed must be a whole number of at least 0")
+    check_seed(seed)

@@ -141,6 +141,7 @@ def test_pictures_are_drawn(folder: Path) -> None:
 def test_known_cameras_go_the_simple_path(folder: Path, known: Result) -> None:
     assert known.exit_code == 0, known.stderr
     assert "known cameras" in known.stderr
+    assert "verdict: " in known.stderr
     camera = run("lens", "camera", "-", "--zoom", 37, stdin=known.stdout.encode())
     assert camera.exit_code == 0, camera.stderr
     (folder / "known.yaml").write_text(camera.stdout)

@@ -308,6 +308,8 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
     [
         ({"starts": 1}, "starts must be a whole number"),
         ({"starts": 0}, "starts must be a whole number"),
+        ({"seed": -1}, "seed must be a whole number"),
+        ({"seed": 1.5}, "seed must be a whole number"),
         ({"method": "magic"}, "method must be one of neuro"),
         ({"trainer": "adam"}, "trainer must be one of lm, backprop, not 'adam'"),
         ({"distortion": "round"}, "distortion must be one of auto"),

@@ -12,7 +12,7 @@ from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
-from neurocal_cli.errors import InputError, NeurocalError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.baseline_models import (
@@ -193,7 +193,18 @@ def test_settings_outside_are_refused_unless_asked_for() -> None:
         lens.setting_of({"zoom": 3000.0, "focus": 450.0})
     setting, warnings = lens.setting_of({"zoom": 2300.0, "focus": 450.0}, extrapolate=True)
     assert len(warnings) == 1
-    assert camera_at(lens, setting).intrinsics.alpha_u > 0
+    with pytest.raises(InputError, match="outside the calibrated range, 100 to 2100"):
+        camera_at(lens, setting)
+    camera = camera_at(lens, setting, extrapolate=True)
+    assert camera.intrinsics.alpha_u > 0
+    assert list(camera.warnings) == warnings
+    with pytest.raises(InputError, match=r"does not determine the camera|no valid camera"):
+        camera_at(lens, np.array([9000.0, 450.0]), extrapolate=True)
+    for wrong in (1250.0, [], [1250.0], [[1250.0, 400.0]], None, [1250.0, "far"]):
+        with pytest.raises(InputError, match="has 2 controls, zoom and focus; give a list of 2 numbers"):
+            camera_at(lens, wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="give rows of 2 numbers"):
+        lens.predict(setting)
     for values in ({"zoom": 500.0, "focus": None}, {"zoom": None, "focus": 1.0}):
         with pytest.raises(UsageError, match="needs a value"):
             lens.setting_of(values)
@@ -265,6 +276,64 @@ def test_known_cameras_are_followed_and_their_noise_is_told() -> None:
     assert "theta" in camera.fixed
 
 
+def known_cameras(count: int, seed: int) -> tuple[LensCameras, dict[str, np.ndarray], np.ndarray]:
+    """Cameras with 0.2 % of noise in alpha and 1 px in u0 and v0, and the truth at nine zooms."""
+    lens, rng = SimulatedZoom(pitch=0.006, image_size=(1280, 720), wander=8.0), np.random.default_rng(seed)
+    zoom, checked = (np.column_stack([np.linspace(0, 3000, n), np.zeros(n)]) for n in (count, 9))
+    table = {name: lens.parameters(zoom)[name] for name in ("alpha_u", "alpha_v", "u0", "v0")}
+    table["alpha_u"], table["alpha_v"] = np.outer(
+        [1, 0.998], table["alpha_u"] * (1 + 0.002 * rng.normal(size=count))
+    )
+    table |= {name: table[name] + rng.normal(size=count) for name in ("u0", "v0")}
+    cameras = LensCameras.of({"zoom": zoom[:, 0], **table}, image_size=lens.image_size)
+    return cameras, lens.parameters(checked), checked[:, :1]
+
+
+def test_networks_through_all_known_cameras_do_not_make_them_exact() -> None:
+    for seed in range(2):
+        cameras, _, _ = known_cameras(5, seed)
+        lens = fit_lens_cameras(cameras, topologies=((1, 0), (2, 0)))
+        std = lens.predict(cameras.settings).std[:, :4] / [*2 * [0.002 * cameras.local[:, 0].min()], 1, 1]
+        assert (std > 0.2).all()
+        assert (np.median(std, axis=0) < 5).all()
+        assert not lens.warnings
+
+
+def test_a_wrong_number_in_a_table_of_cameras_is_told() -> None:
+    for name, row, factor, reason in (
+        ("alpha_u", 2, 2.0, "the camera at zoom 1500 contradicts"),
+        ("u0", 0, 10.0, "centre at zoom 0 lies outside the image"),
+    ):
+        cameras, _, _ = known_cameras(5, 1)
+        local = cameras.local.copy()
+        local[row, cameras.names.index(name)] *= factor
+        verdict = judge_lens(fit_lens_cameras(replace(cameras, local=local), topologies=((1, 0), (2, 0))))
+        assert verdict.word == "poor"
+        assert any(reason in text for text in verdict.reasons)
+
+
+def test_three_cameras_do_not_tell_their_errors() -> None:
+    lens = fit_lens_cameras(known_cameras(3, 1)[0], topologies=((0, 0),))
+    assert "too few to tell their errors" in lens.warnings[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 4, 5, 7, 12, 20])
+def test_the_errors_of_known_cameras_are_told(count: int) -> None:
+    errors, contradicted = [], 0
+    for seed in range(200, 212):
+        cameras, true, at = known_cameras(count, seed)
+        lens = fit_lens_cameras(cameras)
+        prediction = lens.predict(at)
+        truth_there = np.column_stack([true[name] for name in cameras.names])
+        errors.append((prediction.local - truth_there) / prediction.std[:, :4])
+        contradicted += any("contradicts" in reason for reason in judge_lens(lens).reasons)
+    over_std = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
+    assert (over_std < (1.3 if count < 12 else 1.7)).all()
+    assert (over_std > (0.5 if count > 4 else 0.02)).all()
+    assert contradicted <= 1
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -279,6 +348,8 @@ def test_known_cameras_that_cannot_be_used_are_refused(change: dict, message: st
     table = {name: np.arange(1.0, 6) for name in ("zoom", "alpha_u", "alpha_v", "u0", "v0")}
     with pytest.raises(InputError, match=message):
         LensCameras.of(table | change)
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens_cameras(LensCameras.of(table), seed=-1)
 
 
 def test_points_that_cannot_be_used_are_refused() -> None:
@@ -302,6 +373,8 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     for topologies in (5, (2, 2), ((-1, 2),), ((2.5, 2),), ((1, 2), (3,))):
         with pytest.raises(UsageError, match="topologies must be pairs"):
             fit_lens(points, topologies=topologies)
+    with pytest.raises(UsageError, match="seed must be"):
+        fit_lens(points, seed=-1)
     with pytest.raises(NeurocalError, match="settings cannot be calibrated"):
         fit_lens(flat(points), distortion="none")
 
@@ -336,6 +409,30 @@ def test_a_camera_that_moved_is_told() -> None:
     except NeurocalError:
         return
     assert lens.warnings or lens.rejected
+
+
+def test_a_camera_that_moved_a_little_is_told() -> None:
+    """With one view at each setting, `auto` takes the camera to be still."""
+    points = seen("c", grid(5, 1), seed=20, side=5)
+    steps = np.array([3.0, 0.0, 0.0]) * points.point_setting[:, None]
+    moved = LensPoints.grouped(replace(points.points, world=points.points.world + steps), columns(points))
+    lens = fit_lens(moved, distortion="none", topologies=FEW)
+    assert lens.free_pose_px == pytest.approx(FLOOR, rel=0.05)
+    assert lens.noise_floor_px > 1.3 * lens.free_pose_px
+    verdict = judge_lens(lens)
+    assert verdict.word != "good"
+    assert any("moved between the settings" in reason for reason in verdict.reasons)
+    assert any("--camera moving" in advice for advice in verdict.advice)
+    assert smooth().free_pose_px == pytest.approx(smooth().noise_floor_px, rel=0.02)
+
+
+def test_a_setting_in_another_unit_is_named() -> None:
+    settings = np.column_stack([np.linspace(0, 3000, 9), np.zeros(9)])
+    points = SimulatedZoom().points(settings, 4, 0.15, np.random.default_rng(21))
+    zoom = columns(points)["zoom"]
+    zoom[zoom == 1500] *= 1000
+    with pytest.raises(DegenerateGeometryError, match=r"points: .* zoom 1500000 is far from the others"):
+        fit_lens(LensPoints.grouped(points.points, {"zoom": zoom}), distortion="none", topologies=((0, 0),))
 
 
 def test_interpolation_is_that_of_an_independent_library() -> None:

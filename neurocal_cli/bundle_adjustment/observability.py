@@ -20,7 +20,7 @@ _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below whi
 # Largest std of a focal length over its value. Noisy parallel boards fit best with tilts of about one
 # standard deviation each, and V of them then seem to determine the focal length to 1 / sqrt(2 V). The std of
 # flat targets must be below that, times this factor.
-_MEANINGLESS = 0.5
+MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
 _WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 
@@ -130,7 +130,7 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     views, relative_std = problem.views, relative_std_of_scale(problem, state, cov)
     singular = not cov.smallest > _SINGULAR
     boards = views.nearly_flat.all() and problem.free_poses and problem.free[[0, 2]].any()
-    limit = _MEANINGLESS / np.sqrt(2 * views.n_views) if boards else _MEANINGLESS
+    limit = MEANINGLESS / np.sqrt(2 * views.n_views) if boards else MEANINGLESS
     if not singular and relative_std < limit:
         return
     if boards:

@@ -218,8 +218,8 @@ def camera(
     from neurocal_cli.zoom_lens.camera_at import camera_at
 
     learnt = read_lens(lens_file)
-    setting, warnings = learnt.setting_of({"zoom": zoom, "focus": focus}, extrapolate)
-    calibration = camera_at(learnt, setting, camera_name, tuple(warnings))
+    setting, _ = learnt.setting_of({"zoom": zoom, "focus": focus}, extrapolate)
+    calibration = camera_at(learnt, setting, camera_name, extrapolate=extrapolate)
     write_calibration(calibration, output)
     if as_json:
         from neurocal_cli.report import calibration_json
@@ -230,7 +230,7 @@ def camera(
         from neurocal_cli.zoom_lens.report import camera_report
 
         say(camera_report(calibration))
-    warn(warnings)
+    warn(calibration.warnings)
 
 
 @lens.command(cls=options.Command)

@@ -100,6 +100,7 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
         n_points=str(int(lens.counts.sum())),
         rmse_px=number(lens.rmse_px if not lens.known else np.nan),
         left_out_px=number(lens.left_out_px),
+        free_pose_px=number(lens.free_pose_px),
         variance=number(lens.variance),
     )
     yield f"scatter: {flow(lens.scatter)}"
@@ -202,6 +203,7 @@ def _lens(block: Field) -> ZoomLens:
             for bad in block["rejected"].items()
         ),
         left_out_px=fit["left_out_px"].number_or_nan(),
+        free_pose_px=fit.get("free_pose_px").number_or_nan(),
         training=block["training"].text(),
         seed=block["seed"].integer(),
         converged=block["converged"].boolean(),

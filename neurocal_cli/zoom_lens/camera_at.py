@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.bundle_adjustment.observability import MEANINGLESS
 from neurocal_cli.calibration import Calibration, ViewResult
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.setting_normals import Constants
@@ -17,7 +19,12 @@ _VIEW = "view"  # the default name of a view, so that points without a name are 
 
 
 def camera_at(
-    lens: ZoomLens, setting: Array, camera_name: str = "camera", warnings: tuple[str, ...] = ()
+    lens: ZoomLens,
+    setting: Array,
+    camera_name: str = "camera",
+    warnings: tuple[str, ...] = (),
+    *,
+    extrapolate: bool = False,
 ) -> Calibration:
     """Calibration at a setting, with standard deviations and without points.
 
@@ -29,14 +36,24 @@ def camera_at(
     camera_name : str
     warnings : tuple of str
         Stored in the calibration.
+    extrapolate : bool
+        Whether a setting outside the calibrated range gives a warning and not an error.
 
     Raises
     ------
     InputError
-        The networks give no valid camera there.
+        The setting is not one finite number for each control, or outside the calibrated range; or the
+        networks determine no camera there.
     """
-    prediction = lens.predict(np.asarray(setting, dtype=float)[None])
+    setting, outside = lens.check_setting(setting, extrapolate)
+    prediction = lens.predict(setting[None])
     values, std = prediction.local[0], prediction.std[0]
+    share = float((std[:2] / values[:2]).max())
+    if share >= MEANINGLESS:
+        raise InputError(
+            f"the lens does not determine the camera at {describe(lens.controls, setting)}: the std of the "
+            f"focal length is {100 * share:.3g} % of its value; choose a setting nearer to those of the fit"
+        )
     model = coefficient_names(lens.model)
     L, K = len(lens.names), len(model)
     has_theta = prediction.covariance.shape[1] > L and lens.free_theta
@@ -58,7 +75,7 @@ def camera_at(
         trainer=lens.training,
         seed=lens.seed,
         converged=lens.converged,
-        stop_reason=f"from a zoom lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
+        stop_reason=f"from a zoom lens at {describe(lens.controls, setting)}",
         rmse_px=float("nan"),
         max_px=float("nan"),
         distortion_model=lens.model,
@@ -66,7 +83,7 @@ def camera_at(
         covariance=prediction.covariance[0][np.ix_(order, order)],
         covariance_names=tuple(free),
         camera_name=camera_name,
-        warnings=warnings,
+        warnings=(*warnings, *outside),
     )
 
 

@@ -7,20 +7,21 @@ from collections.abc import Mapping
 import numpy as np
 
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_seed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Progress
+from neurocal_cli.zoom_lens.camera_errors import error_variances, too_few
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
+from neurocal_cli.zoom_lens.result import refuse_gaps
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
 _INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach
-_LEAST_STD = 1e-6  # standard deviation of a parameter without scatter, as a share of the parameter
 
 
 @frozen_dataclass(eq=False)
@@ -104,13 +105,18 @@ def fit_lens_cameras(
     topologies: tuple[tuple[int, int], ...] | None = None,
     progress: Progress | None = None,
 ) -> ZoomLens:
-    """Fit networks to known cameras; the scatter about them gives the noise of the parameters.
+    """Fit networks to known cameras; `camera_errors` estimates their noise.
 
     Raises
     ------
     InputError
         Too few settings.
+    DegenerateGeometryError
+        The networks give no camera between the settings.
+    UsageError
+        A negative seed.
     """
+    check_seed(seed)
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)
@@ -128,8 +134,14 @@ def fit_lens_cameras(
         lambda share: report("fitting a network to each parameter", share),
     )
     constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
-    table = Tables(cameras.local, constants, _scatter_normal(members, cameras.local))
-    return ZoomLens(
+    table = Tables(cameras.local, constants, _error_normal(members, x, cameras.local))
+    warnings: list[str] = []
+    if too_few(S, len(cameras.controls)):
+        warnings.append(
+            f"{S} cameras are too few to tell their errors from the changes of the lens, so the standard "
+            "deviations may be far too large; give at least 5 values of each control"
+        )
+    lens = ZoomLens(
         controls=cameras.controls,
         settings=cameras.settings,
         names=cameras.names,
@@ -151,17 +163,16 @@ def fit_lens_cameras(
         converged=True,
         image_size=cameras.image_size,
         unit=cameras.unit,
+        warnings=tuple(warnings),
     )
+    refuse_gaps(lens, cameras.source)
+    return lens
 
 
-def _scatter_normal(members: tuple[LensNets, ...], local: Array) -> Normal:
-    """Inverse covariances of the given parameters, from the scatter about the networks."""
-    scatter = np.median([[net.scatter for net in nets.nets] for nets in members], axis=0)
+def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Normal:
+    """Inverse covariances of the given parameters, from the size of their errors."""
     outputs, by_local = local_to_outputs(members[0].scale, local)
-    size = np.abs(np.median(outputs, axis=0))
-    size[1] = 1.0  # log(alpha_v / alpha_u): a ratio of 1 is 0
-    scatter = np.maximum(scatter, (_LEAST_STD * size) ** 2)
-    H = np.swapaxes(by_local, 1, 2) @ (by_local / scatter[:, None])
+    H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[..., None])
     H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, like one read from a file
     S, L = local.shape
     return Normal(H, np.zeros((S, L)), np.zeros(S), True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
-from neurocal_cli.errors import DegenerateGeometryError, check_choice
+from neurocal_cli.errors import DegenerateGeometryError, check_choice, check_seed
 from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
@@ -86,7 +86,7 @@ def fit_lens(
     Raises
     ------
     UsageError
-        An option that does not exist.
+        An option that does not exist, or a negative seed.
     InputError, DegenerateGeometryError
         The points do not determine a zoom lens; the message says why.
     """
@@ -95,6 +95,7 @@ def fit_lens(
     check_choice("outliers", outliers, OUTLIERS)
     check_choice("camera", camera, CAMERAS)
     check_choice("target", target, TARGETS)
+    check_seed(seed)
     report = progress or (lambda stage, share: None)
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)

@@ -75,6 +75,21 @@ class CalibratedSettings:
         return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
 
+def free_pose_variance(start: CalibratedSettings) -> float:
+    """Variance of the noise if each view of a still camera had a pose of its own [px^2].
+
+    nan if the camera moves, or if some setting does not determine camera and pose by itself.
+    """
+    if not start.data.still or not start.static.good.all():
+        return np.nan
+    t_z = start.data.names.index("t_z")
+    static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
+    data = replace(start.data, still=False)
+    tables = common_tables(data, static.local, first_constants(static, start.lens, False))
+    free = replace(start, data=data, static=static, tables=tables)
+    return free.variance if tables.normal.sensible and np.isfinite(free.variance) else np.nan
+
+
 def check_settings(count: int, controls: int, source: str) -> None:
     """Refuse too few settings.
 

@@ -37,8 +37,7 @@ def lens_report(lens: ZoomLens) -> str:
     blocks = [head, "\n".join(align(_network_rows(lens)))]
     tail = []
     if lens.known:
-        scatter = [net.scatter for net in lens.members[0].nets.nets]
-        tail.append(f"scatter of the cameras around the networks: {_scatter_text(lens, scatter)}")
+        tail.append(f"errors of the cameras, estimated: {_camera_errors(lens)}")
     else:
         tail.append(
             f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
@@ -50,15 +49,12 @@ def lens_report(lens: ZoomLens) -> str:
     tail.append(f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}")
     tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
     blocks.append("\n".join(tail))
-    verdict = judge_lens(lens)
-    if verdict is not None:
-        blocks.append("\n".join(verdict_lines(verdict)))
+    blocks.append("\n".join(verdict_lines(judge_lens(lens))))
     return "\n\n".join(blocks)
 
 
 def lens_json(lens: ZoomLens) -> dict[str, Any]:
     """The summary of a lens as JSON values; None for numbers that do not exist."""
-    verdict = judge_lens(lens)
     return {
         "controls": list(lens.controls),
         "n_settings": len(lens.settings),
@@ -74,20 +70,16 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "target": target_json(lens.target, lens.unit),
         "converged": bool(lens.converged),
         "warnings": list(lens.warnings),
-        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+        "verdict": verdict_json(judge_lens(lens)),
     }
 
 
-def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
-    """The scatter about each network; that of alpha is relative."""
-    local = lens.tables.local
-    C = np.linalg.inv(lens.tables.normal.H)
-    std = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    share = 100 * float(np.median(std[:, 0] / local[:, 0]))
-    others = [
-        f"{name} {math.sqrt(value):.3g}" for name, value in zip(lens.names[2:], scatter[2:], strict=True)
-    ]
-    return f"alpha_u {share:.2g} %, {', '.join(others)}"
+def _camera_errors(lens: ZoomLens) -> str:
+    """The median std of the given parameters; that of alpha is relative."""
+    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.H), axis1=1, axis2=2))
+    share = 100 * float(np.median(std[:, 0] / lens.tables.local[:, 0]))
+    others = [f"{name} {value:.3g}" for name, value in zip(lens.names, np.median(std, axis=0), strict=True)]
+    return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
 
 
 def _network_rows(lens: ZoomLens) -> list[list[str]]:

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
-from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
+from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, free_pose_variance
 from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.setting_normals import Constants
-from neurocal_cli.zoom_lens.settings import describe
+from neurocal_cli.zoom_lens.settings import describe, far_value, middles
 from neurocal_cli.zoom_lens.static_calibration import first_constants, fit_local
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
@@ -62,12 +62,13 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     Raises
     ------
     DegenerateGeometryError
-        The networks follow no camera at one of the settings.
+        The networks follow no camera at one of the settings or between them.
     """
     lens = provisional(start, joints, options)
     x = start.controls
     each = np.array([member.nets.local(x) for member in lens.members])
     _refuse_contradiction(lens, each)
+    refuse_gaps(lens, start.lens.points.source)
     local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
@@ -77,7 +78,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
     tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
-    finished = replace(lens, rmse=rmse, left_out_px=left_out)
+    free_pose = float(np.sqrt(2 * free_pose_variance(start)))
+    finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
     return replace(finished, warnings=_warnings(finished, start, tables_rms))
 
 
@@ -91,6 +93,25 @@ def _refuse_contradiction(lens: ZoomLens, each: Array) -> None:
         f"no lens fits all the settings: the networks give no camera at {where}; check the names, the unit "
         "of X,Y,Z and the image size of every setting"
     )
+
+
+def refuse_gaps(lens: ZoomLens, source: str) -> None:
+    """Refuse networks that give no camera between their own settings.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        It names a setting that is far from the others.
+    """
+    try:
+        lens.predict(middles(lens.settings))
+    except InputError as error:
+        cause = far_value(lens.controls, lens.settings)
+        raise DegenerateGeometryError(
+            f"{source}: the networks give no camera between some of the settings"
+            + (f"; {cause}" if cause else "")
+            + "; check the numbers and units of the settings, or give more of them"
+        ) from error
 
 
 def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> tuple[str, ...]:

@@ -126,3 +126,28 @@ def describe(controls: tuple[str, ...], setting: Array) -> str:
 def scaled_controls(settings: Array, low: Array, high: Array) -> Array:
     """Scale settings (..., D) to -1 to 1 over the calibrated range from low to high (D,)."""
     return 2 * (np.asarray(settings, dtype=float) - low) / (high - low) - 1
+
+
+def middles(settings: Array) -> Array:
+    """Middles between each setting (S, D) and its nearest neighbours, one for each control; (M, D)."""
+    low, high = settings.min(axis=0), settings.max(axis=0)
+    scaled = (settings - low) / np.maximum(high - low, 1e-300)
+    apart = np.abs(scaled[:, None] - scaled)
+    found = [np.zeros((0, settings.shape[1]))]
+    for k in range(settings.shape[1]):
+        # The nearest setting with another value of this control, preferably with the same other value.
+        distance = np.where(apart[..., k] > 0, 2 * apart.sum(axis=2) - apart[..., k], np.inf)
+        nearest = distance.argmin(axis=1)
+        known = np.isfinite(distance.min(axis=1))
+        found.append(0.5 * (settings + settings[nearest])[known])
+    return np.concatenate(found)
+
+
+def far_value(controls: tuple[str, ...], settings: Array) -> str | None:
+    """Text about a value that is farther from the others than these are from each other, or None."""
+    for name, column in zip(controls, settings.T, strict=True):
+        values = np.unique(column)
+        for far, near in ((values[-1], values[:-1]), (values[0], values[1:])):
+            if 0 < np.ptp(near) < np.abs(near - far).min():
+                return f"{name} {far:.10g} is far from the others, {near[0]:.10g} to {near[-1]:.10g}"
+    return None

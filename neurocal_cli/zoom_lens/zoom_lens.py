@@ -100,6 +100,8 @@ class ZoomLens:
         The target estimated from several settings together, to which the lens was fitted.
     target_coupling : (S, L + Q, r) array or None
         Effect of the target's uncertainty on each setting; see `zoom_lens.target_coupling`.
+    free_pose_px : float [px]
+        Of a still camera: the noise floor if each view had a pose of its own; nan where unknown.
     """
 
     controls: tuple[str, ...]
@@ -126,6 +128,7 @@ class ZoomLens:
     warnings: tuple[str, ...] = ()
     target: Target | None = None
     target_coupling: Array | None = None
+    free_pose_px: float = np.nan
 
     @property
     def low(self) -> Array:
@@ -194,7 +197,13 @@ class ZoomLens:
                 has = " and ".join(self.controls)
                 verb = "needs a value of" if value is None else "does not change with"
                 raise UsageError(f"this lens {verb} {name}; it was calibrated over {has}")
-        setting = np.array([values[name] for name in self.controls], dtype=float)
+        return self.check_setting(
+            np.array([values[name] for name in self.controls], dtype=float), extrapolate
+        )
+
+    def check_setting(self, setting: Array, extrapolate: bool = False) -> tuple[Array, list[str]]:
+        """Check a setting (D,) in the order of the controls; otherwise as `setting_of`."""
+        setting = self._numbers(setting, 1)
         if not np.isfinite(setting).all():
             raise InputError("the setting must be finite numbers; correct it")
         outside = [
@@ -206,15 +215,35 @@ class ZoomLens:
             raise InputError(f"{'; '.join(outside)}; choose a setting inside it, or give --extrapolate")
         return setting, [f"{text}: the networks extrapolate there" for text in outside]
 
+    def _numbers(self, settings: Array, dimensions: int) -> Array:
+        """One setting or several as an array of one or two dimensions.
+
+        Raises
+        ------
+        InputError
+        """
+        try:
+            found = np.asarray(settings, dtype=float)
+        except (TypeError, ValueError):
+            found = np.zeros(0)
+        D = len(self.controls)
+        if found.ndim != dimensions or found.shape[-1] != D:
+            raise InputError(
+                f"this lens has {D} control{'s' * (D > 1)}, {' and '.join(self.controls)}; give "
+                f"{['a list', 'rows'][dimensions - 1]} of {D} number{'s' * (D > 1)}"
+            )
+        return found
+
     def predict(self, settings: Array) -> Prediction:
         """Predict parameters at settings (n, D), with covariances.
 
         Raises
         ------
         InputError
-            A scale factor is not positive, which happens only far outside the calibrated range.
+            The settings are not of shape (n, D), or a scale factor is not positive, which happens only far
+            outside the calibrated range.
         """
-        x = self.scaled(np.asarray(settings, dtype=float))
+        x = self.scaled(self._numbers(settings, 2))
         pairs = [member.nets.local_with_jacobian(x) for member in self.members]
         locals_ = np.array([local for local, _ in pairs])
         valid = (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
