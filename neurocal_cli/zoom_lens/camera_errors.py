@@ -26,8 +26,8 @@ _LEAST_STD = 1e-6  # of a parameter without errors, as a share of the parameter
 _LEAST_FREEDOM, _ENOUGH_FREEDOM = 2.0, 4.0
 _SMOOTH = 3  # weights for each control of a smooth parameter
 _TAU2 = 1e-8 * 10 ** np.arange(0.0, 9.0, 0.125)
-# Limit of a deletion residual with many degrees of freedom, and how it grows with few: none of 120 good tables
-# exceeds it. Repeated by the same test.
+# Limit of a deletion residual with many degrees of freedom, and how it grows with few: none of 120 good
+# tables exceeds it. Repeated by the same test.
 _ODD, _ODD_GROWTH = 6.0, 10.0
 
 
