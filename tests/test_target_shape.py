@@ -9,7 +9,7 @@ import pytest
 from support.slow_cases import slow_but
 from support.targets import SHAPES, board, offsets, photographed
 
-from neurocal_cli import calibrate
+from neurocal_cli import Camera, Intrinsics, calibrate
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
@@ -347,6 +347,21 @@ def test_some_of_many_views_tell_whether_a_model_is_too_simple(
     found = find_target([fit])
     assert found is not None
     assert named_lens_is_too_simple([fit], found) == too_simple
+
+
+def test_a_given_camera_with_distortion_finds_the_target_as_well() -> None:
+    points, truth = photographed("parabola", 2, 8, 0.5)
+    lens = Distortion("k1k2", truth.k)
+    K = Intrinsics.from_matrix(truth.K)
+    found = calibrate(points, type=3, intrinsics=Camera(K, lens, points.image_size))
+    assert found.target is not None
+    assert found.rmse_px < 0.16  # 0.1 px in u and in v
+    assert shape_error(found, truth.found) < 0.05  # mm; the board is bent by 0.5 mm
+    of_views = [
+        (view.pose.t - t) / [view.std[name] for name in ("t_x", "t_y", "t_z")]
+        for view, t in zip(found.views.values(), truth.t, strict=True)
+    ]
+    assert np.sqrt(np.square(of_views).mean()) < 2.0
 
 
 def test_given_poses_find_the_target_as_well() -> None:
