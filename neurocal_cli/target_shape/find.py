@@ -352,6 +352,7 @@ def at_world(
 ) -> tuple[Problem, Adjusted]:
     """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
-    if not problem.free_distortion and state.model != "none":  # given, and still in the pixels of the fit
+    if not problem.free_distortion and state.model != "none":
+        # The state contains the given distortion, but `with_points` has removed it from the pixels.
         new = new.with_seen_pixels()
     return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))

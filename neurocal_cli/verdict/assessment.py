@@ -49,6 +49,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
+from neurocal_cli.points import Correspondences
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
@@ -146,7 +147,7 @@ class _AtMinimum:
             self.camera.distortion.model,
             self.camera.distortion.coefficients,
         )
-        self.views = self._arranged()
+        self.views = self._arranged(self.points)
         self.free = estimated_parameters(calibration)
         if xi_is_flat(calibration.distortion_model, calibration.distortion):
             self.free[5] = False  # xi: alpha and alpha_u determine what is projected
@@ -170,10 +171,11 @@ class _AtMinimum:
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
         self.covariance, self.wide = known.found.entries, known.wide
 
-    def _arranged(self) -> Views:
-        if self.points.covariance is None:
-            return arrange(self.points)
-        return weighed(self.points, -self._residuals())
+    def _arranged(self, points: Correspondences) -> Views:
+        """The points, at these or other world coordinates, with the weights that the residuals bear out."""
+        if points.covariance is None:
+            return arrange(points)
+        return weighed(points, -self._residuals())
 
     def evidence(self) -> Evidence:
         """All measures that the rules use."""
@@ -216,7 +218,7 @@ class _AtMinimum:
         target, p = self.calibration.target, {"p1", "p2"} - given
         if target is None and p.isdisjoint(coefficient_names(self.state.model)):
             return found
-        views = self.views if target is None else arrange(target.as_given(self.points))
+        views = self.views if target is None else self._arranged(target.as_given(self.points))
         simpler = reestimate_centre(
             views, normalised(self.given, views), given, self.free_poses, self.cost / self.spare
         )

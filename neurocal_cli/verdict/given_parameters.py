@@ -69,12 +69,12 @@ def reestimate_given(
     free_k : (K,) bool array, optional
         Distortion coefficients that are estimated with them. Default: none.
     variance : float, optional
-        Largest variance of the residuals.
+        Largest variance of the residuals, normalised, with which the points count as explained.
 
     Returns
     -------
     tuple of Reestimated
-        Empty if none is given, or if the points do not determine them or are not explained.
+        Empty if none is given, or if the points do not determine them, or are not explained by them.
     """
     if given.isdisjoint(_NAMES):
         return ()
