@@ -56,23 +56,12 @@ class UsageError(NeurocalError):
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuse a value that is not one of an option's choices.
-
-    Raises
-    ------
-    UsageError
-        It names the option and its values.
-    """
+    """Refuse a value that is not one of an option's choices, with a UsageError that names them."""
     if value not in choices:
         raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
 
 
 def check_seed(seed: object) -> None:
-    """Refuse a seed that NumPy's generators do not take.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a seed that NumPy's generators do not take, with a UsageError."""
     if not isinstance(seed, Integral) or int(seed) < 0:  # NumPy's integers are Integral, too
         raise UsageError("seed must be a whole number of at least 0")

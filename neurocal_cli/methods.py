@@ -211,10 +211,7 @@ def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> t
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
     """Estimate the poses of a given camera's views (type 3) from all points, without outlier rejection.
 
-    Raises
-    ------
-    InputError, DegenerateGeometryError
-        Points that do not determine the poses.
+    Raises InputError or DegenerateGeometryError if the points do not determine the poses.
     """
     given = camera_of(camera)
     problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)

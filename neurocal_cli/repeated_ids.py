@@ -9,13 +9,7 @@ from numpy.typing import NDArray
 
 
 def first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] | None:
-    """Find the first row whose id occurred in its view before, and that earlier row; None if there is none.
-
-    Parameters
-    ----------
-    view : (N,) int array
-    ids : (N,) labels
-    """
+    """Find the first row whose id occurred in its view before, and that earlier row, if there is one."""
     ids = ids.astype(str, copy=False)
     hashes = _hashes(view, ids)
     ordered = np.sort(hashes)

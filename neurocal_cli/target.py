@@ -30,41 +30,20 @@ class Target:
     """Points of a target, given and estimated.
 
     Images determine the shape only up to a similarity transformation. Therefore the estimated points are
-    rotated, moved and scaled as a whole to be nearest to the given ones.
-
-    Attributes
-    ----------
-    given, found : (n, 3) array [world unit]
-    std : (n, 3) array [world unit]
-        Standard deviations of the estimated points, along the world's axes.
-    plane : (n,) int array
-        Index of the plane of the target to which each point belongs.
-    sizes : dict of float [world unit]
-        Prior standard deviation of each part of the offsets, estimated from the data; see
-        `target_shape.prior`.
-    flat : bool
-        Whether the points were kept in their plane.
-    evidence : float
-        Gain in log evidence (marginal likelihood) over the given target.
-    point : (n,) labels, optional
-        Ids.
-    stated : (n, 3) array, optional [world unit]
-        Standard deviations of the given points, if a survey states them. They then weight the distances from
-        the given points, and `sizes` holds the factor by which they were scaled.
-    bends : Bends, optional
-        Additional bend in each view, for a board that bends differently each time.
+    rotated, moved and scaled as a whole to be nearest to the given ones. Stated standard deviations weight
+    the distances from the given points, and `sizes` then holds the factor by which they were scaled.
     """
 
-    given: Array
-    found: Array
-    std: Array
-    plane: NDArray[np.intp]
-    sizes: Mapping[str, float]
-    flat: bool
-    evidence: float
-    point: NDArray[np.str_] | None = None
-    stated: Array | None = None
-    bends: Bends | None = None
+    given: Array  # (n, 3) [world unit]
+    found: Array  # (n, 3) [world unit]
+    std: Array  # (n, 3) [world unit] of the estimated points, along the world's axes
+    plane: NDArray[np.intp]  # (n,) index of the plane of the target to which each point belongs
+    sizes: Mapping[str, float]  # [world unit] prior std of each part of the offsets, see `target_shape.prior`
+    flat: bool  # whether the points were kept in their plane
+    evidence: float  # gain in log evidence (marginal likelihood) over the given target
+    point: NDArray[np.str_] | None = None  # (n,) ids
+    stated: Array | None = None  # (n, 3) [world unit] stds of the given points, if a survey states them
+    bends: Bends | None = None  # of each view, for a board that bends differently each time
 
     @property
     def offsets(self) -> Array:
@@ -175,19 +154,9 @@ class Target:
 
 
 def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
-    """Convert a target that is a chessboard to a `Board` with its estimated points.
+    """Convert a target that is a chessboard to a `Board` with its estimated points and measured distances.
 
-    Parameters
-    ----------
-    target : Target
-    unit : str
-    distances : tuple of Distance
-        Distances measured on it.
-
-    Raises
-    ------
-    InputError
-        The points have no ids of a chessboard.
+    Raises InputError if the points have no ids of a chessboard.
     """
     if target.point is None:
         raise InputError(
@@ -205,10 +174,7 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
 def scale_of(points: Correspondences) -> Scale:
     """The scale of the points according to the distances measured on their board.
 
-    Raises
-    ------
-    InputError
-        The points or distances do not belong to a chessboard.
+    Raises InputError if the points or distances do not belong to a chessboard.
     """
     if not points.distances:
         return NO_SCALE

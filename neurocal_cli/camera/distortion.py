@@ -50,13 +50,7 @@ _PINHOLES = {
 
 
 def coefficient_names(model: str) -> tuple[str, ...]:
-    """Names of a model's coefficients, in order.
-
-    Raises
-    ------
-    InputError
-        There is no such model.
-    """
+    """Names of a model's coefficients, in order; an InputError for an unknown model."""
     if model not in MODELS:
         raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")
     return MODELS[model]
@@ -111,18 +105,9 @@ def pinhole_coefficients(model: str) -> Array:
 
 
 def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Distort normalised image points.
+    """Distorted points x', y' of normalised image points x, y, arrays of one shape.
 
-    Parameters
-    ----------
-    model : str
-    k : sequence of coefficients
-        Each a number or an array that broadcasts against x.
-    x, y : arrays of one shape
-
-    Returns
-    -------
-    x', y' : arrays of that shape
+    Each coefficient is a number or an array that broadcasts against x.
     """
     if model in WIDE:
         seen = project_directions(model, k, x, y, np.ones_like(x), by_coefficients=False)
@@ -131,16 +116,7 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
 
 
 def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Distorted:
-    """Distort normalised image points, with derivatives.
-
-    Returns
-    -------
-    point : (x', y')
-    by_point : four arrays
-        dx'/dx, dx'/dy, dy'/dx, dy'/dy.
-    by_coefficient : list of pairs of arrays
-        dx', dy' by each coefficient.
-    """
+    """The same with derivatives, as `Distorted`."""
     if model in WIDE:
         seen = project_directions(model, k, x, y, np.ones_like(x))
         return (seen.x, seen.y), (*seen.by_x[:2], *seen.by_y[:2]), seen.by_coefficient

@@ -52,20 +52,10 @@ def monotonic_radius(distortion: Distortion) -> float:
 
 
 def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
-    """Derivative of the distorted radius by the undistorted one; for a fisheye, by the angle.
+    """Derivative (m,) of the distorted radius by the undistorted one r (m,); for a fisheye, by the angle r.
 
-    Parameters
-    ----------
-    model : str
-    k : (K,) array
-    r : (m,) array
-        Undistorted radii, or a fisheye's angles.
-
-    Returns
-    -------
-    slope : (m,) array
-        Without tangential terms; its first zero is at `monotonic_radius`.
-    by_k : (m, K) array
+    Tangential terms are ignored; its first zero is at `monotonic_radius`. The second result are its
+    derivatives (m, K) by the coefficients.
     """
     s = r[:, None] ** 2
     if model == "fisheye":
@@ -123,23 +113,10 @@ def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_
 def undistort(
     distortion: Distortion, x: Array, y: Array, near: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array]:
-    """Undistort normalised image points: the inverse of `distort` where the model is monotonic.
+    """Undistort normalised image points: the inverse of `distort` where the model is monotonic, else ``nan``.
 
     Newton's method starts from the inverse of the model without tangential terms, so that it finds no
-    spurious point and misses no true one.
-
-    Parameters
-    ----------
-    distortion : Distortion
-    x, y : arrays of one shape
-        Distorted points.
-    near : two arrays of that shape, optional
-        Undistorted points nearby, to start from.
-
-    Returns
-    -------
-    x, y : arrays of that shape
-        ``nan`` if a point has no undistorted one.
+    spurious point and misses no true one; or from undistorted points nearby, if they are given.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if distortion.is_identity:

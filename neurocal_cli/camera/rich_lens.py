@@ -33,16 +33,7 @@ _LEAST_RADIUS = 1e-6  # |s| below which a direction is on the axis
 
 
 class Displacement(NamedTuple):
-    """A displacement with its derivatives.
-
-    Attributes
-    ----------
-    x, y : arrays
-    by_x, by_y : three arrays each
-        By X, Y, Z.
-    by_coefficient : list of pairs of arrays
-        By each of `NAMES`; empty if not requested.
-    """
+    """A displacement with its derivatives by X, Y, Z and by each of `NAMES`, these only if requested."""
 
     x: Array
     y: Array
@@ -52,16 +43,9 @@ class Displacement(NamedTuple):
 
 
 def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool = True) -> Displacement:
-    """The displacement in the given directions.
+    """The displacement with the coefficients `NAMES` in directions X, Y, Z, arrays of one shape in any unit.
 
-    Parameters
-    ----------
-    k : (n,) array
-        The coefficients `NAMES`.
-    X, Y, Z : arrays of one shape
-        In any unit; only the direction matters.
-    by_coefficients : bool
-        Whether to compute the derivatives by the coefficients, of which there are hundreds.
+    The derivatives by the coefficients, of which there are hundreds, are optional.
     """
     k, shape = np.asarray(k, dtype=float), X.shape
     X, Y, Z = X.ravel(), Y.ravel(), Z.ravel()
@@ -170,14 +154,10 @@ def _field(f: Array, sx: Array, sy: Array, lx: float, ly: float) -> _Field:
 
 
 def _basis(t: Array, lowest: int, highest: int) -> tuple[NDArray[np.intp], Array, Array]:
-    """The four nonzero cubic B-splines at positions t, in units of the node spacing.
+    """The four nonzero cubic B-splines at positions t (N,), in units of the node spacing.
 
-    Returns
-    -------
-    node : (N,) int array
-        The node before t, clipped to the given limits; beyond them the values are those at the limit.
-    weights, slopes : (4, N) arrays
-        Of the nodes node - 1 to node + 2.
+    Returns the node (N,) before t, clipped to the given limits, beyond which the values are those at the
+    limit; and the weights and slopes (4, N) of the nodes node - 1 to node + 2.
     """
     t = np.clip(np.nan_to_num(t), lowest, highest + 1)
     node = np.minimum(np.floor(t), highest)

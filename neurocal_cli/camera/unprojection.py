@@ -61,21 +61,9 @@ def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[
 
 
 def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Directions that a wide lens maps to distorted points.
+    """Unit vectors X, Y, Z that a wide lens maps to distorted points x, y of one shape; else ``nan``.
 
     Newton's method on the unit sphere starts from the inverse of the model without tangential terms.
-
-    Parameters
-    ----------
-    distortion : Distortion
-        Of a wide model.
-    x, y : arrays of one shape
-        Distorted points.
-
-    Returns
-    -------
-    X, Y, Z : arrays of that shape
-        Of unit length; ``nan`` if a point has no direction.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     k, limit = distortion.coefficients, largest_angle(distortion)
