@@ -64,32 +64,15 @@ _LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; al
 
 @frozen_dataclass(eq=False)
 class Candidate:
-    """A distortion model fitted to the points.
+    """A distortion model fitted to the points."""
 
-    Attributes
-    ----------
-    problem : Problem
-        With this model, and a penalty that keeps it monotonic if needed.
-    adjusted : Adjusted
-    lost : array
-        Cross-validation: squared error of each part of the data when it is held out.
-    noise : bool
-        Whether its coefficients are only noise.
-    not_monotonic : str or None
-        Where it is not monotonic: within the "points" or within the "image".
-    determined : bool
-        Whether the points determine all parameters.
-    weak : bool
-        Whether a focal length is so poorly determined that other local minima may be lower.
-    """
-
-    problem: Problem
+    problem: Problem  # with this model, and a penalty that keeps it monotonic if needed
     adjusted: Adjusted
-    lost: Array
-    noise: bool
-    not_monotonic: str | None
-    determined: bool
-    weak: bool
+    lost: Array  # cross-validation: squared error of each part of the data when it is held out
+    noise: bool  # whether its coefficients are only noise
+    not_monotonic: str | None  # where it is not monotonic: within the "points" or within the "image"
+    determined: bool  # whether the points determine all parameters
+    weak: bool  # whether a focal length is so poorly determined that other local minima may be lower
 
     @property
     def sound(self) -> bool:
@@ -133,14 +116,8 @@ def fit_candidates(
 ) -> dict[str, Candidate]:
     """Fit every model, starting from a state of any of them.
 
-    Parameters
-    ----------
-    problem : Problem
-    state : CameraState
-    by_views : bool
-        Whether cross-validation holds out views or points.
-    wanted : str, optional
-        The only model of interest; the others serve as starts and need not be monotonic.
+    Cross-validation holds out views or points. If only one model is wanted, the others serve as starts and
+    need not be monotonic.
     """
     return _Chain(problem, by_views, radius(problem.views, state), wanted=wanted).all_from(state)
 
@@ -160,21 +137,11 @@ def judged_again(
 
 @frozen_dataclass(eq=False)
 class _Chain:
-    """Fits a chain of models to one problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    by_views : bool
-    reach : float
-        Normalised radius of the farthest point.
-    repeated : RepeatedPoses, optional
-    wanted : str, optional
-    """
+    """Fits a chain of models to one problem."""
 
     problem: Problem
     by_views: bool
-    reach: float
+    reach: float  # normalised radius of the farthest point
     repeated: RepeatedPoses | None = None
     wanted: str | None = None
 

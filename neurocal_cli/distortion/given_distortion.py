@@ -20,10 +20,8 @@ def check_distortion(solution: Solution) -> Solution:
     An estimated distortion that is not monotonic in parts of the image without points is fitted again so that
     it is, unless the points contradict that.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The estimated distortion is not monotonic among the points, or cannot be made so within the image.
+    Raises DegenerateGeometryError if the estimated distortion is not monotonic among the points, or cannot be
+    made so within the image.
     """
     problem = solution.problem
     distortion = problem.distortion

@@ -66,19 +66,10 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which anothe
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
     """Fit all models, starting from a solution with any of them, and select one.
 
-    Parameters
-    ----------
-    solution : Solution
-    more_starts : callable, optional
-        Yields other starting states for a problem, in case the first leads to a local minimum.
-    preferred : str
-        A model to select unless another predicts decidedly better.
-
-    Returns
-    -------
-    Solution
-        With the cross-validation errors of all fitted models. It is a refusal if the distortion is strong and
-        the model that fits is not monotonic inside the image.
+    `more_starts` yields other starting states for a problem, in case the first leads to a local minimum. The
+    `preferred` model is selected unless another predicts decidedly better. The result has the
+    cross-validation errors of all fitted models. It is a refusal if the distortion is strong and the model
+    that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
@@ -250,15 +241,9 @@ def _decidedly(
 def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
     """Whether a fit predicts held-out data better than another by a given factor, and significantly.
 
-    The significance is that of the mean log ratio over the folds, so that no single fold dominates.
-
-    Parameters
-    ----------
-    lost, others : arrays
-        Squared error of each part of the data when it is held out.
-    repeated : RepeatedPoses
-    enough : float
-        Least ratio of the other's rms error to this one's.
+    `lost` and `others` are the squared errors of each part of the data when it is held out, `enough` the
+    least ratio of the other's rms error to this one's. The significance is that of the mean log ratio over
+    the folds, so that no single fold dominates.
     """
     by_fold = [np.maximum(_by_fold(array, repeated), 1e-300) for array in (lost, others)]
     if not by_fold[1].sum() > enough**2 * by_fold[0].sum():

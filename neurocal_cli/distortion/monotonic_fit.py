@@ -55,21 +55,11 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @frozen_dataclass(eq=False)
 class MonotonicFit:
-    """`Penalty` for a distortion that is not monotonic.
+    """`Penalty` for a distortion that is not monotonic."""
 
-    Attributes
-    ----------
-    radii : (m,) array
-        Undistorted radii, or a fisheye's angles.
-    weight : float
-        w, in normalised pixels.
-    least : float
-        s0.
-    """
-
-    radii: Array
-    weight: float
-    least: float
+    radii: Array  # (m,) undistorted radii, or a fisheye's angles
+    weight: float  # w, in normalised pixels
+    least: float  # s0
 
     @_quietly
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
@@ -134,19 +124,10 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
 
 @_quietly
 def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted] | None:
-    """Fit a distortion again so that it is monotonic inside the image.
+    """Fit a distortion again so that it is monotonic inside the image, whose size the points know.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its points know the image size.
-    found : Adjusted
-        The best fit, which is monotonic among the points but not within the image.
-
-    Returns
-    -------
-    problem, adjusted
-        The problem with its penalty; None if the data contradict every such distortion.
+    Starts from the best fit, which is monotonic among the points. The resulting problem has the penalty; None
+    if the data contradict every such distortion.
     """
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))

@@ -36,12 +36,8 @@ _LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Solution:
     """The better of a solution and the results of other starts, if it may be a local minimum.
 
-    Parameters
-    ----------
-    solution : Solution
-        Returned unchanged if no distortion is estimated.
-    more_starts : callable
-        Yields other starting states for a problem.
+    A solution without an estimated distortion is returned unchanged. `more_starts` yields other starting
+    states for a problem.
     """
     problem = solution.problem
     # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.

@@ -29,19 +29,7 @@ PANORAMAS = ("cylinder", "equirectangular")
 class Panorama:
     """An image on a cylinder or a sphere around the camera.
 
-    Parameters
-    ----------
-    shape : {"cylinder", "equirectangular"}
-    f : float [px/rad]
-    u0, v0 : float [px]
-        Pixel of the z axis.
-    image_size : (width, height) [px]
-    name : str
-
-    Raises
-    ------
-    InputError
-        Another shape, or a scale that is not positive.
+    Raises InputError for another shape, or a scale that is not positive.
 
     Examples
     --------
@@ -53,11 +41,11 @@ class Panorama:
     array([[0.8944, 0.4472, 0.    ]])
     """
 
-    shape: str
-    f: float
-    u0: float
+    shape: str  # one of `PANORAMAS`
+    f: float  # px/rad
+    u0: float  # px; with v0 the pixel of the z axis
     v0: float
-    image_size: tuple[int, int]
+    image_size: tuple[int, int]  # (width, height) [px]
     name: str = "camera"
 
     def __post_init__(self) -> None:

@@ -22,20 +22,12 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 def averaged_over_sizes(
     covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]
 ) -> Array:
-    """Covariance of the shared parameters, averaged over the priors of the profile.
+    """Covariance (f, f) of the shared parameters, averaged over the priors of the profile.
 
-    Parameters
-    ----------
-    covariance : (f, f) array
-        For one of the priors.
-    H, right : (f, f) and (f,) arrays
-        Precision, and the gradient at the reported values, without the profile's prior.
-    profile : slice
-        Places of the profile among the f parameters.
-    value : (n,) array
-        The reported profile.
-    priors : (m, n, n) and (m,) arrays
-        Prior covariances, and the logarithms of their prior probabilities.
+    `covariance` is that for one of the priors; H (f, f) and `right` (f,) are the precision, and the gradient
+    at the reported values, without the profile's prior; `profile` are the places of the profile among the f
+    parameters and `value` (n,) the reported one; `priors` are prior covariances (m, n, n) and the logarithms
+    (m,) of their prior probabilities.
     """
     is_profile = np.zeros(len(H), dtype=bool)
     is_profile[profile] = True

@@ -59,17 +59,9 @@ _NEARLY = 0.1  # change of the log evidence that ends the rounds
 
 
 def with_displacement(solution: Solution) -> Solution:
-    """Fit a rich lens, starting from a fisheye or a rich lens.
+    """Fit a rich lens, starting from a fisheye or a rich lens at the minimum, or near it.
 
-    Parameters
-    ----------
-    solution : Solution
-        At the minimum, or near it.
-
-    Returns
-    -------
-    Solution
-        The penalty of its problem is the prior; `shared` is the covariance with the prior.
+    The penalty of the resulting problem is the prior; `shared` is the covariance with the prior.
     """
     solution = _by_evidence(_begun(solution))
     if solution.problem.points.covariance is not None:
@@ -80,12 +72,7 @@ def with_displacement(solution: Solution) -> Solution:
 def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
     """Predicted squared error (V,) of held-out views with a rich lens, without adjusting one.
 
-    Parameters
-    ----------
-    solution : Solution
-        A fisheye, at the minimum.
-    repeated : RepeatedPoses
-        Views of one pose are held out together.
+    The solution is a fisheye, at the minimum. Views of one pose are held out together.
     """
     solution = _begun(solution)
     problem, state = solution.problem, solution.state
@@ -131,21 +118,11 @@ def _extent(directions: Array) -> Array:
 
 @frozen_dataclass(eq=False)
 class _Prior:
-    """The prior of k1 to k4 and the nodes, a `Penalty`.
+    """The prior of k1 to k4 and the nodes, a `Penalty`."""
 
-    Attributes
-    ----------
-    rows : (n, n) array
-        Square root of the precision: extra residuals of k1 to k4 and the nodes.
-    sizes : array
-        Of the processes, in units of x'.
-    scale : float
-        Rms residual of the fisheye, in the same unit.
-    """
-
-    rows: Array
-    sizes: Array
-    scale: float
+    rows: Array  # (n, n) square root of the precision: extra residuals of k1 to k4 and the nodes
+    sizes: Array  # of the processes, in units of x'
+    scale: float  # rms residual of the fisheye, in the same unit
 
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Jacobian (m, 5 + K) and residuals (m,)."""
@@ -198,21 +175,11 @@ def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Pr
 
 @frozen_dataclass(eq=False)
 class _Processes:
-    """The Gaussian processes of the prior.
+    """The Gaussian processes of the prior."""
 
-    Attributes
-    ----------
-    profile : (p, n, n) array
-    field : (f, m, m) array
-        Covariances of processes of size 1; the field's are the same for both directions.
-    of_fisheye : (4,) array
-        Standard deviations of k1 to k4.
-    scale : float
-    """
-
-    profile: Array
-    field: Array
-    of_fisheye: Array
+    profile: Array  # (p, n, n) covariances of processes of size 1
+    field: Array  # (f, m, m) the same, for both directions
+    of_fisheye: Array  # (4,) standard deviations of k1 to k4
     scale: float
 
     def inverses(self, sizes: Array) -> tuple[Array, Array]:
@@ -250,30 +217,17 @@ def _alike(distance: Array, length: float) -> Array:
 class _Found:
     """Estimated sizes of the processes, with the resulting posterior.
 
-    Attributes
-    ----------
-    sizes, gamma : arrays
-        Size of each process in units of x', and its effective number of unknowns determined by the points.
-    precision : (n, n) array
-        P, of k1 to k4 and the nodes, in units of the squared residuals.
-    covariance : (f, f) array
-        Of the free shared parameters.
-    determined : float
-        Effective number of the nodes' unknowns that the points determine.
-    variance : float
-        Of the residuals.
-    S, g : (f, f) and (f,) arrays
-        Quadratic model of the squared error around the state, with the poses eliminated.
+    S and g are the quadratic model of the squared error around the state, with the poses eliminated.
     """
 
-    sizes: Array
-    gamma: Array
-    precision: Array
-    covariance: Array
-    determined: float
-    variance: float
-    S: Array
-    g: Array
+    sizes: Array  # of each process, in units of x'
+    gamma: Array  # effective number of unknowns of each process that the points determine
+    precision: Array  # (n, n) P, of k1 to k4 and the nodes, in units of the squared residuals
+    covariance: Array  # (f, f) of the free shared parameters
+    determined: float  # effective number of the nodes' unknowns that the points determine
+    variance: float  # of the residuals
+    S: Array  # (f, f)
+    g: Array  # (f,)
 
 
 def _sizes(

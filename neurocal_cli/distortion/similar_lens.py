@@ -37,17 +37,8 @@ def similar_states(
 ) -> list[CameraState]:
     """States of another model with nearly the same image, the most similar first; same poses and centre.
 
-    Parameters
-    ----------
-    state : CameraState
-        Of one camera.
-    model : str
-        A model with coefficients.
-    farthest : float
-        Largest angle from the axis that is compared [rad].
-    xi : array, optional
-        For a model with xi: return one state for each of these values, in their order, without those that
-        have no similar lens.
+    The state is of one camera, and angles up to the `farthest` [rad] are compared. If values of xi are given,
+    there is one state for each of them, in their order, without those that have no similar lens.
     """
     if (same := _with_more_coefficients(state, model)) is not None:
         return [same]

@@ -32,19 +32,11 @@ _MOST_STEPS = 15
 
 @frozen_dataclass(eq=False)
 class LineImages:
-    """Images of the points on lines, in any unit and from any origin.
-
-    Attributes
-    ----------
-    lines : CollinearPoints
-    pixels : (M, 2) array
-        Of each point on each line.
-    whitening : (M, 3) array or None
-        Entries (0, 0), (0, 1), (1, 1) of the factor that whitens a pixel's error.
-    """
+    """Images of the points on lines, in any unit and from any origin."""
 
     lines: CollinearPoints
-    pixels: Array
+    pixels: Array  # (M, 2) of each point on each line
+    # (M, 3) entries (0, 0), (0, 1), (1, 1) of the factor that whitens a pixel's error.
     whitening: Array | None
 
     def whiten(self, u: Array, v: Array) -> tuple[Array, Array]:
@@ -60,27 +52,14 @@ class LineImages:
 
 @frozen_dataclass(eq=False)
 class DistortedLines:
-    """Straight lines and their distorted images.
+    """Straight lines and their distorted images."""
 
-    Attributes
-    ----------
-    images : LineImages
-        Observed points.
-    entries : (5,) array
-        A11, A12, A22, A13, A23 of the camera.
-    distortion : Distortion
-    base, along : (L, 2) arrays
-        A point and the direction of each line in the normalised image.
-    feet : (M,) array
-        t of each point.
-    """
-
-    images: LineImages
-    entries: Array
+    images: LineImages  # observed points
+    entries: Array  # (5,) A11, A12, A22, A13, A23 of the camera
     distortion: Distortion
-    base: Array
-    along: Array
-    feet: Array
+    base: Array  # (L, 2) a point of each line in the normalised image
+    along: Array  # (L, 2) direction of each line
+    feet: Array  # (M,) t of each point
 
     def with_camera(self, entries: Array, coefficients: Array) -> DistortedLines:
         """The same lines with other entries of A and other coefficients of the same model."""
@@ -133,16 +112,10 @@ class DistortedLines:
             return bool(np.isfinite(at.errors()).all() and (at.determinant > 0).all())
 
     def derivatives(self) -> tuple[Array, Array, Array]:
-        """Errors, and their derivatives by A and the distortion.
+        """Errors r (M,), their derivatives by A and the distortion, and their directions nu (M, 2).
 
-        Returns
-        -------
-        r : (M,) array
-        J : (M, 5 + K) array
-            Minus the derivative of r by A's entries and the coefficients, with the parameters of each
-            line eliminated.
-        nu : (M, 2) array
-            Direction of each error in the whitened image.
+        The second result J (M, 5 + K) is minus the derivative of r by A's entries and the coefficients, with
+        the parameters of each line eliminated. The directions are in the whitened image.
         """
         at = _Images(self)
         J = at.columns()

@@ -27,12 +27,9 @@ _NARROW = 1e-3  # rad
 
 
 class Field(NamedTuple):
-    """Field of view of an image along the row and the column of its optical axis [rad].
+    """Field of view of an image along the row and the column of its optical axis, as angles from it [rad].
 
-    Attributes
-    ----------
-    left, right, top, bottom : float
-        Angles from the axis; left and top are negative.
+    Those to the left and the top are negative.
     """
 
     left: float
@@ -55,13 +52,7 @@ class Field(NamedTuple):
 
 
 def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
-    """The field of view of images of some size.
-
-    Raises
-    ------
-    InputError
-        The camera has no rays along that row or column.
-    """
+    """The field of view of images of some size; an InputError if that row or column has no rays."""
     u0, v0 = _axis(camera, size)
     share, ends = np.linspace(0, 1, _ALONG), []
     for row in (True, False):
@@ -99,24 +90,11 @@ def undistorted_view(
     fov: float | None = None,
     new_size: tuple[int, int] | None = None,
 ) -> Undistorted:
-    """Choose the projection of undistorted images.
+    """Choose the projection of undistorted images, one of `SHAPES`, for images of some size [px].
 
-    Parameters
-    ----------
-    camera : Camera
-    size : (width, height) [px]
-        Of its images.
-    shape : {"plane", "cylinder", "equirectangular"}
-    fov : float, optional [degrees]
-        Field of view from left to right. By default a plane keeps the scale of the image centre; the other
-        shapes show the whole field of view from left to right.
-    new_size : (width, height), optional [px]
-        Of the undistorted images; by default the same.
-
-    Raises
-    ------
-    InputError
-        The shape does not exist, or cannot show that field of view.
+    The field of view is from left to right [degrees]. By default a plane keeps the scale of the image centre;
+    the other shapes show the whole field of view. The undistorted images have the same size, unless a new one
+    is given. Raises InputError if the shape does not exist, or cannot show that field of view.
     """
     if shape not in SHAPES:
         raise InputError(f"the shape must be one of {', '.join(SHAPES)}, not {shape[:40]!r}")

@@ -40,18 +40,9 @@ def undistorted_camera(
 ) -> Camera:
     """The camera of undistorted pixels.
 
-    Parameters
-    ----------
-    camera : Camera
-    alpha : float, optional
-        See `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
-    size : (width, height), optional [px]
-        Of the images, for alpha; else the camera's.
-
-    Raises
-    ------
-    InputError
-        No image size for alpha, or a distortion that leaves no picture.
+    alpha is that of `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
+    The size of the images is needed for alpha, and is by default the camera's. Raises InputError if there is
+    none, or if the distortion leaves no picture.
     """
     size = size or camera.image_size
     intrinsics = plane_like(camera)
@@ -77,16 +68,9 @@ def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array |
 def sources(
     camera: Camera, new: Undistorted, u: Array, v: Array, R: Array | None = None
 ) -> tuple[Array, Array]:
-    """Source pixels of pixels (u, v) of an undistorted image; ``nan`` where there are none.
+    """Source pixels of pixels u, v, arrays of one shape, of an undistorted image; ``nan`` where none is.
 
-    Parameters
-    ----------
-    camera : Camera
-    new : Camera or Panorama
-        Without distortion.
-    u, v : arrays of one shape [px]
-    R : (3, 3) array, optional
-        From the camera's frame to that of the new one, where it is turned as well.
+    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
     """
     X, Y, Z = _directions(new, u, v)
     if R is not None:
@@ -127,23 +111,10 @@ def _distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
     """Camera matrix for undistorted images of the same size, as in OpenCV's getOptimalNewCameraMatrix.
 
-    Parameters
-    ----------
-    camera : Camera
-    size : (width, height) [px]
-    alpha : float
-        0: the largest rectangle of valid pixels fills the image. 1: the image shows all pixels of the
-        distorted one, and the rest is black. Values in between interpolate the two matrices.
-
-    Returns
-    -------
-    intrinsics : Intrinsics
-        Without skew. The ratio of its scale factors is that of the rectangle's sides.
-
-    Raises
-    ------
-    InputError
-        The distortion leaves no rectangle.
+    With alpha = 0 the largest rectangle of valid pixels fills the image. With 1 the image shows all pixels of
+    the distorted one, and the rest is black. Values in between interpolate the two matrices. The result has
+    no skew, and the ratio of its scale factors is that of the rectangle's sides. Raises InputError if the
+    distortion leaves no rectangle.
     """
     width, height = size
     corner = np.array([width - 1, height - 1], dtype=float)
@@ -246,10 +217,7 @@ def chosen_view(
 ) -> Undistorted:
     """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
 
-    Raises
-    ------
-    InputError
-        Both of them, or no image size where one is needed.
+    Raises InputError for both of them, and if there is no image size where one is needed.
     """
     if to == "plane" and fov is None and new_size is None:
         return undistorted_camera(camera, alpha, size)
@@ -275,22 +243,11 @@ def shown(
 def map_points(
     points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
 ) -> Correspondences:
-    """Convert points to the pixels of another camera with the same centre.
+    """Convert points to the pixels of another camera with the same centre, without distortion.
 
-    Parameters
-    ----------
-    points : Correspondences
-        Their covariances and the image centre, where given, are transformed as well.
-    camera : Camera
-    new : Camera or Panorama
-        Without distortion.
-    R : (3, 3) array, optional
-        From the camera's frame to that of the new one, where it is turned as well.
-
-    Raises
-    ------
-    InputError
-        A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
+    Their covariances and the image centre, where given, are transformed as well. R (3, 3) is from the
+    camera's frame to that of the new one, where it is turned as well. Raises InputError for a pixel that the
+    distortion does not reach, or that a plane cannot show, named by its file and line.
     """
     pixels = undistort_pixels(camera, new, points.pixels, R)
     lost = ~np.isfinite(pixels[:, 0])
