@@ -15,25 +15,13 @@ _SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which i
 def smallest(rows: Array, constrained: int) -> Array:
     """Minimise ``|C y + D z|`` over y, and over z with ``|z| = 1``, where ``rows = [C D]``.
 
+    `rows` (K, m, n) are K problems of m equations each, and D are the `constrained` last columns. The result
+    (K, n) is (y, z); its sign is arbitrary for each problem.
+
     QR eliminates y. Then z is the smallest right singular vector of the triangular remainder of D. Faugeras
     and Toscani (1986) do the same with the normal equations, which costs half of the digits.
 
-    Parameters
-    ----------
-    rows : (K, m, n) array
-        K problems of m equations each.
-    constrained : int
-        Number of columns of D, the last ones.
-
-    Returns
-    -------
-    solution : (K, n) array
-        (y, z); the sign is arbitrary for each problem.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The equations do not determine y.
+    Raises DegenerateGeometryError if the equations do not determine y.
     """
     K, m, n = rows.shape
     if m < n:

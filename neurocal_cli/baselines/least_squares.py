@@ -19,14 +19,7 @@ _STEP = 1.5e-8  # relative step of forward differences
 
 @frozen_dataclass(eq=False)
 class Minimum:
-    """A minimum.
-
-    Attributes
-    ----------
-    x : (n,) array
-    iterations : int
-    converged : bool
-    """
+    """The minimum x (n,)."""
 
     x: Array
     iterations: int
@@ -41,16 +34,9 @@ def least_squares(
 ) -> Minimum:
     """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns of views, by a trust region.
 
-    Parameters
-    ----------
-    residuals : callable
-        Maps unknowns (n,) to residuals (m,).
-    start : (n,) array
-    view : (m,) int array, optional
-        View of each residual. Without it, every residual may depend on every unknown.
-    shared : int
-        With `view`: number of the first unknowns, which all views share; the others belong to single views,
-        in order.
+    `residuals` maps unknowns (n,) to residuals (m,), and `view` (m,) is the view of each residual. Without
+    it, every residual may depend on every unknown. With it, the first `shared` unknowns are those that all
+    views share; the others belong to single views, in order.
     """
     from scipy.optimize import least_squares as minimise
 

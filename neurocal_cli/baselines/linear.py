@@ -45,12 +45,8 @@ _FEWEST = 4, 6  # points of a flat and of a solid view
 def linear(problem: Problem) -> Found:
     """Solve a problem in closed form.
 
-    Raises
-    ------
-    UsageError
-        Distortion is to be estimated, which linear calibration cannot.
-    DegenerateGeometryError
-        A view has too few points, or noise leaves no valid camera.
+    Raises UsageError if distortion is to be estimated, which linear calibration cannot, and
+    DegenerateGeometryError if a view has too few points or noise leaves no valid camera.
     """
     if problem.free_distortion:
         raise UsageError("the method linear estimates no distortion; give distortion none, or another method")
@@ -72,18 +68,9 @@ def linear_state(problem: Problem) -> CameraState:
 
 
 def whole_groups(problem: Problem, fewest: tuple[int, int]) -> list[tuple[NDArray[np.intp], bool]]:
-    """Group the views into flat and solid ones; each view must have enough points.
+    """Group the views into flat and solid ones, which need this many points.
 
-    Parameters
-    ----------
-    problem : Problem
-    fewest : (int, int)
-        Least number of points of a flat and of a solid view.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        A view has too few points.
+    Raises DegenerateGeometryError if a view has too few.
     """
     views, flat = problem.views, begin_flat(problem)
     needed = np.where(flat, *fewest)

@@ -23,13 +23,7 @@ from neurocal_cli.geometry import Array
 
 
 def nonlinear(problem: Problem) -> Found:
-    """Minimise the pixel error from the linear solution.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        See `linear`.
-    """
+    """Minimise the pixel error from the linear solution, with its errors."""
     return descend(*as_seen(problem, linear_state(problem)))
 
 

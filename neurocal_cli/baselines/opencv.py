@@ -32,19 +32,10 @@ def without_skew(problem: Problem) -> Problem:
 
 
 def opencv(problem: Problem) -> Found:
-    """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2).
+    """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2); the problem comes from `without_skew`.
 
-    Parameters
-    ----------
-    problem : Problem
-        From `without_skew`.
-
-    Raises
-    ------
-    UsageError
-        The problem is of type 3 or 4, or OpenCV does not have the distortion model.
-    DegenerateGeometryError
-        OpenCV refuses the points, or its result is not a valid camera.
+    Raises UsageError if the problem is of type 3 or 4, or OpenCV does not have the distortion model, and
+    DegenerateGeometryError if OpenCV refuses the points, or its result is not a valid camera.
     """
     import cv2
 

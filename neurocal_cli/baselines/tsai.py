@@ -47,19 +47,10 @@ _DISTORTIONS = ("none", "k1")
 
 
 def tsai(problem: Problem) -> Found:
-    """Calibrate by radial alignment.
+    """Calibrate by radial alignment; the problem comes from `with_known_centre`.
 
-    Parameters
-    ----------
-    problem : Problem
-        From `with_known_centre`.
-
-    Raises
-    ------
-    UsageError
-        The problem is of type 4, or has a distortion other than k1, or the image centre is unknown.
-    DegenerateGeometryError
-        There are too few points, or no camera satisfies the equations.
+    Raises UsageError if the problem is of type 4, or has a distortion other than k1, or the image centre is
+    unknown, and DegenerateGeometryError if there are too few points, or no camera satisfies the equations.
     """
     if problem.type == 4:
         raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
@@ -80,10 +71,7 @@ def tsai(problem: Problem) -> Found:
 def with_known_centre(problem: Problem) -> Problem:
     """The problem that Tsai's method solves: with image centre and right angles given (types 1 and 2).
 
-    Raises
-    ------
-    UsageError
-        The problem is of type 1, and the points have neither a centre nor an image size.
+    Raises UsageError for type 1 if the points have neither a centre nor an image size.
     """
     if problem.type in (3, 4):
         return problem
@@ -115,13 +103,8 @@ def _remarks(problem: Problem) -> tuple[str, ...]:
 class _Alignment:
     """Result of stage 1 for a group of views.
 
-    Attributes
-    ----------
-    views : (K,) int array
-    flat : bool
-    rows : (K, 2, 4) array
-        s r_1 with s t_x, and r_2 with t_y. For flat views they are in the coordinates of the plane, up to
-        scale, and without the third column of R.
+    The rows (K, 2, 4) are s r_1 with s t_x, and r_2 with t_y. For flat views they are in the coordinates of
+    the plane, up to scale, and without the third column of R.
     """
 
     views: NDArray[np.intp]

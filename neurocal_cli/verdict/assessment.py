@@ -80,13 +80,7 @@ _DISTANT = 10.0  # times the distance of the farthest point
 # In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def gather_evidence(calibration: Calibration) -> Evidence:
-    """Compute all measures of a calibration's quality.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        With its points.
-    """
+    """Compute all measures of the quality of a calibration, which has its points."""
     return _AtMinimum(calibration).evidence()
 
 

@@ -37,30 +37,18 @@ _ACROSS = 11  # points of a grid on the board
 class BoardShape:
     """Estimated bend or stretch of a target that is given as flat.
 
-    Attributes
-    ----------
-    bend : float
-        Height between its highest and lowest point over the mean plane [world unit]; 0 if it is stretched.
-    stretch, shear : float
-        Relative stretch of the longer side against the shorter one; deviation of the angle between the sides
-        from a right angle [rad]. 0 if the board is bent.
-    side : str
-        World axis nearest to the longer side.
-    focal_length : float
-        Relative change of the focal length if this shape were used.
-    sigmas : float
-        The same in standard deviations.
-    explained : float
-        Share of the squared error that the shape explains.
+    If it is bent, the bend is the height between its highest and lowest point over the mean plane [world
+    unit], and the other two are 0. Else the bend is 0, and the others are the relative stretch of the longer
+    side against the shorter one, and the deviation of the angle between the sides from a right angle [rad].
     """
 
     bend: float
     stretch: float
     shear: float
-    side: str
-    focal_length: float
-    sigmas: float
-    explained: float
+    side: str  # world axis nearest to the longer side
+    focal_length: float  # relative change of the focal length if this shape were used
+    sigmas: float  # the same in standard deviations
+    explained: float  # share of the squared error that the shape explains
 
 
 def board_shape(
@@ -74,20 +62,9 @@ def board_shape(
 ) -> BoardShape | None:
     """Test whether the board is bent or stretched; None if it is not, or if the test is impossible.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised, at the minimum, with estimated poses.
-    free : (5 + K,) bool array
-    variance : float
-        Of the residuals, normalised.
-    spare : float
-        Equations beyond the unknowns.
-    times : float
-        Variance of sums over views relative to that of independent views (`repeated_poses`).
-    std : float
-        Standard deviation of A11, normalised.
+    The state is normalised, at the minimum, with estimated poses; `variance` is that of its residuals and
+    `std` that of A11, `spare` are the equations beyond the unknowns, and `times` is the variance of sums over
+    views relative to that of independent views (`repeated_poses`).
     """
     if views.n_views < _FEWEST or not free[0] or not views.nearly_flat.all():
         return None
@@ -145,23 +122,12 @@ def _least(n: int) -> float:
 
 @frozen_dataclass(eq=False)
 class _Frame:
-    """The board's own axes.
-
-    Attributes
-    ----------
-    centre : (3,) array
-    axes : (3, 3) array
-        Columns: along the board, across it, its normal.
-    size : float
-        Farthest point along it [world unit].
-    aspect : float
-        Across over along.
-    """
+    """The board's own axes."""
 
     centre: Array
-    axes: Array
-    size: float
-    aspect: float
+    axes: Array  # (3, 3) columns: along the board, across it, its normal
+    size: float  # farthest point along it [world unit]
+    aspect: float  # across over along
 
     @classmethod
     def of(cls, views: Views) -> _Frame | None:

@@ -39,15 +39,8 @@ Cause = TypeVar("Cause", BoardShape, ViewChange, ViewGroups)
 def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) -> Iterator[Finding]:
     """Findings about a camera that is not the same in all views, or a board that is not flat.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    unit : str
-        Of the world.
-    wide : bool
-        Whether the lens is wide, and so may have no single centre of projection.
-    estimated : bool
-        Whether the target was estimated.
+    A wide lens may have no single centre of projection. `unit` is that of the world, and `estimated` tells
+    whether the target was estimated.
     """
     change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
     missing = evidence.missing

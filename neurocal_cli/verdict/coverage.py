@@ -20,24 +20,12 @@ _THIRDS = (
 
 @frozen_dataclass
 class Coverage:
-    """Coverage by the points of a calibration.
+    """Coverage by the points of a calibration."""
 
-    Attributes
-    ----------
-    image : float
-        Share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown.
-    empty : str
-        The emptiest part of the image, such as "upper left"; "" if all parts are covered.
-    tilt : float
-        Largest angle between the planes of two views' targets [degrees]; 90 for targets that are not flat.
-    relief : float
-        Depth of the deepest target over its distance; nan if all are flat.
-    """
-
-    image: float
-    empty: str
-    tilt: float
-    relief: float
+    image: float  # share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown
+    empty: str  # the emptiest part of the image, such as "upper left"; "" if all parts are covered
+    tilt: float  # largest angle between two views' targets [degrees]; 90 for targets that are not flat
+    relief: float  # depth of the deepest target over its distance; nan if all are flat
 
 
 def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:

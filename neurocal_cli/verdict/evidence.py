@@ -17,44 +17,25 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 class Evidence:
     """Measures of a calibration's quality.
 
-    Attributes
-    ----------
-    rmse_px : float [px]
-        Rms reprojection error of the calibration.
-    held_out_px : float [px]
-        Five-fold cross-validation error; nan if no data can be left out.
-    precision_px : float [px]
-        Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
-        networks are no freer than the camera.
-    contradiction : float
-        The camera's rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone.
-    disagreement : float
-        Chi-squared per parameter of the difference between two halves of the data; 1 if the reported
-        standard deviations hold.
-    correlation : float
-        Correlation of neighbouring residuals; 0 for noise.
-    condition : float
-        Condition of the normal matrix scaled to a unit diagonal.
-    coverage : Coverage
-    projection : ProjectionUncertainty or None
-        At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
-        image size is unknown.
-    repeated, mirrored : tuple of str
-        Views that are copies of others; views that show the target mirrored.
-    reestimated : tuple of Reestimated
-        Given parameters, estimated from the points.
-    noise : tuple of Finding
-        Residuals that do not look like measurement noise, or contradict the stated noise.
-    groups : ViewGroups or None
-        Two cameras among the views, or a changing focal length; None if there is neither.
-    poses : int
-        Number of different poses among the views (`repeated_poses`).
-    change : ViewChange or None
-        Change of the camera between views; None if there is none.
-    board : BoardShape or None
-        Bend or stretch of a target that is given as flat; None if there is none.
-    missing : MissingCoefficients or None
-        Effect of coefficients that the chosen distortion model lacks; None if it lacks none.
+    * `rmse_px` [px]: rms reprojection error of the calibration.
+    * `held_out_px` [px]: five-fold cross-validation error; nan if no data can be left out.
+    * `precision_px` [px]: noise floor, the rms error of a free network for each view, corrected for degrees
+      of freedom; nan if the networks are no freer than the camera.
+    * `contradiction`: the camera's rms error, corrected for degrees of freedom, over `precision_px`; 1 for
+      noise alone.
+    * `disagreement`: chi-squared per parameter of the difference between two halves of the data; 1 if the
+      reported standard deviations hold.
+    * `correlation` of neighbouring residuals; 0 for noise.
+    * `condition` of the normal matrix scaled to a unit diagonal.
+    * `projection`: at the distances of the nearest, median and farthest point, and at ten times the farthest;
+      None if the image size is unknown.
+    * `repeated`, `mirrored`: views that are copies of others; views that show the target mirrored.
+    * `reestimated`: given parameters, estimated from the points.
+    * `noise`: residuals that do not look like measurement noise, or contradict the stated noise.
+    * `poses`: number of different poses among the views (`repeated_poses`).
+    * `groups`, `change`, `board`, `missing`: two cameras among the views or a changing focal length, a change
+      of the camera between views, a bend or stretch of a target that is given as flat, the effect of
+      coefficients that the chosen distortion model lacks; each is None if there is none.
     """
 
     rmse_px: float

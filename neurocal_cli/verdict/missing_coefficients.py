@@ -32,27 +32,13 @@ _CENTRE = slice(3, 5)  # of A's entries
 
 @frozen_dataclass
 class MissingCoefficients:
-    """Effect of the coefficients that a distortion model lacks.
+    """Effect of the coefficients that a distortion model lacks."""
 
-    Attributes
-    ----------
-    model : str
-        The model that has them.
-    explained : float
-        Share of the squared error that they explain.
-    focal_length : float
-        Relative change of the focal length with them.
-    centre : float [px]
-        Shift of the image centre with them.
-    sigmas : float
-        Largest change of an intrinsic parameter, in its standard deviations.
-    """
-
-    model: str
-    explained: float
-    focal_length: float
-    centre: float
-    sigmas: float
+    model: str  # that has them
+    explained: float  # share of the squared error that they explain
+    focal_length: float  # relative change of the focal length with them
+    centre: float  # shift of the image centre with them [px]
+    sigmas: float  # largest change of an intrinsic parameter, in its standard deviations
 
 
 def missing_coefficients(
@@ -60,18 +46,8 @@ def missing_coefficients(
 ) -> MissingCoefficients | None:
     """Test whether the distortion model lacks coefficients; None if it lacks none, or not significantly.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised, at the minimum.
-    normal : array
-        Normal matrices of the views at the state.
-    free : (5 + K,) bool array
-        Which of A's entries and of the distortion coefficients are estimated.
-    free_poses : bool
-    std : (5,) array
-        Standard deviations of A's entries, normalised; 0 if given.
+    The state is normalised, at the minimum, with the normal matrices of the views; `std` (5,) are the
+    standard deviations of A's entries, 0 if given.
     """
     if state.model not in POLYNOMIAL_MODELS[:-1]:
         return None

@@ -31,21 +31,11 @@ _BEYOND, _LEAST = 1.1, 1.2
 
 @frozen_dataclass(eq=False)
 class ProjectionUncertainty:
-    """Standard deviation of projected pixels over the image.
+    """Standard deviation of projected pixels over the image."""
 
-    Attributes
-    ----------
-    pixels : (G, 2) array [px]
-        Positions in the image; `std` is nan outside the domain of the lens.
-    depths : (D,) array
-        Distances along the optical axis [world unit].
-    std : (D, G) array [px]
-        Standard deviation of both coordinates together, ``sqrt(var u + var v)``.
-    """
-
-    pixels: Array
-    depths: Array
-    std: Array
+    pixels: Array  # (G, 2) [px] positions in the image
+    depths: Array  # (D,) distances along the optical axis [world unit]
+    std: Array  # (D, G) [px] of both coordinates, ``sqrt(var u + var v)``; nan outside the domain of the lens
 
     @property
     def worst(self) -> float:
@@ -75,25 +65,12 @@ def projection_uncertainty(
     shared: Array,
     farthest: float | None = None,
 ) -> ProjectionUncertainty:
-    """Propagate the covariance of a calibration to projected pixels.
+    """Propagate the covariance of a calibration to projected pixels (G, 2) [px] at depths (D,).
 
-    Parameters
-    ----------
-    views, state, normal
-        At the minimum, normalised.
-    camera : Camera
-        The same in pixels.
-    free : (5 + K,) bool array
-    free_poses : bool
-    variance : float
-        Of the residuals, normalised.
-    pixels : (G, 2) array [px]
-    depths : (D,) array
-    shared : (f, f) array
-        Covariance of the free entries and coefficients (`view_covariance`).
-    farthest : float, optional
-        Angle from the axis of the farthest point of a wide lens [rad]. Pixels much farther out lie beyond its
-        image circle.
+    The state is normalised and at the minimum, the camera is the same in pixels, and `variance` is that of
+    the residuals, normalised. `shared` (f, f) is the covariance of the free entries and coefficients
+    (`view_covariance`). Pixels of a wide lens that are much farther out than the angle [rad] of the
+    `farthest` point lie beyond its image circle.
     """
     columns = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     gain, motion = _motions(views, state, normal, columns, free_poses)

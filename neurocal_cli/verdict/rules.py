@@ -54,12 +54,7 @@ _TOLD = 3.0  # standard deviations
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
-    """Apply the rules to the measures of a calibration.
-
-    Returns
-    -------
-    Verdict
-    """
+    """Apply the rules to the measures of a calibration."""
     projection = evidence.projection
     worst = projection.worst if projection is not None else float("nan")
     measures = {

@@ -38,24 +38,13 @@ _ADJUSTED = 4  # clustering rounds with adjusted cameras, after those with the q
 
 @frozen_dataclass(eq=False)
 class ViewGroups:
-    """Two cameras among the views, or a focal length for each view.
+    """Two cameras among the views, or a focal length for each view."""
 
-    Attributes
-    ----------
-    names : two tuples of str
-        The views of each camera, the smaller group first; empty if only the focal length changes.
-    cameras : (2, 5) array [px]
-        A11, A12, A22, A13 and A23 of both; nan if only the focal length changes.
-    scale : (V,) array
-        Focal length of each view over the common one; empty if there are two cameras.
-    explained : float
-        Share of the squared error that this explains.
-    """
-
+    # The views of each camera, the smaller group first; empty if only the focal length changes.
     names: tuple[tuple[str, ...], tuple[str, ...]]
-    cameras: Array
-    scale: Array
-    explained: float
+    cameras: Array  # (2, 5) [px] A11, A12, A22, A13 and A23 of both; nan if only the focal length changes
+    scale: Array  # (V,) focal length of each view over the common one; empty if there are two cameras
+    explained: float  # share of the squared error that this explains
 
     @property
     def apart(self) -> float:
@@ -71,15 +60,8 @@ def view_groups(
 ) -> ViewGroups | None:
     """Find two cameras among the views, or a changing focal length; None if neither explains the error.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        The common camera, at its minimum with all poses free.
-    normal : (V, 12 + K, 12 + K) array
-    free : (5 + K,) bool array
-    networks : (V,) array, optional
-        Result of `free_networks`, if known.
+    The state is the common camera, at its minimum with all poses free; `networks` (V,) is the result of
+    `free_networks`, if known.
     """
     conditions = conditions_on_views(views, state)
     n_free = int(free[:5].sum())
