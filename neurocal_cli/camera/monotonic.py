@@ -18,7 +18,7 @@ from neurocal_cli.camera.distortion import (
     distort,
     distort_with_jacobian,
 )
-from neurocal_cli.camera.tilt import untilted
+from neurocal_cli.camera.polynomial import untilted
 from neurocal_cli.camera.unprojection import first_root, largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
+from neurocal_cli.camera.polynomial import sensor_rotation
 from neurocal_cli.camera.projection import ENTRIES, project_points
-from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models converge from these starts.
