@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.monotonic import is_monotonic, undistort
+from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.projection import (
     ENTRIES,
@@ -24,7 +24,6 @@ from neurocal_cli.camera.projection import (
     project_with_jacobian,
     rays_of,
 )
-from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array

@@ -9,6 +9,7 @@ The inverse is `neurocal_cli.camera.monotonic.undistort`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import field
 
 import numpy as np
@@ -54,6 +55,12 @@ def coefficient_names(model: str) -> tuple[str, ...]:
     if model not in MODELS:
         raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")
     return MODELS[model]
+
+
+def radial_part(model: str, k: Sequence[float] | Array) -> list[float]:
+    """The coefficients (K,) of a model, with 0 for those that are not rotationally symmetric."""
+    names = coefficient_names(model)
+    return [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
 
 
 @frozen_dataclass(eq=False)

@@ -26,6 +26,7 @@ from neurocal_cli.camera.distortion import (
     coefficient_names,
     distort,
     pinhole_coefficients,
+    radial_part,
 )
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.distortion.similar_lens import similar_states
@@ -354,8 +355,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # Least squares up to the farthest point: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted radius of the
     # undistorted radius r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
-    radial = [0.0 if name in NOT_RADIAL else k for name, k in old.items()]
-    distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
+    distorted = distort(state.model, radial_part(state.model, state.k), r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)

@@ -26,10 +26,15 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
-from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reaches
+from neurocal_cli.camera.monotonic import (
+    largest_angle,
+    monotonic_radius,
+    radial_slope,
+    reaches,
+    unproject_directions,
+)
 from neurocal_cli.camera.polynomial import untilted
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
-from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
-from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names, radial_part
 from neurocal_cli.camera.polynomial import sensor_rotation
 from neurocal_cli.camera.projection import ENTRIES, project_points
 from neurocal_cli.geometry import Array
@@ -96,10 +96,8 @@ def tilted_states(state: CameraState) -> list[CameraState]:
 
 def _radius(model: str, k: Array, theta: Array) -> Array:
     """Distorted radii without tangential terms; nan outside the model's domain."""
-    names = coefficient_names(model)
-    radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
-        x, seen = _projected(model, radial, np.sin(theta), np.cos(theta))
+        x, seen = _projected(model, radial_part(model, k), np.sin(theta), np.cos(theta))
         # The domain ends where the radius first ceases to grow.
         grows = seen & (np.diff(x, prepend=0.0) > 0)
     return np.where(np.logical_and.accumulate(grows), x, np.nan)

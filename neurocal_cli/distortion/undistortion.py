@@ -19,10 +19,9 @@ from neurocal_cli.bundle_adjustment.measured_directions import unit
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.monotonic import monotonic_radius
+from neurocal_cli.camera.monotonic import largest_angle, monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.projection import image_points_with_jacobian, project_points
-from neurocal_cli.camera.unprojection import largest_angle
 from neurocal_cli.distortion.undistorted_view import Undistorted, plane_like, undistorted_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
