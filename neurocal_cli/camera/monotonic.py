@@ -194,16 +194,25 @@ def _newton(
     model, k = distortion.model, distortion.coefficients
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
-            (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
-            dx, dy, det = x - bx, y - by, xx * yy - xy * yx
-            step = (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det
-            sx, sy = sx + step[0], sy + step[1]
-            if not np.fmax.reduce(np.hypot(*step) / (1 + np.hypot(sx, sy)), axis=None, initial=0.0) > _STEP:
+            step_x, step_y, _ = _newton_step(distortion, x, y, sx, sy)
+            sx, sy = sx + step_x, sy + step_y
+            length = np.hypot(step_x, step_y) / (1 + np.hypot(sx, sy))
+            if not np.fmax.reduce(length, axis=None, initial=0.0) > _STEP:
                 break
         (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
         good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
         good &= (sx * sx + sy * sy < radius**2) & (xx * yy - xy * yx > 0)
     return sx, sy, good
+
+
+def _newton_step(
+    distortion: Distortion, x: Array, y: Array, sx: Array, sy: Array
+) -> tuple[Array, Array, Array]:
+    """Step from undistorted points (sx, sy) towards those of (x, y), and the determinant of the Jacobian."""
+    model, k = distortion.model, distortion.coefficients
+    (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
+    dx, dy, det = x - bx, y - by, xx * yy - xy * yx
+    return (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det, det
 
 
 def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
@@ -225,12 +234,7 @@ def nearly_undistorted(distortion: Distortion, x: Array, y: Array) -> tuple[Arra
         return x, y
     sx, sy = x, y
     for _ in range(2):
-        (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(
-            distortion.model, distortion.coefficients, sx, sy
-        )
-        det = xx * yy - xy * yx
-        step_x = (yy * (x - bx) - xy * (y - by)) / det
-        step_y = (xx * (y - by) - yx * (x - bx)) / det
+        step_x, step_y, det = _newton_step(distortion, x, y, sx, sy)
         sx, sy = sx + step_x, sy + step_y
     far = ~((det > 0) & (step_x * step_x + step_y * step_y < _SMALL_STEP**2))
     if far.any():

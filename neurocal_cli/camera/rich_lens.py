@@ -61,10 +61,7 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
     field = _field(nodes, sx, sy, 2 * reach_x / (GRID - 3), 2 * reach_y / (GRID - 3))
     (fx, fy), (fx_x, fy_x), (fx_y, fy_y) = field.value, field.by_x, field.by_y
     cross = sx * sy * bend
-    by_s = (
-        (scale + sx * sx * bend + fx_x, cross + fx_y),
-        (cross + fy_x, scale + sy * sy * bend + fy_y),
-    )
+    by_s = (scale + sx * sx * bend + fx_x, cross + fx_y), (cross + fy_x, scale + sy * sy * bend + fy_y)
     # ds = (dX, dY) / w - s (dX X / d + dY Y / d + dZ w / d) / w
     by = []
     for sx_, sy_ in by_s:
@@ -72,15 +69,18 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
         by.append(tuple(a.reshape(shape) for a in (sx_ / w - along * sx, sy_ / w - along * sy, -along)))
     columns: list[tuple[Array, Array]] = []
     if by_coefficients:
-        none = np.zeros(shape)
+        none = np.zeros(len(r))
         ox, oy = sx / r, sy / r
         grows = -radial.slope * r / reach
-        by_reaches = (ox * grows, oy * grows), (-fx_x * sx / reach_x, -fy_x * sx / reach_x)
-        columns += [(a.reshape(shape), b.reshape(shape)) for a, b in by_reaches]
-        columns.append(((-fx_y * sy / reach_y).reshape(shape), (-fy_y * sy / reach_y).reshape(shape)))
-        columns += [((ox * b).reshape(shape), (oy * b).reshape(shape)) for b in radial.basis()]
-        of_nodes = [b.reshape(shape) for b in field.basis()]
+        columns = [(ox * grows, oy * grows)]
+        columns += [
+            (-fx_x * sx / reach_x, -fy_x * sx / reach_x),
+            (-fx_y * sy / reach_y, -fy_y * sy / reach_y),
+        ]
+        columns += [(ox * b, oy * b) for b in radial.basis()]
+        of_nodes = field.basis()
         columns += [(b, none) for b in of_nodes] + [(none, b) for b in of_nodes]
+        columns = [(a.reshape(shape), b.reshape(shape)) for a, b in columns]
     return Displacement(
         (scale * sx + fx).reshape(shape), (scale * sy + fy).reshape(shape), by[0], by[1], columns
     )
