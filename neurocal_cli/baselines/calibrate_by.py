@@ -20,7 +20,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration import Calibration, Rejected, StopReason
-from neurocal_cli.distortion.given_distortion import check_distortion
+from neurocal_cli.distortion.given_model import check_distortion
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.pipeline.result import calibration_of
 

@@ -41,7 +41,7 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.multi_start import FEW_VIEWS
+from neurocal_cli.distortion.given_model import FEW_VIEWS
 from neurocal_cli.geometry import Array
 
 Starts = Callable[[Problem], Iterable[CameraState]]
