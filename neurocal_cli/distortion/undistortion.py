@@ -1,7 +1,7 @@
 """Undistortion of points, and the source pixels of undistorted images.
 
 A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere
-(`panorama`). On a plane, with A' without distortion, that is
+(`undistorted_view`). On a plane, with A' without distortion, that is
 
     x = undistort(A^-1 m),   m' = A' x
 
