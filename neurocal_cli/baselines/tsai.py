@@ -28,11 +28,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Minimum, least_squares
-from neurocal_cli.baselines.linear import whole_groups
-from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
+from neurocal_cli.baselines.linear import smallest, whole_groups
+from neurocal_cli.baselines.nonlinear import Minimum, least_pixel_error
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -244,7 +242,6 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     model = problem.distortion.model if problem.free_distortion else "none"
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])
-    error = whitened_residuals(views)
 
     def state(p: Array) -> CameraState:
         f = np.exp(p[0])
@@ -254,5 +251,5 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
         entries = np.array([[aspect * f, 0.0, f, *centre]])
         return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
 
-    least = least_squares(lambda p: error(state(p)), start, view_of_residual(views), len(start) - V)
+    least = least_pixel_error(views, state, start, len(start) - V)
     return state(least.x), least
