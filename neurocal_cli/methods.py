@@ -23,7 +23,7 @@ from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
-from neurocal_cli.verdict.pixel_values import repeated_views
+from neurocal_cli.verdict.odd_points import repeated_views
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions

@@ -217,12 +217,12 @@ class Correspondences:
         self._set(covariance=_frozen(covariance))
 
     def _check_world_std(self, std: Array) -> None:
-        good = ((std >= 0) & (std <= _LARGEST)).all(axis=1)  # False for nan as well
+        good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
         problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
         self._set_rows("world_std", std, good, problem)
 
     def _check_across(self, across: Array) -> None:
-        good = np.abs(across).max(axis=1) <= _LARGEST  # False for nan as well
+        good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
         problem = "the direction nu,nv in which the point was measured must be two finite numbers"
         self._set_rows("across", across, good, problem)
 

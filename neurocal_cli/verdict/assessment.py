@@ -58,7 +58,7 @@ from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import Reestimated, reestimate_centre, reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.verdict.pixel_values import repeated_views
+from neurocal_cli.verdict.odd_points import repeated_views
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,

@@ -14,9 +14,8 @@ from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import Reestimated
-from neurocal_cli.verdict.pixel_values import normalised, odd_pixels, points_given_twice
+from neurocal_cli.verdict.odd_points import normalised, odd_pixels, points_given_twice, views_of_another_scale
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
-from neurocal_cli.verdict.units_of_views import views_of_another_scale
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
