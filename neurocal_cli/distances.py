@@ -20,24 +20,15 @@ _ANOTHER_UNIT = 0.1  # a scale further from 1 is not that of a print of the stat
 class Distance:
     """A measured distance between two places of a board.
 
-    Parameters
-    ----------
-    start, end : str
-        Ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of the first
-        square.
-    length, std : float [world unit]
-        Measured distance and its standard deviation.
-
-    Raises
-    ------
-    InputError
-        An invalid id, or a length or standard deviation that is not positive.
+    The places are ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of
+    the first square. Raises InputError for an invalid id, and for a length or standard deviation that is not
+    positive.
     """
 
     start: str
     end: str
-    length: float
-    std: float
+    length: float  # world unit
+    std: float  # of the length
 
     def __post_init__(self) -> None:
         if grid_place(self.start) == grid_place(self.end):

@@ -65,19 +65,10 @@ def radial_part(model: str, k: Sequence[float] | Array) -> list[float]:
 
 @frozen_dataclass(eq=False)
 class Distortion:
-    """A distortion model with its coefficients; the default is no distortion.
+    """A distortion model, one of `MODELS`, with its coefficients; the default is no distortion.
 
-    Parameters
-    ----------
-    model : str
-        One of `MODELS`.
-    coefficients : sequence of float
-        As many as the model has; missing ones are 0.
-
-    Raises
-    ------
-    InputError
-        An unknown model, too many coefficients, or one that is not finite.
+    Missing coefficients are 0. Raises InputError for an unknown model, too many coefficients, or one that is
+    not finite.
     """
 
     model: str = "none"
