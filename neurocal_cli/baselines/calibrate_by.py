@@ -61,11 +61,7 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     if not found.converged:
         reason = StopReason.MAX_ITERATIONS
     return replace(
-        calibration,
-        network=None,
-        converged=found.converged,
-        stop_reason=reason.value,
-        warnings=warnings,
+        calibration, network=None, converged=found.converged, stop_reason=reason.value, warnings=warnings
     )
 
 

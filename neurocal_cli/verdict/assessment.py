@@ -23,18 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import (
-    FOLDS,
-    Minimum,
-    disagreement,
-    held_out,
-    reduced,
-)
-from neurocal_cli.bundle_adjustment.outlier_views import (
-    conditions_on_views,
-    free_networks,
-    seen_from_behind,
-)
+from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
+from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals

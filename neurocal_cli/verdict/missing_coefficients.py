@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
-from neurocal_cli.bundle_adjustment.residual_correlation import (
-    correlation,
-    effective_number,
-    point_residuals,
-)
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.frozen_dataclass import frozen_dataclass

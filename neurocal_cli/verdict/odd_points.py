@@ -59,11 +59,7 @@ def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     step = _step(pixels)
     if step:
         to = "whole numbers" if step == 1 else f"multiples of {step} px"
-        yield (
-            1,
-            f"the pixels are rounded to {to}",
-            "give sub-pixel coordinates, as `neurocal detect` does",
-        )
+        yield 1, f"the pixels are rounded to {to}", "give sub-pixel coordinates, as `neurocal detect` does"
     else:
         yield from _clipped(pixels)
     yield from _outside(points)
