@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -51,22 +52,15 @@ class BoardShape:
     explained: float  # share of the squared error that the shape explains
 
 
-def board_shape(
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    variance: float,
-    spare: float,
-    times: float,
-    std: float,
-) -> BoardShape | None:
+def board_shape(m: Minimum, variance: float, spare: float, times: float, std: float) -> BoardShape | None:
     """Test whether the board is bent or stretched; None if it is not, or if the test is impossible.
 
-    The state is normalised, at the minimum, with estimated poses; `variance` is that of its residuals and
-    `std` that of A11, `spare` are the equations beyond the unknowns, and `times` is the variance of sums over
-    views relative to that of independent views (`repeated_poses`).
+    The poses are estimated. `variance` is that of the residuals and `std` that of A11, both normalised;
+    `spare` are the equations beyond the unknowns, and `times` is the variance of sums over views relative to
+    that of independent views (`repeated_poses`).
     """
-    if views.n_views < _FEWEST or not free[0] or not views.nearly_flat.all():
+    views, state, free = m.views, m.state, m.free
+    if views.n_views < _FEWEST or not views.nearly_flat.all():
         return None
     frame = _Frame.of(views)
     if frame is None:
@@ -90,7 +84,6 @@ def board_shape(
     if not chi >= _least(len(group)):
         return None
     moved = float(step[0])
-    explained = chi * times * seen / views.n_views / spare
     bent = group is _BENT
     stretch, shear = (0.0, 0.0) if bent else (float(value) for value in step[f:])
     return BoardShape(
@@ -100,7 +93,7 @@ def board_shape(
         side="XYZ"[int(np.argmax(np.abs(frame.axes[:, 0])))],
         focal_length=moved / float(state.entries[0, 0]),
         sigmas=abs(moved) / std,
-        explained=explained,
+        explained=chi * times * seen / views.n_views / spare,
     )
 
 

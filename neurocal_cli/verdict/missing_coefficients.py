@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum, reduced
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
@@ -37,27 +37,24 @@ class MissingCoefficients:
     sigmas: float  # largest change of an intrinsic parameter, in its standard deviations
 
 
-def missing_coefficients(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool, std: Array
-) -> MissingCoefficients | None:
+def missing_coefficients(m: Minimum, std: Array) -> MissingCoefficients | None:
     """Test whether the distortion model lacks coefficients; None if it lacks none, or not significantly.
 
-    The state is normalised, at the minimum, with the normal matrices of the views; `std` (5,) are the
-    standard deviations of A's entries, 0 if given.
+    `std` (5,) are the standard deviations of A's entries, normalised; 0 if given.
     """
+    views, state, normal, free = m.views, m.state, m.normal, m.free
     if state.model not in POLYNOMIAL_MODELS[:-1]:
         return None
     if views.n_views > _ENOUGH:
         some = np.linspace(0, views.n_views - 1, _ENOUGH).astype(np.intp)
-        views, state = views.subset(some), state.of_views(some)
-        normal = normal[some]
+        views, state, normal = views.subset(some), state.of_views(some), normal[some]
     before, n_coefficients = float(normal[:, -1, -1].sum()), len(state.k)
     richer = [state.with_model(m) for m in POLYNOMIAL_MODELS[POLYNOMIAL_MODELS.index(state.model) + 1 :]]
-    if not before > 0 or not _promises_enough(views, richer[-1], free, free_poses, before):
+    if not before > 0 or not _promises_enough(views, richer[-1], free, m.free_poses, before):
         return None
     best, lowest = None, -_DECISIVE
     for start in richer:
-        found = adjust(views.batches, start, _all_free(free, start), free_poses, _STEPS)
+        found = adjust(views.batches, start, _all_free(free, start), m.free_poses, _STEPS)
         left = float(found.cost.sum()) / before
         n = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
         criterion = n * np.log(max(left, _ROUNDING)) + (len(start.k) - n_coefficients) * np.log(n)
