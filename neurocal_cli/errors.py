@@ -23,14 +23,8 @@ class InputError(NeurocalError, ValueError):
 class FormatError(NeurocalError, ValueError):
     """A file that cannot be read as the expected format.
 
-    Parameters
-    ----------
-    problem : str
-        What is wrong and what to do.
-    source : str
-        The file's name, ``<stdin>`` for a stream.
-    line : int, optional
-        Line number, counted from 1.
+    `problem` says what is wrong and what to do. The source is the file's name, ``<stdin>`` for a stream, and
+    its lines are counted from 1.
     """
 
     def __init__(self, problem: str, source: str = "", line: int | None = None) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,9 +65,7 @@ class Target:
 
     def applied(self, points: Correspondences) -> Correspondences:
         """Points of this target moved to their estimated coordinates, without the bends of single views."""
-        place = self.places(points.world)
-        world = np.where((place >= 0)[:, None], self.found[place], points.world)
-        return points if (place < 0).all() else replace(points, world=world)
+        return _moved(points, self.places(points.world), self.found)
 
     def seen(self, points: Correspondences) -> Correspondences:
         """Points of this target moved to their estimated coordinates, with the bend of each view."""
@@ -84,9 +82,7 @@ class Target:
 
     def as_given(self, points: Correspondences) -> Correspondences:
         """Points moved back to their given coordinates: the inverse of `seen`."""
-        place = self.rows_of(self.straightened(points).world)
-        world = np.where((place >= 0)[:, None], self.given[place], points.world)
-        return points if (place < 0).all() else replace(points, world=world)
+        return _moved(points, self.rows_of(self.straightened(points).world), self.given)
 
     def _bend(self, points: Correspondences) -> Array:
         """(N, 3) offsets of points by the bends of their views [world unit]."""
@@ -115,42 +111,46 @@ class Target:
         found, std = self.found.copy(), self.std.copy()
         found[place[both]] = 0.5 * (self.found[place[both]] + other.found[both])
         std[place[both]] = 0.5 * np.hypot(self.std[place[both]], other.std[both])
-        point = None
-        if self.point is not None and other.point is not None:
-            point = np.concatenate([self.point, other.point[new]])
-        stated = None
-        if self.stated is not None and other.stated is not None:
-            stated = np.concatenate([self.stated, other.stated[new]])
+
+        def both_of(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if a is None or b is None else np.concatenate([a, b[new]])
+
         return replace(
             self,
             given=np.concatenate([self.given, other.given[new]]),
             found=np.concatenate([found, other.found[new]]),
             std=np.concatenate([std, other.std[new]]),
             plane=np.concatenate([self.plane, other.plane[new]]),
-            point=point,
-            stated=stated,
+            point=both_of(self.point, other.point),
+            stated=both_of(self.stated, other.stated),
         )
 
     def bend(self) -> float:
         """Height between the highest and lowest point over the mean plane, of the worst plane [world]."""
         worst = 0.0
-        for plane in range(int(self.plane.max()) + 1):
-            local, _ = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
-            rows = np.column_stack([np.ones(len(local)), local[:, :2]])
-            height = local[:, 2] - rows @ np.linalg.lstsq(rows, local[:, 2], rcond=None)[0]
+        for found, _ in self._planes():
+            rows = np.column_stack([np.ones(len(found)), found[:, :2]])
+            height = found[:, 2] - rows @ np.linalg.lstsq(rows, found[:, 2], rcond=None)[0]
             worst = max(worst, float(np.ptp(height)))
         return worst
 
     def stretch(self) -> float:
         """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""
         worst = 0.0
-        for plane in range(int(self.plane.max()) + 1):
-            found, given = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
+        for found, given in self._planes():
             rows = np.column_stack([np.ones(len(given)), given[:, :2]])
             linear = np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:]
             along, across = np.linalg.svd(linear, compute_uv=False)
             worst = max(worst, float(along / across - 1))
         return worst
+
+    def _planes(self) -> Iterator[tuple[Array, Array]]:
+        """Found and given points of each plane about their centres, along the given ones' principal axes."""
+        for plane in range(int(self.plane.max()) + 1):
+            found, given = self.found[self.plane == plane], self.given[self.plane == plane]
+            centred = given - given.mean(axis=0)
+            axes = np.linalg.svd(centred, full_matrices=False)[2].T
+            yield (found - found.mean(axis=0)) @ axes, centred @ axes
 
 
 def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
@@ -268,11 +268,10 @@ def is_flat(given: Array) -> bool:
     return bool(extent[-1] < _THIN * extent[0])
 
 
-def _in_plane(found: Array, given: Array) -> tuple[Array, Array]:
-    """Both sets of points relative to their centres, along the principal axes of the given ones."""
-    centred = given - given.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2].T
-    return (found - found.mean(axis=0)) @ axes, centred @ axes
+def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Correspondences:
+    """Points moved to other coordinates (n, 3), of which `place` (N,) are the indices; -1: not moved."""
+    world = np.where((place >= 0)[:, None], to[place], points.world)
+    return points if (place < 0).all() else replace(points, world=world)
 
 
 def _places(known: Array, world: Array) -> NDArray[np.intp]:

@@ -20,7 +20,7 @@ from neurocal_cli.camera.distortion import (
     distort_with_jacobian,
     radial_part,
 )
-from neurocal_cli.camera.polynomial import untilted
+from neurocal_cli.camera.polynomial import first_eight, untilted
 from neurocal_cli.geometry import Array
 
 # Start and end of Newton's method. Random models of tests/test_monotonic.py are inverted to 1e-8 up to 95 %
@@ -52,7 +52,7 @@ def monotonic_radius(distortion: Distortion) -> float:
         theta = largest_angle(distortion)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
     k = distortion.coefficients
-    k1, k2, _, _, k3, k4, k5, k6 = _first_eight(k)
+    k1, k2, _, _, k3, k4, k5, k6 = first_eight(k)
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
     slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
@@ -110,7 +110,7 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
         n = np.arange(1, 5)
         by_k = (2 * n + 1) * s**n
         return 1.0 + by_k @ k, by_k
-    k1, k2, _, _, k3, k4, k5, k6 = _first_eight(k)
+    k1, k2, _, _, k3, k4, k5, k6 = first_eight(k)
     n = np.arange(1, 4)
     powers, growths = s**n, 2 * n * s**n  # and 2 s d/ds of them
     top, top_growth = 1.0 + powers @ [k1, k2, k3], growths @ [k1, k2, k3]
@@ -121,10 +121,6 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
     by_bottom = -((u + up) * powers + u * growths) / v**2 + 2 * u * vp * powers / v**3
     none = np.zeros((len(r), 6))
     return slope, np.column_stack([by_top[:, :2], none[:, :2], by_top[:, 2:], by_bottom, none])[:, : len(k)]
-
-
-def _first_eight(k: Array) -> Array:
-    return np.r_[k[:8], np.zeros(max(8 - len(k), 0))]
 
 
 def _twice_s_slope(p: Array) -> Array:

@@ -42,7 +42,7 @@ def distorted(k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
 
 def _radial(k: Coefficients, r2: Array) -> tuple[Array, Any]:
     """R, and one over its denominator."""
-    k1, k2, _, _, k3, k4, k5, k6 = _all(k)
+    k1, k2, _, _, k3, k4, k5, k6 = first_eight(k)
     R = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     if len(k) <= 5:
         return R, 1.0
@@ -67,7 +67,7 @@ def _behind_prism(k: Coefficients, point: tuple[Array, Array], r2: Array) -> tup
 def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     """Distorted points, their derivatives by the points, and by each coefficient."""
     count = len(k)
-    k1, k2, p1, p2, k3, k4, k5, k6 = _all(k)
+    k1, k2, p1, p2, k3, k4, k5, k6 = first_eight(k)
     x2, y2 = x * x, y * y
     r2 = x2 + y2
     r4 = r2 * r2
@@ -109,7 +109,7 @@ def _on_tilted_sensor(k: Coefficients, before: Distorted) -> Distorted:
     return point, by_point, [*((a * dx + b * dy, c * dx + d * dy) for dx, dy in by_k), *by_tau]
 
 
-def _all(k: Coefficients) -> list[Any]:
+def first_eight(k: Coefficients) -> list[Any]:
     """The first eight coefficients; 0 for those that the model lacks."""
     return [*k[:8], *[0.0] * (8 - len(k))]
 

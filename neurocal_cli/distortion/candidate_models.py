@@ -90,6 +90,11 @@ class Candidate:
         """Sum of squared residuals."""
         return float(self.adjusted.cost.sum())
 
+    @property
+    def held_out(self) -> float:
+        """Sum of squared errors of data that are held out."""
+        return float(self.lost.sum())
+
     def criterion(self, n: float) -> float:
         """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
         penalty = max(np.log(n), _LEAST_PENALTY) * self.coefficients

@@ -94,7 +94,7 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         problem=chosen.problem,
         adjusted=replace(chosen.adjusted, iterations=iterations),
         would_take=solution.would_take | (good - {name}),
-        model_errors={name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()},
+        model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
         refusal=_refusal(fitted, chosen),
     )
 
@@ -202,7 +202,7 @@ def _best(
         for name, candidate in finite.items()
         if name in few or all(_decidedly(candidate, other, repeated, _FAR_BETTER) for other in few.values())
     }
-    best = min(pool, key=lambda name: _lost(pool[name]))
+    best = min(pool, key=lambda name: pool[name].held_out)
     good = {
         name
         for name, candidate in eligible.items()
@@ -213,7 +213,7 @@ def _best(
         excess = _by_fold(candidate.lost - pool[best].lost, repeated)
         chance = np.sqrt(len(excess)) * excess.std()
         simpler = candidate.coefficients < pool[best].coefficients
-        if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if simpler else 0.0):
+        if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
             tied.append(name)
     return min(tied, key=lambda name: criterion[name]), good
 
@@ -224,11 +224,11 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
     if not ordinary:
         return fitted
-    lowest, least = min(c.criterion(n) for c in ordinary), min(map(_lost, ordinary))
+    lowest, least = min(c.criterion(n) for c in ordinary), min(c.held_out for c in ordinary)
     return {
         name: c
         for name, c in fitted.items()
-        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and _lost(c) <= (1 + 2 * _TIE) * least)
+        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
 
 
@@ -252,10 +252,6 @@ def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPose
     return bool(ratio.sum() > _CERTAIN * np.sqrt(len(ratio)) * ratio.std())
 
 
-def _lost(candidate: Candidate) -> float:
-    return float(candidate.lost.sum())
-
-
 def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
     """Sum the held-out errors of views or parts of points by fold."""
     if len(lost) == len(repeated.group):
@@ -274,7 +270,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
     sound = {name: c for name, c in monotonic.items() if c.sound}
     if not sound or not several:
         return sound or monotonic
-    lowest = [min(float(c.lost.sum()) for c in some.values()) for some in (sound, monotonic)]
+    lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
 
 
@@ -282,7 +278,7 @@ def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
     """Why the result must be refused: the model that fits is not monotonic, the selected one far worse."""
     for model, candidate in fitted.items():
         bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
-        if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
+        if bad and chosen.held_out > _FAR_WORSE**2 * candidate.held_out:
             return (
                 f"the distortion is strong, and the model {model} that fits the points is not monotonic "
                 f"(maps two directions to one pixel) inside the {candidate.not_monotonic}; give points "

@@ -76,14 +76,10 @@ def view_groups(
     own = float(free_networks(views, state, OWN_STEPS).sum())
     noise = _NOISE * own / freedom
     quadratics = reduced(normal, free, True)
-    scale = _scales(quadratics, state, free)
-    gain = _gain_of_scales(quadratics, state, free)
+    scale, gain = _focal_lengths(quadratics, state, free)
     one_each = (cost - gain - own) / max(spare - views.n_views + 1, 1)
-    if (
-        spare - views.n_views < _SPARE - 1
-        or np.ptp(scale) < _DIFFERENT
-        or not (np.abs(scale - 1) < 0.5).all()
-    ):
+    told_apart = spare - views.n_views >= _SPARE - 1 and np.ptp(scale) >= _DIFFERENT
+    if not (told_apart and (np.abs(scale - 1) < 0.5).all()):
         one_each = np.inf
     found = _two_cameras(views, state, quadratics, free)
     two = np.inf
@@ -167,26 +163,19 @@ def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Arra
     return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
 
 
-def _direction(state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """Step of the free parameters for a relative change of the focal length."""
-    scaled = np.zeros(len(free))
-    scaled[:3] = state.entries[0][:3]
-    return np.asarray(scaled[free])
+def _focal_lengths(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> tuple[Array, float]:
+    """(V,) focal length of each view over the common one, by one Gauss-Newton step.
 
-
-def _scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """(V,) focal length of each view over the common one, by one Gauss-Newton step."""
-    d = _direction(state, free)
-    return np.asarray(1 + (q.g @ d) / np.einsum("i,vij,j->v", d, q.S, d))
-
-
-def _gain_of_scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> float:
-    """Drop in squared error with a focal length for each view and all other parameters in common."""
-    d = _direction(state, free)
+    The second result is the drop in squared error with them and all other parameters in common.
+    """
+    d = np.zeros(len(free))
+    d[:3] = state.entries[0][:3]
+    d = d[free]  # step of the free parameters for a relative change of the focal length
     Sd, gd = q.S @ d, q.g @ d
     weight = 1 / np.maximum(Sd @ d, 1e-300)
     S = (q.S - weight[:, None, None] * Sd[:, :, None] * Sd[:, None, :]).sum(axis=0)
     g = (q.g - (weight * gd)[:, None] * Sd).sum(axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(q.S.sum(axis=0)), 1e-300))
     common = np.linalg.pinv(S * np.outer(scale, scale), rcond=1e-9, hermitian=True) @ (scale * g)
-    return float((weight * gd**2).sum() + (scale * g) @ common)
+    gain = float((weight * gd**2).sum() + (scale * g) @ common)
+    return np.asarray(1 + gd / np.einsum("i,vij,j->v", d, q.S, d)), gain
