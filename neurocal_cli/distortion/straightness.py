@@ -14,6 +14,7 @@ enter.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -76,24 +77,24 @@ class DistortedLines:
         return curves
 
     def _moved(self) -> tuple[DistortedLines, float]:
-        at = _Images(self)
-        index, n = self.images.lines.line, self.normals
-        r, across = at.errors(), at.across(n[index])
+        at, n, t = self._at_feet, self.normals, self.feet
+        across = at.across(n[self.images.lines.line])
         # Each line moves by (a + b t) along its normal.
-        t = self.feet
-        sums = [
-            self.images.sum_by_line(c)
-            for c in (across * across, across * across * t, across * across * t * t)
-        ]
-        right = [self.images.sum_by_line(c) for c in (across * r, across * r * t)]
-        det = sums[0] * sums[2] - sums[1] ** 2
-        a = (sums[2] * right[0] - sums[1] * right[1]) / det
-        b = (sums[0] * right[1] - sums[1] * right[0]) / det
+        square, product = across * across, across * at.r
+        s0, s1, s2 = (self.images.sum_by_line(c) for c in (square, square * t, square * t * t))
+        r0, r1 = (self.images.sum_by_line(c) for c in (product, product * t))
+        det = s0 * s2 - s1**2
+        a, b = (s2 * r0 - s1 * r1) / det, (s0 * r1 - s1 * r0) / det
         along = self.along + b[:, None] * n
         along /= np.linalg.norm(along, axis=1)[:, None]
-        feet, shift = at.nearer()
+        u, v = at.tangent
+        shift = (u * at.error[0] + v * at.error[1]) / (u * u + v * v)
         step = float(max(np.abs(a).max(), np.abs(b).max(), np.abs(shift).max()))
-        return replace(self, base=self.base + a[:, None] * n, along=along, feet=feet), step
+        return replace(self, base=self.base + a[:, None] * n, along=along, feet=t + shift), step
+
+    @cached_property
+    def _at_feet(self) -> _Images:
+        return _Images(self)
 
     @property
     def normals(self) -> Array:
@@ -102,14 +103,13 @@ class DistortedLines:
 
     def errors(self) -> Array:
         """(M,) distances of the points from their curves, whitened, signed."""
-        return _Images(self).errors()
+        return self._at_feet.r
 
     @property
     def valid(self) -> bool:
         """Whether no line is a single point and the distortion is monotonic at all points."""
         with np.errstate(all="ignore"):
-            at = _Images(self)
-            return bool(np.isfinite(at.errors()).all() and (at.determinant > 0).all())
+            return bool(np.isfinite(self.errors()).all() and (self._at_feet.determinant > 0).all())
 
     def derivatives(self) -> tuple[Array, Array, Array]:
         """Errors r (M,), their derivatives by A and the distortion, and their directions nu (M, 2).
@@ -117,26 +117,25 @@ class DistortedLines:
         The second result J (M, 5 + K) is minus the derivative of r by A's entries and the coefficients, with
         the parameters of each line eliminated. The directions are in the whitened image.
         """
-        at = _Images(self)
+        at = self._at_feet
         J = at.columns()
         across = at.across(self.normals[self.images.lines.line])
-        t = self.feet
-        basis = np.column_stack([across, across * t])
+        basis = np.column_stack([across, across * self.feet])
         gram = self.images.sum_by_line(basis[:, :, None] * basis[:, None, :])
         mixed = self.images.sum_by_line(basis[:, :, None] * J[:, None, :])
         taken = np.linalg.solve(gram, mixed)[self.images.lines.line]  # regular where `valid`
         J -= (basis[:, :, None] * taken).sum(axis=1)
-        return at.errors(), J, np.column_stack(at.nu)
+        return at.r, J, np.column_stack(at.nu)
 
 
 class _Images:
     """Predicted images of all feet, with their derivatives."""
 
     def __init__(self, curves: DistortedLines) -> None:
-        self.curves, self.images = curves, curves.images
+        self.entries, self.images = curves.entries, curves.images
         index = self.images.lines.line
-        self.along = curves.along[index]
-        x, y = (curves.base[index] + curves.feet[:, None] * self.along).T
+        along = curves.along[index]
+        x, y = (curves.base[index] + curves.feet[:, None] * along).T
         model, k = curves.distortion.model, curves.distortion.coefficients
         image = image_points_with_jacobian(curves.entries, model, k, x, y)
         self.x, self.y, self.slope, self.by_k = image.x, image.y, image.by_point, image.by_coefficient
@@ -144,9 +143,10 @@ class _Images:
         self.determinant = ux * vy - uy * vx
         u, v = self.images.pixels[:, 0] - image.u, self.images.pixels[:, 1] - image.v
         self.error = self.images.whiten(u, v)
-        self.tangent = self._through(self.along)
+        self.tangent = self._through(along)
         length = np.hypot(*self.tangent)
         self.nu = -self.tangent[1] / length, self.tangent[0] / length
+        self.r = self.nu[0] * self.error[0] + self.nu[1] * self.error[1]
 
     def _through(self, direction: Array) -> tuple[Array, Array]:
         """Distorted and whitened images of directions in the undistorted image."""
@@ -154,24 +154,14 @@ class _Images:
         uu, uv, vu, vv = self.slope
         return self.images.whiten(uu * dx + uv * dy, vu * dx + vv * dy)
 
-    def errors(self) -> Array:
-        """Whitened distances (N,) of the points across their curves."""
-        return self.nu[0] * self.error[0] + self.nu[1] * self.error[1]
-
     def across(self, direction: Array) -> Array:
         """Components across the curve of directions in the undistorted image."""
         u, v = self._through(direction)
         return self.nu[0] * u + self.nu[1] * v
 
-    def nearer(self) -> tuple[Array, Array]:
-        """Feet nearer to the points, and the shifts."""
-        u, v = self.tangent
-        shift = (u * self.error[0] + v * self.error[1]) / (u * u + v * v)
-        return self.curves.feet + shift, shift
-
     def columns(self) -> Array:
         """(M, 5 + K) derivatives of the images across their curves by A's entries and the coefficients."""
-        a, s, b, _, _ = self.curves.entries
+        a, s, b, _, _ = self.entries
         zero, one = np.zeros_like(self.x), np.ones_like(self.x)
         by = [(self.x, zero), (self.y, zero), (zero, self.y), (one, zero), (zero, one)]
         by += [(a * dx + s * dy, b * dy) for dx, dy in self.by_k]
