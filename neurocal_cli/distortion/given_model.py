@@ -59,13 +59,10 @@ def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterab
     if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
         return solution
     few = of_few_views(solution, FEW_VIEWS)
-    if few is solution or is_elsewhere(few, solution) or _is_lower(few, _lowest(few, more_starts)):
+    certain = few is solution or is_elsewhere(few, solution)
+    if certain or _cost(_lowest(few, more_starts)) < _LOWER * _cost(few.adjusted):
         return replace(solution, adjusted=_lowest(solution, more_starts))
     return solution
-
-
-def _is_lower(solution: Solution, other: Adjusted) -> bool:
-    return _cost(other) < _LOWER * _cost(solution.adjusted)
 
 
 def _may_be_local(solution: Solution) -> bool:
@@ -89,10 +86,8 @@ def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[Camera
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
         if found is None or (fitted == wanted and not found.cost < _cost(best)):
             continue
-        for near in _as(wanted, found.adjusted, problem.views):
-            adjusted = problem.adjust(near)
-            if _cost(adjusted) < _cost(best):
-                best = adjusted
+        same = [problem.adjust(near) for near in _as(wanted, found.adjusted, problem.views)]
+        best = min([best, *same], key=_cost)
     return best
 
 

@@ -200,13 +200,15 @@ def _best(
     pool = {
         name: candidate
         for name, candidate in finite.items()
-        if name in few or all(_decidedly(candidate, other, repeated, _FAR_BETTER) for other in few.values())
+        if name in few
+        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, _FAR_BETTER) for c in few.values())
     }
     best = min(pool, key=lambda name: pool[name].held_out)
     good = {
         name
         for name, candidate in eligible.items()
-        if np.isfinite(candidate.lost).all() and not _decidedly(pool[best], candidate, repeated)
+        if np.isfinite(candidate.lost).all()
+        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
     }
     tied = []
     for name, candidate in pool.items():
@@ -230,12 +232,6 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
         for name, c in fitted.items()
         if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
-
-
-def _decidedly(
-    candidate: Candidate, other: Candidate, repeated: RepeatedPoses, enough: float = _DECIDEDLY
-) -> bool:
-    return predicts_decidedly_better(candidate.lost, other.lost, repeated, enough)
 
 
 def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
