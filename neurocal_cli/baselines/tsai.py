@@ -61,8 +61,13 @@ def tsai(problem: Problem) -> Found:
             "method"
         )
     check_points(problem)
-    remarks = () if problem.type == 2 else _remarks(problem)
+    u0, v0 = problem.entries[3:]
+    remark = (
+        f"the method tsai takes the image centre for known; ({u0:g}, {v0:g}) is used, and the true centre "
+        "may be tens of pixels away"
+    )
     state, least = _camera_and_poses(problem)
+    remarks = () if problem.type == 2 else (remark,)
     return Found(problem, state, False, least.iterations, least.converged, remarks)
 
 
@@ -89,14 +94,6 @@ def with_known_centre(problem: Problem) -> Problem:
     return replace(problem, entries=entries, free=free, fixed=frozenset({"u0", "v0", "theta"}))
 
 
-def _remarks(problem: Problem) -> tuple[str, ...]:
-    u0, v0 = problem.entries[3:]
-    return (
-        f"the method tsai takes the image centre for known; ({u0:g}, {v0:g}) is used, and the true centre "
-        "may be tens of pixels away",
-    )
-
-
 @frozen_dataclass(eq=False)
 class _Alignment:
     """Result of stage 1 for a group of views.
@@ -108,11 +105,6 @@ class _Alignment:
     views: NDArray[np.intp]
     flat: bool
     rows: Array
-
-    @property
-    def aspect(self) -> Array:
-        """(K,) s from each solid view."""
-        return np.asarray(np.linalg.norm(self.rows[:, 0, :3], axis=1))
 
     def poses(self, s: float, sign: Array) -> tuple[Array, Array, Array]:
         """R (K, 3, 3) and t_x, t_y (K,) for an aspect s; `sign` (K,) chooses a flat view's pose."""
@@ -173,7 +165,8 @@ class _Stages:
         """Mean aspect of the solid views, weighted by their points; None if all views are flat."""
         for group in self.groups:
             if not group.flat:
-                return float(np.average(group.aspect, weights=self.views.counts[group.views]))
+                aspect = np.linalg.norm(group.rows[:, 0, :3], axis=1)
+                return float(np.average(aspect, weights=self.views.counts[group.views]))
         return None
 
     def poses(self, s: float) -> tuple[Array, Array]:

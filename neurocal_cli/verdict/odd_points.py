@@ -170,7 +170,9 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     order = np.argsort(points.view_index, kind="stable")
     worlds = np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
     step = _steps(worlds)
-    usual = _most_common(step)
+    # The spacing that most views have; of two equally common ones, the first view's.
+    alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
+    usual = float(step[np.argmax(alike.sum(axis=1))])
     off = np.abs(np.log(step / usual)) > np.log(_SCALED)
     if not off.any():
         return
@@ -203,12 +205,6 @@ def _steps(worlds: list[Array]) -> Array:
             known[key] = float(median(np.sqrt(squares.min(axis=1))))
         found.append(known[key])
     return np.array(found)
-
-
-def _most_common(step: Array) -> float:
-    """The spacing that most views have; of two equally common ones, the first view's."""
-    near = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
-    return float(step[np.argmax(near.sum(axis=1))])
 
 
 def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.bool_]:

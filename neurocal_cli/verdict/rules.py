@@ -213,7 +213,9 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
-    if calibration.type == 2 and _is_middle(calibration):
+    size = calibration.image_size
+    is_middle = size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    if calibration.type == 2 and is_middle:
         yield (
             1,
             "the given image centre is the middle of the image, from which those of real cameras differ by "
@@ -225,7 +227,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
     if e.projection is not None and calibration.type != 3:
         worst = e.projection.worst
-        diagonal = float(np.hypot(*(calibration.image_size or (np.nan, np.nan))))
+        diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
         yield (
             _PROJECTION.grade(worst / diagonal),
             f"the std of predicted pixels is up to {worst:.2g} px",
@@ -267,11 +269,6 @@ def _lean(target: Target) -> float:
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]
     return abs(float((stretches(given)[1] * linear).sum()))
-
-
-def _is_middle(calibration: Calibration) -> bool:
-    A, size = calibration.intrinsics, calibration.image_size
-    return size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
 def _oblong(calibration: Calibration) -> bool:
