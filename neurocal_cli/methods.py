@@ -156,22 +156,19 @@ def calibrate(
 
             found = calibrate_by(method, problem, camera_name)
             _refuse_misfit(found)
-            return replace(
-                found,
-                warnings=(*found.warnings, *_unused(points, f"the method is {method}")),
-                judgement=assess,
+            warnings = _unused(points, f"the method is {method}")
+        else:
+            solution, rejected = _solved(problem, options, outliers, choice)
+            if known_target is not None:
+                solution = replace(solution, target=known_target)
+            if solution.refusal:
+                raise DegenerateGeometryError(solution.refusal)
+            found = calibration_of(
+                solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
             )
-        solution, rejected = _solved(problem, options, outliers, choice)
-        if known_target is not None:
-            solution = replace(solution, target=known_target)
-        if solution.refusal:
-            raise DegenerateGeometryError(solution.refusal)
-        found = calibration_of(
-            solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
-        )
-        _refuse_misfit(found)
-        warnings = (*found.warnings, *_about_target(found, solution, choice))
-        return replace(found, warnings=warnings, judgement=assess)
+            _refuse_misfit(found)
+            warnings = _about_target(found, solution, choice)
+        return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:

@@ -244,7 +244,7 @@ def distinct_points(
 ) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
     """The distinct world points (n, 3), the index of each row's point (N,), and the ids, if all have one."""
     world = np.concatenate([points.world for points in some])
-    first, label = distinct_rows(_whole(world, _scale(world)))
+    first, label = distinct_rows(_whole(world, world))
     ids = None
     if all(points.point is not None for points in some):
         ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
@@ -275,18 +275,14 @@ def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Corre
 
 
 def _places(known: Array, world: Array) -> NDArray[np.intp]:
-    both = _whole(np.concatenate([known, world]), _scale(known))
+    both = _whole(np.concatenate([known, world]), known)
     label = distinct_rows(both)[1]
     place = np.full(int(label.max()) + 1, -1, dtype=np.intp)
     place[label[: len(known)]] = np.arange(len(known))
     return place[label[len(known) :]]
 
 
-def _scale(world: Array) -> float:
-    """Resolution to which coordinates of the same point agree [world unit]."""
-    size = float(np.ptp(world, axis=0).max()) if len(world) else 1.0
-    return float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0
-
-
-def _whole(world: Array, scale: float) -> NDArray[np.float64]:
-    return np.round(world / scale)
+def _whole(world: Array, known: Array) -> Array:
+    """World coordinates in units of the resolution to which those of the same known point agree."""
+    size = float(np.ptp(known, axis=0).max()) if len(known) else 1.0
+    return np.round(world / (float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0))

@@ -7,7 +7,6 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 _CELLS = 6  # across and down

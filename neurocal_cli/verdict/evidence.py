@@ -15,44 +15,31 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """Measures of a calibration's quality.
+    """Measures of a calibration's quality; the last four are None if there is nothing of the kind."""
 
-    * `rmse_px` [px]: rms reprojection error of the calibration.
-    * `held_out_px` [px]: five-fold cross-validation error; nan if no data can be left out.
-    * `precision_px` [px]: noise floor, the rms error of a free network for each view, corrected for degrees
-      of freedom; nan if the networks are no freer than the camera.
-    * `contradiction`: the camera's rms error, corrected for degrees of freedom, over `precision_px`; 1 for
-      noise alone.
-    * `disagreement`: chi-squared per parameter of the difference between two halves of the data; 1 if the
-      reported standard deviations hold.
-    * `correlation` of neighbouring residuals; 0 for noise.
-    * `condition` of the normal matrix scaled to a unit diagonal.
-    * `projection`: at the distances of the nearest, median and farthest point, and at ten times the farthest;
-      None if the image size is unknown.
-    * `repeated`, `mirrored`: views that are copies of others; views that show the target mirrored.
-    * `reestimated`: given parameters, estimated from the points.
-    * `noise`: residuals that do not look like measurement noise, or contradict the stated noise.
-    * `poses`: number of different poses among the views (`repeated_poses`).
-    * `groups`, `change`, `board`, `missing`: two cameras among the views or a changing focal length, a change
-      of the camera between views, a bend or stretch of a target that is given as flat, the effect of
-      coefficients that the chosen distortion model lacks; each is None if there is none.
-    """
-
-    rmse_px: float
-    held_out_px: float
+    rmse_px: float  # rms reprojection error of the calibration
+    held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
+    # Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
+    # networks are no freer than the camera.
     precision_px: float
-    contradiction: float
+    contradiction: (
+        float  # rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone
+    )
+    # Chi-squared per parameter of the difference between two halves of the data; 1 if the reported standard
+    # deviations hold.
     disagreement: float
-    correlation: float
-    condition: float
+    correlation: float  # of neighbouring residuals; 0 for noise
+    condition: float  # of the normal matrix scaled to a unit diagonal
     coverage: Coverage
+    # At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
+    # image size is unknown.
     projection: ProjectionUncertainty | None
-    repeated: tuple[str, ...]
-    mirrored: tuple[str, ...]
-    reestimated: tuple[Reestimated, ...]
-    noise: tuple[Finding, ...]
-    groups: ViewGroups | None
-    poses: int
-    change: ViewChange | None
-    board: BoardShape | None
-    missing: MissingCoefficients | None
+    repeated: tuple[str, ...]  # views that are copies of others
+    mirrored: tuple[str, ...]  # views that show the target mirrored
+    reestimated: tuple[Reestimated, ...]  # given parameters, estimated from the points
+    noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
+    poses: int  # number of different poses among the views (`repeated_poses`)
+    groups: ViewGroups | None  # two cameras among the views, or a changing focal length
+    change: ViewChange | None  # of the camera between views
+    board: BoardShape | None  # bend or stretch of a target that is given as flat
+    missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks

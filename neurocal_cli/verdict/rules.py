@@ -14,8 +14,7 @@ from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import Reestimated
-from neurocal_cli.verdict.odd_points import normalised, odd_pixels, points_given_twice, views_of_another_scale
-from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
+from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
@@ -155,11 +154,7 @@ def given_parameters(
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    points = with_rejected(calibration)
-    yield from rejected_points(calibration)
-    yield from odd_pixels(points)
-    yield from points_given_twice(points)
-    yield from views_of_another_scale(calibration.points)
+    yield from odd_points(calibration)
     yield from e.noise
     if e.repeated:
         twice = "the rows are given twice, in the view itself or in another one"
