@@ -81,7 +81,8 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
     if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
         fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
-    repeated = _repeated(views, fitted)
+    closest = min(fitted.values(), key=lambda c: c.cost).adjusted.state
+    repeated = repeated_poses(views, closest, point_residuals(views, closest))
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
@@ -154,12 +155,6 @@ def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: flo
     for model, candidate in others.items():
         if model not in fitted or candidate.cost < fitted[model].cost:
             fitted[model] = candidate
-
-
-def _repeated(views: Views, fitted: dict[str, Candidate]) -> RepeatedPoses:
-    """Views that repeat a pose, according to the closest fit."""
-    state = min(fitted.values(), key=lambda c: c.cost).adjusted.state
-    return repeated_poses(views, state, point_residuals(views, state))
 
 
 def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:

@@ -11,8 +11,17 @@ C = sum_j s_j^2 C_j, and S the posterior covariance of w. Then
 
     gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
-A wide lognormal prior bounds sizes that the points do not determine. The covariance includes the prior, and
-it is averaged over the profile's sizes (see `profile_sizes`).
+A wide lognormal prior bounds sizes that the points do not determine. The covariance includes the prior.
+
+Among the points, these determine the profile g. Farther out its prior dominates, whose sizes may be poorly
+determined: if a polynomial fits the profile among the points, the most probable sizes are small, but larger
+ones are not much less probable. So the covariance is averaged over the sizes of the profile. Let w_m be the
+posterior weight of the m-th sizes, P_m and g_m the posterior covariance and mean of g for them, g the
+reported profile, and T = dc/dg the response of all other unknowns c. Then
+
+    E = sum_m w_m (P_m + (g_m - g) (g_m - g)^T),    cov(c, g) = cov(c, g | g) + [T; 1] E [T; 1]^T
+
+is the result of Bayesian model averaging (Hoeting et al. 1999) around the reported parameters.
 """
 
 from __future__ import annotations
@@ -32,10 +41,9 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
-from neurocal_cli.distortion.profile_sizes import averaged_over_sizes
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.normal_equations import unit_diagonal
+from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
 _N = len(NODES)
 # Indices of k1 to k4 and the nodes among the coefficients; and the parts of these unknowns.
@@ -141,7 +149,7 @@ def _by_evidence(solution: Solution) -> Solution:
         before = found.sizes
         rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
         problem = replace(problem, penalty=_Prior(rows, before, processes.scale))
-        adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
+        adjusted = problem.adjust(adjusted)
         normal = adjusted.normal
         found = _sizes(problem, adjusted.state, normal, processes, before)
         if (found.gamma * np.abs(np.log(found.sizes / before))).max() < _NEARLY:
@@ -162,6 +170,43 @@ def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
     profile = slice(first + _PROFILE.start, first + _PROFILE.stop)
     H, right = H / found.variance, right / found.variance
     return averaged_over_sizes(found.covariance, H, right, profile, x[_PROFILE], processes.profiles())
+
+
+def averaged_over_sizes(
+    covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]
+) -> Array:
+    """Covariance (f, f) of the shared parameters, averaged over the priors of the profile.
+
+    `covariance` is that for one of the priors; H (f, f) and `right` (f,) are the precision, and the gradient
+    at the reported values, without the profile's prior; `profile` are the places of the profile among the f
+    parameters and `value` (n,) the reported one; `priors` are prior covariances (m, n, n) and the logarithms
+    (m,) of their prior probabilities.
+    """
+    is_profile = np.zeros(len(H), dtype=bool)
+    is_profile[profile] = True
+    T = -solve_scaled(H[np.ix_(~is_profile, ~is_profile)], H[~is_profile, profile])
+    told = H[profile, profile] + H[profile, ~is_profile] @ T
+    information = right[profile] + T.T @ right[~is_profile] + told @ value
+    follow = np.zeros((len(H), len(value)))
+    follow[profile], follow[~is_profile] = np.eye(len(value)), T
+    E = _second_moment(told, information, value, *priors)
+    return np.asarray(covariance + follow @ (E - covariance[profile, profile]) @ follow.T)
+
+
+def _second_moment(
+    told: Array, information: Array, value: Array, covariances: Array, logarithm: Array
+) -> Array:
+    """E, from the profile's J^T J and J^T r at 0."""
+    root = np.linalg.cholesky(covariances)
+    turned = np.swapaxes(root, 1, 2)
+    G = np.eye(len(told)) + turned @ told @ root
+    P = root @ np.linalg.inv(G) @ turned
+    mean = P @ information
+    logarithm = logarithm + 0.5 * (mean @ information - np.linalg.slogdet(G)[1])
+    weight = np.exp(logarithm - logarithm.max())
+    away = mean - value
+    second = P + away[:, :, None] * away[:, None, :]
+    return np.asarray(np.tensordot(weight / weight.sum(), second, axes=1))
 
 
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:

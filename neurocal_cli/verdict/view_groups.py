@@ -83,7 +83,7 @@ def view_groups(
         one_each = np.inf
     found = _two_cameras(views, state, quadratics, free)
     two = np.inf
-    if found is not None and _differ(found.cameras):
+    if found is not None and found.differs:
         two = (found.cost - own) / (spare - n_free)
     if min(one_each, two) > noise:
         return None
@@ -102,15 +102,16 @@ def view_groups(
     )
 
 
-def _differ(cameras: Array) -> bool:
-    return bool((np.abs(cameras[0] - cameras[1])[[0, 2, 3, 4]] > _DIFFERENT * cameras[0, 0]).any())
-
-
 @frozen_dataclass(eq=False)
 class _Split:
     member: NDArray[np.bool_]
     cameras: Array  # (2, 5), normalised
     cost: float
+
+    @property
+    def differs(self) -> bool:
+        first, second = self.cameras[:, [0, 2, 3, 4]]
+        return bool((np.abs(first - second) > _DIFFERENT * first[0]).any())
 
 
 def _two_cameras(
