@@ -367,7 +367,6 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     if not np.isfinite(distorted).all():  # there is a pole
         return pinhole_coefficients(model)
     found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
-    new = {name: k for name, k in old.items() if name in NOT_RADIAL} | dict(
-        zip(of_radius, found, strict=True)
-    )
+    new = {name: k for name, k in old.items() if name in NOT_RADIAL}
+    new.update(zip(of_radius, found, strict=True))
     return np.array([new.get(name, 0.0) for name in names])

@@ -297,16 +297,11 @@ def _sizes(
         inverse = _inverse(H)
         step = inverse @ right
         covariance, w = variance * inverse[own, own], x + step[own]
-        num, den = (
-            np.concatenate(
-                [
-                    _evidence(processes.profile, of_profile, w, covariance, (_PROFILE,)),
-                    _evidence(processes.field, of_field, w, covariance, (_FIELD_X, _FIELD_Y)),
-                ],
-                axis=1,
-            )
-            * sizes**2
+        of_each = (
+            _evidence(processes.profile, of_profile, w, covariance, (_PROFILE,)),
+            _evidence(processes.field, of_field, w, covariance, (_FIELD_X, _FIELD_Y)),
         )
+        num, den = np.concatenate(of_each, axis=1) * sizes**2
         determined = _N - float((P[4:, 4:] * covariance[4:, 4:]).sum())
         last, variance = variance, (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
         change = np.clip(_change(num, den, np.log(sizes / scale)), -_LONGEST, _LONGEST)

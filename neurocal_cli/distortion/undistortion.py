@@ -46,13 +46,17 @@ def undistorted_camera(
     size = size or camera.image_size
     intrinsics = plane_like(camera)
     if alpha is not None:
-        if size is None:
-            raise InputError(
-                "alpha needs the size of the images, which neither the camera nor the points have; add "
-                "image_size"
-            )
-        intrinsics = new_matrix(camera, size, alpha)
+        intrinsics = new_matrix(camera, _known("alpha", size), alpha)
     return Camera(intrinsics, Distortion(), size, camera.name)
+
+
+def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
+    if size is None:
+        raise InputError(
+            f"{what} needs the size of the images, which neither the camera nor the points have; add "
+            "image_size"
+        )
+    return size
 
 
 def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array | None = None) -> Array:
@@ -129,11 +133,9 @@ def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsic
     least, most = _outer(camera, corner)
     least, most = np.fmin(least, low), np.fmax(most, high)
     outer = corner / (most - least)
-    (a, b), (u0, v0) = (
-        (1 - alpha) * inner + alpha * outer,
-        (1 - alpha) * -inner * low + alpha * -outer * least,
-    )
-    return Intrinsics(a, b, u0, v0)
+    scale = (1 - alpha) * inner + alpha * outer
+    centre = (1 - alpha) * -inner * low + alpha * -outer * least
+    return Intrinsics(*scale, *centre)
 
 
 def _inner(camera: Camera, corner: Array) -> tuple[Array, Array]:
@@ -222,12 +224,7 @@ def chosen_view(
         return undistorted_camera(camera, alpha, size)
     if alpha is not None:
         raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
-    size = size or camera.image_size
-    if size is None:
-        raise InputError(
-            "a field of view needs the size of the images, which neither the camera nor the points have; add "
-            "image_size"
-        )
+    size = _known("a field of view", size or camera.image_size)
     return undistorted_view(camera, size, to, fov, new_size)
 
 
