@@ -20,21 +20,11 @@ N_SHAPES = 3
 
 @frozen_dataclass(eq=False)
 class Bends:
-    """The bend of the board in each view.
+    """The bend of the board in each of the named views."""
 
-    Attributes
-    ----------
-    size : float [world unit]
-        Prior standard deviation of each coefficient, the expected rms height of a bend.
-    names : tuple of str
-        Names of the views.
-    coefficients : (V, 3) array [world unit]
-        Coefficients of the three shapes in each view.
-    """
-
-    size: float
+    size: float  # [world unit] prior std of each coefficient, the expected rms height of a bend
     names: tuple[str, ...]
-    coefficients: Array
+    coefficients: Array  # (V, 3) [world unit] of the three shapes in each view
 
     def of_views(self, names: tuple[str, ...]) -> Array:
         """(V, 3) coefficients of the named views; 0 for unknown views."""
@@ -51,26 +41,14 @@ class Bends:
 
 @frozen_dataclass(eq=False)
 class Surface:
-    """The three shapes of a bend over the plane of a board.
+    """The three shapes of a bend over the plane of a board."""
 
-    Attributes
-    ----------
-    centre : (3,) array [world unit]
-    axes : (3, 3) array
-        Columns: two in the plane, and the normal.
-    half : float [world unit]
-        Half of the board's longer side.
-    times : (3,) array
-        Factors of x^2 + y^2, x^2 - y^2 and 2 x y, with which coefficients of variance 1 give heights of mean
-        square 1.
-    planes : (3, 3) array
-        The plane subtracted from each shape (columns), as coefficients of 1, x and y (rows).
-    """
-
-    centre: Array
-    axes: Array
-    half: float
+    centre: Array  # (3,) [world unit]
+    axes: Array  # (3, 3) columns: two in the plane, and the normal
+    half: float  # [world unit] half of the board's longer side
+    # (3,) factors of the shapes, with which coefficients of variance 1 give heights of mean square 1.
     times: Array
+    # (3, 3) the plane subtracted from each shape (columns), as coefficients of 1, x and y (rows).
     planes: Array
 
     def offsets(self, world: Array) -> Array:

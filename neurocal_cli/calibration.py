@@ -35,105 +35,53 @@ class StopReason(str, Enum):
 
 @frozen_dataclass(eq=False)
 class NetworkRecord:
-    """Record of the training, kept with the result.
+    """Record of the training, kept with the result; errors and losses are in pixels."""
 
-    Attributes
-    ----------
-    W : (3, 3) array
-        Output weights, ``A = S1 W``, ``W[2, 2] = 1``.
-    V : dict of (3, 4) arrays by view
-        Hidden weights; ``[R | t] = s2 V S2`` up to the scale that gamma leaves free.
-    S1 : (3, 3) array
-        From normalised to real pixels.
-    S2 : dict of (4, 4) arrays by view
-        From real to normalised world coordinates; ``P = S1 W V S2`` up to scale.
-    starts, agreed : int
-        Number of random starts over all views; least number in any view that ended at its best result.
-    iterations : int
-        Training iterations (epochs for backprop) of the network, summed over the starts.
-    refine_iterations : int
-        Iterations of bundle adjustment on the reprojection error (3).
-    loss : float
-        Root mean square of the network's error (5) after training [px].
-    rmse_before, rmse_after : float
-        Reprojection error (3) before and after bundle adjustment [px].
-    curve : tuple of float
-        Learning curve: loss of the network [px rms] along the training of the best start.
-    """
-
-    W: Array
+    W: Array  # (3, 3) output weights, ``A = S1 W``, ``W[2, 2] = 1``
+    # By view, (3, 4) hidden weights; ``[R | t] = s2 V S2`` up to the scale that gamma leaves free.
     V: Mapping[str, Array]
-    S1: Array
-    S2: Mapping[str, Array]
-    starts: int
-    agreed: int
-    iterations: int
-    refine_iterations: int
-    loss: float
-    rmse_before: float
+    S1: Array  # (3, 3) from normalised to real pixels
+    S2: Mapping[str, Array]  # by view, (4, 4) from real to normalised world; ``P = S1 W V S2`` up to scale
+    starts: int  # number of random starts over all views
+    agreed: int  # least number of starts in any view that ended at its best result
+    iterations: int  # of training the network (epochs for backprop), summed over the starts
+    refine_iterations: int  # of bundle adjustment on the reprojection error (3)
+    loss: float  # rms of the network's error (5) after training
+    rmse_before: float  # reprojection error (3) before bundle adjustment
     rmse_after: float
-    curve: tuple[float, ...] = ()
+    curve: tuple[float, ...] = ()  # learning curve: loss along the training of the best start
 
 
 @frozen_dataclass
 class StraightLines:
-    """Record of a distortion that was estimated from straight lines alone.
+    """Record of a distortion that was estimated from straight lines alone."""
 
-    Attributes
-    ----------
-    n_lines, n_points : int
-        Number of lines, counted in each view that shows them, and of points on them.
-    centre : (u, v) [px]
-        Centre of distortion.
-    rms_before, rms_after : float [px]
-        Distance of the points from straight lines before and after undistortion.
-    """
-
-    n_lines: int
-    n_points: int
-    centre: tuple[float, float]
-    rms_before: float
-    rms_after: float
+    n_lines: int  # counted in each view that shows them
+    n_points: int  # on these lines
+    centre: tuple[float, float]  # (u, v) [px] of the distortion
+    rms_before: float  # px; distance of the points from straight lines before undistortion
+    rms_after: float  # px; the same after it
 
 
 @frozen_dataclass(eq=False)
 class ViewResult:
-    """One view's pose.
-
-    Attributes
-    ----------
-    pose : Pose
-    std : dict
-        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z [world unit]; 0 for a given pose.
-    n_points : int
-    rmse_px : float [px]
-    fixed : bool
-        Whether the pose was given.
-    """
+    """One view's pose."""
 
     pose: Pose
-    std: Mapping[str, float]
+    std: Mapping[str, float]  # of R_x, R_y, R_z [rad], t_x, t_y, t_z [world unit]; 0 for a given pose
     n_points: int
     rmse_px: float
-    fixed: bool = False
+    fixed: bool = False  # whether the pose was given
 
 
 @frozen_dataclass(eq=False)
 class Rejected:
-    """Outliers: points and views that were left out because they contradict the others.
+    """Outliers: points and views that were left out because they contradict the others."""
 
-    Attributes
-    ----------
-    points : Correspondences or None
-        With their lines in the file; None if there are none.
-    error_px : (M,) array [px]
-        Reprojection error of each point; nan where it has none, and in views that were left out as a whole.
-    views : dict of str by view name
-        Views that were left out as a whole, each with the reason.
-    """
-
-    points: Correspondences | None = None
+    points: Correspondences | None = None  # with their lines in the file; None if there are none
+    # (M,) reprojection error of each point; nan where it has none, and in views left out as a whole.
     error_px: Array = field(default_factory=lambda: np.zeros(0))
+    # Those that were left out as a whole, each with the reason.
     views: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -142,23 +90,12 @@ class Rejected:
 
 @frozen_dataclass
 class Verdict:
-    """Verdict on a calibration: one word, with reasons and advice.
+    """Verdict on a calibration: one word, with reasons and advice."""
 
-    Attributes
-    ----------
-    word : str
-        "good", "usable" or "poor".
-    reasons : tuple of str
-        What is wrong, the worst first; empty for a good calibration.
-    advice : tuple of str
-        What to do about it.
-    measures : dict of float
-        The measures behind it (`verdict.evidence.Evidence`); nan if not determined.
-    """
-
-    word: str
-    reasons: tuple[str, ...]
-    advice: tuple[str, ...]
+    word: str  # "good", "usable" or "poor"
+    reasons: tuple[str, ...]  # what is wrong, the worst first; empty for a good calibration
+    advice: tuple[str, ...]  # what to do about it
+    # The measures behind it (`verdict.evidence.Evidence`); nan if not determined.
     measures: Mapping[str, float]
 
 
@@ -307,12 +244,7 @@ def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
 def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
     """Convert any of the accepted types to a `Camera`; a matrix has no distortion.
 
-    Raises
-    ------
-    UsageError
-        Another type.
-    InputError
-        A matrix that is no camera matrix.
+    Raises UsageError for another type, and InputError for a matrix that is no camera matrix.
     """
     if isinstance(given, Camera):
         return given

@@ -20,24 +20,15 @@ _ANOTHER_UNIT = 0.1  # a scale further from 1 is not that of a print of the stat
 class Distance:
     """A measured distance between two places of a board.
 
-    Parameters
-    ----------
-    start, end : str
-        Ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of the first
-        square.
-    length, std : float [world unit]
-        Measured distance and its standard deviation.
-
-    Raises
-    ------
-    InputError
-        An invalid id, or a length or standard deviation that is not positive.
+    The places are ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of
+    the first square. Raises InputError for an invalid id, and for a length or standard deviation that is not
+    positive.
     """
 
     start: str
     end: str
-    length: float
-    std: float
+    length: float  # world unit
+    std: float  # of the length
 
     def __post_init__(self) -> None:
         if grid_place(self.start) == grid_place(self.end):
@@ -54,21 +45,11 @@ class Distance:
 
 @frozen_dataclass
 class Scale:
-    """The scale of a target from measured distances.
+    """The scale of a target from measured distances."""
 
-    Attributes
-    ----------
-    factor : float
-        By which all lengths have to be multiplied.
-    std : float
-        Standard deviation of the factor. Distances that contradict each other increase it.
-    contradiction : str
-        The distance that contradicts the others, if any.
-    """
-
-    factor: float = 1.0
-    std: float = 0.0
-    contradiction: str = ""
+    factor: float = 1.0  # by which all lengths have to be multiplied
+    std: float = 0.0  # of the factor; distances that contradict each other increase it
+    contradiction: str = ""  # the distance that contradicts the others, if any
 
 
 NO_SCALE = Scale()
@@ -76,13 +57,7 @@ _CONTRADICTED = 4.0  # standard deviations of a distance
 
 
 def grid_place(label: str) -> tuple[str, float, float]:
-    """Plane, column and row of an id ``[plane/]c:r``.
-
-    Raises
-    ------
-    InputError
-        No such id.
-    """
+    """Plane, column and row of an id ``[plane/]c:r``; an InputError for any other text."""
     match = re.fullmatch(_LABEL, label) if isinstance(label, str) else None
     if match is None:
         raise InputError(f"{label!r} is no place on a board; write a vertex as column:row, such as 0:0")
@@ -92,16 +67,8 @@ def grid_place(label: str) -> tuple[str, float, float]:
 def fitted_scale(places: Callable[[str], Array], distances: Sequence[Distance]) -> Scale:
     """Fit the scale of a target to distances, each weighted by its standard deviation.
 
-    Parameters
-    ----------
-    places : callable
-        Nominal world coordinates (3,) of an id.
-    distances : sequence of Distance
-
-    Raises
-    ------
-    InputError
-        An id that the target does not have; distances in another unit.
+    `places` gives the nominal world coordinates (3,) of an id. Raises InputError for an id that the target
+    does not have, and for distances in another unit.
     """
     if not distances:
         return NO_SCALE

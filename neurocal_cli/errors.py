@@ -23,14 +23,8 @@ class InputError(NeurocalError, ValueError):
 class FormatError(NeurocalError, ValueError):
     """A file that cannot be read as the expected format.
 
-    Parameters
-    ----------
-    problem : str
-        What is wrong and what to do.
-    source : str
-        The file's name, ``<stdin>`` for a stream.
-    line : int, optional
-        Line number, counted from 1.
+    `problem` says what is wrong and what to do. The source is the file's name, ``<stdin>`` for a stream, and
+    its lines are counted from 1.
     """
 
     def __init__(self, problem: str, source: str = "", line: int | None = None) -> None:
@@ -56,23 +50,12 @@ class UsageError(NeurocalError):
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuse a value that is not one of an option's choices.
-
-    Raises
-    ------
-    UsageError
-        It names the option and its values.
-    """
+    """Refuse a value that is not one of an option's choices, with a UsageError that names them."""
     if value not in choices:
         raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
 
 
 def check_seed(seed: object) -> None:
-    """Refuse a seed that NumPy's generators do not take.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a seed that NumPy's generators do not take, with a UsageError."""
     if not isinstance(seed, Integral) or int(seed) < 0:  # NumPy's integers are Integral, too
         raise UsageError("seed must be a whole number of at least 0")

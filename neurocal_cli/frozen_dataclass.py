@@ -68,46 +68,33 @@ def _init(cls: Any) -> Callable[..., None]:
     arguments = [f for f in fields(cls) if f.init]
     by_position = [f for f in arguments if not f.kw_only]
     by_name = [f for f in arguments if f.kw_only]
-    factories = [(f.name, f.default_factory) for f in fields(cls) if f.default_factory is not MISSING]
+    factories = {f.name: f.default_factory for f in fields(cls) if f.default_factory is not MISSING}
+    defaults = {f.name: f.default for f in arguments if f.default is not MISSING}
+    defaults |= {f.name: _FACTORY for f in arguments if f.name in factories}
     has_post_init = hasattr(cls, "__post_init__")
 
     def assign(self: Any, values: dict[str, Any]) -> None:
         del values["self"]
         vars(self).update(values)
-        for name, factory in factories:
+        for name, factory in factories.items():
             if values.get(name, _FACTORY) is _FACTORY:
                 vars(self)[name] = factory()
         if has_post_init:
             self.__post_init__()
 
-    names = ", ".join(
-        ["self", *map(_argument, by_position), *["*"][: len(by_name)], *map(_argument, by_name)]
-    )
-    compiled: dict[str, Any] = {}
-    exec(
-        f"def __init__({names}): _assign(self, locals())",
-        {"_assign": assign, "__name__": cls.__module__},
-        compiled,
-    )
+    def argument(f: Field[Any]) -> str:
+        # The default itself is put in its place afterwards; this one lets Python check the order.
+        return f"{f.name}=0" if f.name in defaults else f.name
+
+    names = ["self", *map(argument, by_position), *["*"][: len(by_name)], *map(argument, by_name)]
+    compiled: dict[str, Any] = {"_assign": assign, "__name__": cls.__module__}
+    exec(f"def __init__({', '.join(names)}): _assign(self, locals())", compiled)
     init = compiled["__init__"]
     init.__qualname__ = f"{cls.__qualname__}.__init__"
     init.__annotations__ = {f.name: f.type for f in arguments} | {"return": None}
-    init.__defaults__ = tuple([_default(f) for f in by_position if _has_default(f)])
-    init.__kwdefaults__ = {f.name: _default(f) for f in by_name if _has_default(f)}
+    init.__defaults__ = tuple([defaults[f.name] for f in by_position if f.name in defaults])
+    init.__kwdefaults__ = {f.name: defaults[f.name] for f in by_name if f.name in defaults}
     return init
-
-
-def _has_default(argument: Field[Any]) -> bool:
-    return argument.default is not MISSING or argument.default_factory is not MISSING
-
-
-def _default(argument: Field[Any]) -> Any:
-    return argument.default if argument.default is not MISSING else _FACTORY
-
-
-def _argument(argument: Field[Any]) -> str:
-    # The default itself is put in its place afterwards; this one lets Python check the order.
-    return f"{argument.name}=0" if _has_default(argument) else argument.name
 
 
 @recursive_repr()

@@ -27,16 +27,7 @@ _SINGULAR = 1e-9  # below it only the combination is taken to vary with a rotati
 
 
 def euler_to_rotation(R_x: float, R_y: float, R_z: float) -> Array:
-    """Rotation matrix ``Rz(R_z) Ry(R_y) Rx(R_x)``.
-
-    Parameters
-    ----------
-    R_x, R_y, R_z : float [rad]
-
-    Returns
-    -------
-    R : (3, 3) array
-    """
+    """Rotation matrix ``Rz(R_z) Ry(R_y) Rx(R_x)``, (3, 3), of angles in radians."""
     cx, cy, cz = np.cos(R_x), np.cos(R_y), np.cos(R_z)
     sx, sy, sz = np.sin(R_x), np.sin(R_y), np.sin(R_z)
     return np.array(
@@ -49,16 +40,7 @@ def euler_to_rotation(R_x: float, R_y: float, R_z: float) -> Array:
 
 
 def rotation_to_euler(R: Array) -> Array:
-    """Euler angles of rotations; R_z is 0 where R_y is +-pi/2.
-
-    Parameters
-    ----------
-    R : (..., 3, 3) array
-
-    Returns
-    -------
-    angles : (..., 3) array of R_x, R_y, R_z [rad]
-    """
+    """Euler angles R_x, R_y, R_z [rad], (..., 3, 3) -> (..., 3); R_z is 0 where R_y is +-pi/2."""
     R = np.asarray(R, dtype=float)
     cy = np.hypot(R[..., 0, 0], R[..., 1, 0])
     locked = cy < _GIMBAL_COSINE
@@ -72,18 +54,10 @@ def rotation_to_euler(R: Array) -> Array:
 
 
 def euler_jacobian(R: Array) -> Array:
-    """Derivative of the Euler angles by a small left rotation, ``R -> exp(omega) R``.
+    """Derivative (..., 3, 3) of the Euler angles of rotations by a small left one, ``R -> exp(omega) R``.
 
-    Columns of the inverse are the instantaneous axes of R_x, R_y, R_z in the camera frame.
-    At gimbal lock the pseudo-inverse is returned: only the defined combination moves.
-
-    Parameters
-    ----------
-    R : (..., 3, 3) array
-
-    Returns
-    -------
-    J : (..., 3, 3) array, d(R_x, R_y, R_z) / d omega
+    Columns of the inverse are the instantaneous axes of R_x, R_y, R_z in the camera frame. At gimbal lock the
+    pseudo-inverse is returned: only the defined combination moves.
     """
     _, R_y, R_z = np.moveaxis(rotation_to_euler(R), -1, 0)
     cy, sy, cz, sz = np.cos(R_y), np.sin(R_y), np.cos(R_z), np.sin(R_z)
@@ -196,20 +170,10 @@ def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def similarity(points: Array) -> tuple[Array, float]:
-    """Centre and scale that bring points into [-1, 1], the paper's s_1 and s_2 with an origin.
+    """Centre (D,) and scale that bring points (N, D) into [-1, 1], the paper's s_1 and s_2 with an origin.
 
-    Dividing by s alone leaves data far from the origin badly conditioned (Hartley 1997), so the
-    centroid is subtracted first.
-
-    Parameters
-    ----------
-    points : (N, D) array
-
-    Returns
-    -------
-    centre : (D,) array
-    scale : float
-        Largest absolute centred coordinate; 1 when all the points coincide.
+    Dividing by s alone leaves data far from the origin badly conditioned (Hartley 1997), so the centroid is
+    subtracted first. The scale is 1 when all the points coincide.
     """
     centre = points.mean(axis=0)
     scale = float(np.abs(points - centre).max(initial=0.0))

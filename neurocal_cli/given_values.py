@@ -14,10 +14,8 @@ _LONGEST = 10**6  # px; longer sides are mistakes
 def real_array(name: str, values: ArrayLike) -> Array:
     """Convert to an array of floats, which shares memory with an array of floats.
 
-    Raises
-    ------
-    InputError
-        Text, rows of different lengths, complex numbers, or a masked array with hidden entries.
+    Raises InputError for text, rows of different lengths, complex numbers and masked arrays with hidden
+    entries.
     """
     try:
         array = np.asarray(values)
@@ -32,13 +30,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 
 
 def checked_size(size: ArrayLike) -> tuple[int, int]:
-    """Width and height of an image [px] as whole numbers.
-
-    Raises
-    ------
-    InputError
-        They are not two whole numbers from 1 to a million.
-    """
+    """Width and height of an image [px]; an InputError unless they are whole numbers from 1 to a million."""
     sides = real_array("image_size", size)
     if sides.shape != (2,) or not ((sides >= 1) & (sides <= _LONGEST) & (sides == np.round(sides))).all():
         raise InputError(f"image_size must be two positive whole numbers up to {_LONGEST} px")

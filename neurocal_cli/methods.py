@@ -23,7 +23,7 @@ from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
-from neurocal_cli.verdict.pixel_values import repeated_views
+from neurocal_cli.verdict.odd_points import repeated_views
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
@@ -156,22 +156,19 @@ def calibrate(
 
             found = calibrate_by(method, problem, camera_name)
             _refuse_misfit(found)
-            return replace(
-                found,
-                warnings=(*found.warnings, *_unused(points, f"the method is {method}")),
-                judgement=assess,
+            warnings = _unused(points, f"the method is {method}")
+        else:
+            solution, rejected = _solved(problem, options, outliers, choice)
+            if known_target is not None:
+                solution = replace(solution, target=known_target)
+            if solution.refusal:
+                raise DegenerateGeometryError(solution.refusal)
+            found = calibration_of(
+                solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
             )
-        solution, rejected = _solved(problem, options, outliers, choice)
-        if known_target is not None:
-            solution = replace(solution, target=known_target)
-        if solution.refusal:
-            raise DegenerateGeometryError(solution.refusal)
-        found = calibration_of(
-            solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
-        )
-        _refuse_misfit(found)
-        warnings = (*found.warnings, *_about_target(found, solution, choice))
-        return replace(found, warnings=warnings, judgement=assess)
+            _refuse_misfit(found)
+            warnings = _about_target(found, solution, choice)
+        return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:
@@ -211,10 +208,7 @@ def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> t
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
     """Estimate the poses of a given camera's views (type 3) from all points, without outlier rejection.
 
-    Raises
-    ------
-    InputError, DegenerateGeometryError
-        Points that do not determine the poses.
+    Raises InputError or DegenerateGeometryError if the points do not determine the poses.
     """
     given = camera_of(camera)
     problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)

@@ -14,7 +14,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.given_values import checked_size, real_array
-from neurocal_cli.repeated_ids import first_repeat
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
@@ -174,39 +173,30 @@ class Correspondences:
         def pick(values: Any) -> Any:
             return None if values is None else np.asarray(values)[rows]
 
-        return replace(
-            self,
-            world=self.world[rows],
-            pixels=self.pixels[rows],
-            view=pick(self.view),
-            point=pick(self.point),
-            covariance=pick(self.covariance),
-            world_std=pick(self.world_std),
-            across=pick(self.across),
-            lines=pick(self.lines),
-        )
+        by_row = ("world", "pixels", "view", "point", "covariance", "world_std", "across", "lines")
+        return replace(self, **{name: pick(getattr(self, name)) for name in by_row})
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def _refuse_row(self, good: NDArray[np.bool_], problem: str) -> None:
+        """Refuse the first row that is not good."""
+        if not good.all():
+            raise InputError(f"{self.place(int(np.argmin(good)))}: {problem}; correct or remove the row")
 
     def _check_finite(self) -> None:
         for name, values in (("X,Y,Z", self.world), ("u,v", self.pixels)):
             if values.min() >= -_LARGEST and values.max() <= _LARGEST:  # False for nan, 20 times faster
                 continue
             good = np.abs(values).max(axis=1) <= _LARGEST  # False for nan as well
-            if not good.all():
-                row = int(np.argmin(good))
-                raise InputError(
-                    f"{self.place(row)}: {name} must be finite numbers of a sensible size, found "
-                    f"{', '.join(f'{x:g}' for x in values[row])}; correct or remove the row"
-                )
-
+            found = ", ".join(f"{x:g}" for x in values[np.argmin(good)])
+            self._refuse_row(good, f"{name} must be finite numbers of a sensible size, found {found}")
         if 0 < max(-self.world.min(), self.world.max()) < 1 / _LARGEST:
             raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
 
     def _check_ids(self, ids: NDArray[Any]) -> None:
-        repeat = first_repeat(self.view_index, ids)
+        repeat = _first_repeat(self.view_index, ids)
         if repeat is None:
             return
         row, earlier = repeat
@@ -221,39 +211,27 @@ class Correspondences:
         suu, suv, svv = covariance.T
         with np.errstate(over="ignore", invalid="ignore"):
             good = (suu > 0) & (svv > 0) & (suu * svv > suv * suv) & (suu * svv < np.inf)
-        if not good.all():
-            row = int(np.argmin(good))
-            raise InputError(
-                f"{self.place(row)}: the pixel's covariance (sigma, or suu,suv,svv) must be positive "
-                "definite; correct or remove the row"
-            )
+        self._refuse_row(
+            np.asarray(good), "the pixel's covariance (sigma, or suu,suv,svv) must be positive definite"
+        )
         self._set(covariance=_frozen(covariance))
 
     def _check_world_std(self, std: Array) -> None:
-        if len(std) != len(self.world):
-            raise InputError(
-                f"{self.source}: world_std needs one row for each of the {len(self.world)} points"
-            )
-        good = ((std >= 0) & (std <= _LARGEST)).all(axis=1)  # False for nan as well
-        if not good.all():
-            row = int(np.argmin(good))
-            raise InputError(
-                f"{self.place(row)}: the world point's standard deviation sX,sY,sZ must be numbers of at "
-                "least 0; correct or remove the row"
-            )
-        self._set(world_std=_frozen(std) if std.any() else None)
+        good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
+        problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
+        self._set_rows("world_std", std, good, problem)
 
     def _check_across(self, across: Array) -> None:
-        if len(across) != len(self.world):
-            raise InputError(f"{self.source}: across needs one row for each of the {len(self.world)} points")
-        good = np.abs(across).max(axis=1) <= _LARGEST  # False for nan as well
-        if not good.all():
-            row = int(np.argmin(good))
-            raise InputError(
-                f"{self.place(row)}: the direction nu,nv in which the point was measured must be two finite "
-                "numbers; correct or remove the row"
-            )
-        self._set(across=_frozen(across) if across.any() else None)
+        good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
+        problem = "the direction nu,nv in which the point was measured must be two finite numbers"
+        self._set_rows("across", across, good, problem)
+
+    def _set_rows(self, name: str, values: Array, good: NDArray[np.bool_], problem: str) -> None:
+        """Set values of all points, unless all are zero."""
+        if len(values) != len(self.world):
+            raise InputError(f"{self.source}: {name} needs one row for each of the {len(self.world)} points")
+        self._refuse_row(good, problem)
+        self._set(**{name: _frozen(values) if values.any() else None})
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
@@ -291,3 +269,29 @@ def _factorise(
     rank[order] = np.arange(len(order))
     run_lengths = np.diff(np.concatenate([starts, [n]]))
     return tuple(str(distinct[k]) for k in order), np.repeat(rank[inverse.ravel()], run_lengths)
+
+
+def _first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the first row whose id occurred in its view before, and that earlier row, if there is one."""
+    ids = ids.astype(str, copy=False)
+    hashes = _hashes(view, ids)
+    ordered = np.sort(hashes)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(repeated) == 0:  # nearly always; comparing a million labels directly would take seconds
+        return None
+    seen: dict[tuple[int, str], int] = {}
+    for row in np.flatnonzero(np.isin(hashes, repeated)).tolist():
+        earlier = seen.setdefault((int(view[row]), str(ids[row])), row)
+        if earlier != row:
+            return row, earlier
+    return None
+
+
+def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:
+    """Hash each row to 64 bits, with FNV-1a over the view and the characters of the id."""
+    hashes = np.uint64(0xCBF29CE484222325) ^ view.astype(np.uint64)
+    characters = np.ascontiguousarray(ids).view(np.uint32).reshape(len(ids), -1)
+    for k in range(characters.shape[1]):
+        hashes *= np.uint64(0x100000001B3)
+        hashes ^= characters[:, k]
+    return hashes

@@ -30,22 +30,10 @@ def work_through(
     jobs: int,
     prepare: Callable[[], None] | None = None,
 ) -> Iterator[Result]:
-    """Results of all tasks in their order, whatever the number of processes.
+    """Results of all tasks in their order, whatever the number of processes; with 1 in this one.
 
-    Parameters
-    ----------
-    work : callable
-        A function of a module, so that another process can import it.
-    tasks : sequence
-    jobs : int
-        Number of processes; with 1 the work is done in this one.
-    prepare : callable, optional
-        Called in each process before its first task; `start_worker` by default.
-
-    Raises
-    ------
-    NeurocalError
-        A process was killed.
+    `work` is a function of a module, so that another process can import it; `prepare` is called in each
+    process before its first task, `start_worker` by default. Raises NeurocalError if a process was killed.
     """
     jobs = min(jobs, len(tasks))
     if jobs <= 1:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,41 +30,20 @@ class Target:
     """Points of a target, given and estimated.
 
     Images determine the shape only up to a similarity transformation. Therefore the estimated points are
-    rotated, moved and scaled as a whole to be nearest to the given ones.
-
-    Attributes
-    ----------
-    given, found : (n, 3) array [world unit]
-    std : (n, 3) array [world unit]
-        Standard deviations of the estimated points, along the world's axes.
-    plane : (n,) int array
-        Index of the plane of the target to which each point belongs.
-    sizes : dict of float [world unit]
-        Prior standard deviation of each part of the offsets, estimated from the data; see
-        `target_shape.prior`.
-    flat : bool
-        Whether the points were kept in their plane.
-    evidence : float
-        Gain in log evidence (marginal likelihood) over the given target.
-    point : (n,) labels, optional
-        Ids.
-    stated : (n, 3) array, optional [world unit]
-        Standard deviations of the given points, if a survey states them. They then weight the distances from
-        the given points, and `sizes` holds the factor by which they were scaled.
-    bends : Bends, optional
-        Additional bend in each view, for a board that bends differently each time.
+    rotated, moved and scaled as a whole to be nearest to the given ones. Stated standard deviations weight
+    the distances from the given points, and `sizes` then holds the factor by which they were scaled.
     """
 
-    given: Array
-    found: Array
-    std: Array
-    plane: NDArray[np.intp]
-    sizes: Mapping[str, float]
-    flat: bool
-    evidence: float
-    point: NDArray[np.str_] | None = None
-    stated: Array | None = None
-    bends: Bends | None = None
+    given: Array  # (n, 3) [world unit]
+    found: Array  # (n, 3) [world unit]
+    std: Array  # (n, 3) [world unit] of the estimated points, along the world's axes
+    plane: NDArray[np.intp]  # (n,) index of the plane of the target to which each point belongs
+    sizes: Mapping[str, float]  # [world unit] prior std of each part of the offsets, see `target_shape.prior`
+    flat: bool  # whether the points were kept in their plane
+    evidence: float  # gain in log evidence (marginal likelihood) over the given target
+    point: NDArray[np.str_] | None = None  # (n,) ids
+    stated: Array | None = None  # (n, 3) [world unit] stds of the given points, if a survey states them
+    bends: Bends | None = None  # of each view, for a board that bends differently each time
 
     @property
     def offsets(self) -> Array:
@@ -86,9 +65,7 @@ class Target:
 
     def applied(self, points: Correspondences) -> Correspondences:
         """Points of this target moved to their estimated coordinates, without the bends of single views."""
-        place = self.places(points.world)
-        world = np.where((place >= 0)[:, None], self.found[place], points.world)
-        return points if (place < 0).all() else replace(points, world=world)
+        return _moved(points, self.places(points.world), self.found)
 
     def seen(self, points: Correspondences) -> Correspondences:
         """Points of this target moved to their estimated coordinates, with the bend of each view."""
@@ -105,9 +82,7 @@ class Target:
 
     def as_given(self, points: Correspondences) -> Correspondences:
         """Points moved back to their given coordinates: the inverse of `seen`."""
-        place = self.rows_of(self.straightened(points).world)
-        world = np.where((place >= 0)[:, None], self.given[place], points.world)
-        return points if (place < 0).all() else replace(points, world=world)
+        return _moved(points, self.rows_of(self.straightened(points).world), self.given)
 
     def _bend(self, points: Correspondences) -> Array:
         """(N, 3) offsets of points by the bends of their views [world unit]."""
@@ -136,58 +111,52 @@ class Target:
         found, std = self.found.copy(), self.std.copy()
         found[place[both]] = 0.5 * (self.found[place[both]] + other.found[both])
         std[place[both]] = 0.5 * np.hypot(self.std[place[both]], other.std[both])
-        point = None
-        if self.point is not None and other.point is not None:
-            point = np.concatenate([self.point, other.point[new]])
-        stated = None
-        if self.stated is not None and other.stated is not None:
-            stated = np.concatenate([self.stated, other.stated[new]])
+
+        def both_of(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if a is None or b is None else np.concatenate([a, b[new]])
+
         return replace(
             self,
             given=np.concatenate([self.given, other.given[new]]),
             found=np.concatenate([found, other.found[new]]),
             std=np.concatenate([std, other.std[new]]),
             plane=np.concatenate([self.plane, other.plane[new]]),
-            point=point,
-            stated=stated,
+            point=both_of(self.point, other.point),
+            stated=both_of(self.stated, other.stated),
         )
 
     def bend(self) -> float:
         """Height between the highest and lowest point over the mean plane, of the worst plane [world]."""
         worst = 0.0
-        for plane in range(int(self.plane.max()) + 1):
-            local, _ = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
-            rows = np.column_stack([np.ones(len(local)), local[:, :2]])
-            height = local[:, 2] - rows @ np.linalg.lstsq(rows, local[:, 2], rcond=None)[0]
+        for found, _ in self._planes():
+            rows = np.column_stack([np.ones(len(found)), found[:, :2]])
+            height = found[:, 2] - rows @ np.linalg.lstsq(rows, found[:, 2], rcond=None)[0]
             worst = max(worst, float(np.ptp(height)))
         return worst
 
     def stretch(self) -> float:
         """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""
         worst = 0.0
-        for plane in range(int(self.plane.max()) + 1):
-            found, given = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
+        for found, given in self._planes():
             rows = np.column_stack([np.ones(len(given)), given[:, :2]])
             linear = np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:]
             along, across = np.linalg.svd(linear, compute_uv=False)
             worst = max(worst, float(along / across - 1))
         return worst
 
+    def _planes(self) -> Iterator[tuple[Array, Array]]:
+        """Found and given points of each plane about their centres, along the given ones' principal axes."""
+        for plane in range(int(self.plane.max()) + 1):
+            found, given = self.found[self.plane == plane], self.given[self.plane == plane]
+            centred = given - given.mean(axis=0)
+            axes = np.linalg.svd(centred, full_matrices=False)[2].T
+            yield (found - found.mean(axis=0)) @ axes, centred @ axes
+
 
 def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
-    """Convert a target that is a chessboard to a `Board` with its estimated points.
+    """Convert a target that is a chessboard to a `Board` with its estimated points and measured distances.
 
-    Parameters
-    ----------
-    target : Target
-    unit : str
-    distances : tuple of Distance
-        Distances measured on it.
-
-    Raises
-    ------
-    InputError
-        The points have no ids of a chessboard.
+    Raises InputError if the points have no ids of a chessboard.
     """
     if target.point is None:
         raise InputError(
@@ -205,10 +174,7 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
 def scale_of(points: Correspondences) -> Scale:
     """The scale of the points according to the distances measured on their board.
 
-    Raises
-    ------
-    InputError
-        The points or distances do not belong to a chessboard.
+    Raises InputError if the points or distances do not belong to a chessboard.
     """
     if not points.distances:
         return NO_SCALE
@@ -278,7 +244,7 @@ def distinct_points(
 ) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
     """The distinct world points (n, 3), the index of each row's point (N,), and the ids, if all have one."""
     world = np.concatenate([points.world for points in some])
-    first, label = distinct_rows(_whole(world, _scale(world)))
+    first, label = distinct_rows(_whole(world, world))
     ids = None
     if all(points.point is not None for points in some):
         ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
@@ -302,26 +268,21 @@ def is_flat(given: Array) -> bool:
     return bool(extent[-1] < _THIN * extent[0])
 
 
-def _in_plane(found: Array, given: Array) -> tuple[Array, Array]:
-    """Both sets of points relative to their centres, along the principal axes of the given ones."""
-    centred = given - given.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2].T
-    return (found - found.mean(axis=0)) @ axes, centred @ axes
+def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Correspondences:
+    """Points moved to other coordinates (n, 3), of which `place` (N,) are the indices; -1: not moved."""
+    world = np.where((place >= 0)[:, None], to[place], points.world)
+    return points if (place < 0).all() else replace(points, world=world)
 
 
 def _places(known: Array, world: Array) -> NDArray[np.intp]:
-    both = _whole(np.concatenate([known, world]), _scale(known))
+    both = _whole(np.concatenate([known, world]), known)
     label = distinct_rows(both)[1]
     place = np.full(int(label.max()) + 1, -1, dtype=np.intp)
     place[label[: len(known)]] = np.arange(len(known))
     return place[label[len(known) :]]
 
 
-def _scale(world: Array) -> float:
-    """Resolution to which coordinates of the same point agree [world unit]."""
-    size = float(np.ptp(world, axis=0).max()) if len(world) else 1.0
-    return float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0
-
-
-def _whole(world: Array, scale: float) -> NDArray[np.float64]:
-    return np.round(world / scale)
+def _whole(world: Array, known: Array) -> Array:
+    """World coordinates in units of the resolution to which those of the same known point agree."""
+    size = float(np.ptp(known, axis=0).max()) if len(known) else 1.0
+    return np.round(world / (float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0))

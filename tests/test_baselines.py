@@ -15,7 +15,7 @@ from support.scenes import Scene, pinhole, random_flat_set, random_solid, table_
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_calibration, write_points
 from neurocal_cli.baselines.calibrate_by import calibrate_by
-from neurocal_cli.baselines.constrained_least_squares import smallest
+from neurocal_cli.baselines.linear import smallest
 from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import NeurocalError, UsageError

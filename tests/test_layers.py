@@ -43,7 +43,7 @@ HOMES = {
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (
     {"errors", "frozen_dataclass", "geometry"},
-    {"distances", "given_values", "processes", "repeated_ids"},
+    {"distances", "given_values", "processes"},
     {"bends", "board", "camera", "least_squares", "median", "network", "points"},
     {"target"},
     {"calibration", "printing", "training"},

@@ -9,8 +9,7 @@ import pytest
 from support.wrong_inputs import flat, moved, scaled
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
-from neurocal_cli.verdict.units_of_views import views_of_another_scale
+from neurocal_cli.verdict.odd_points import odd_pixels, points_given_twice, views_of_another_scale
 
 POINTS = flat()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.distortion.profile_sizes import averaged_over_sizes
+from neurocal_cli.distortion.rich_fit import averaged_over_sizes
 from neurocal_cli.geometry import Array
 
 NODES, SEEN, NOISE = np.arange(1.0, 7.0), 4, 0.1

@@ -17,8 +17,13 @@ from neurocal_cli import Correspondences, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.panorama import PANORAMAS, Panorama
-from neurocal_cli.distortion.undistorted_view import SHAPES, field_of_view, undistorted_view
+from neurocal_cli.distortion.undistorted_view import (
+    PANORAMAS,
+    SHAPES,
+    Panorama,
+    field_of_view,
+    undistorted_view,
+)
 from neurocal_cli.distortion.undistortion import shown, sources, undistort_pixels
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.camera_info import camera_info_lines

@@ -20,7 +20,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration import Calibration, Rejected, StopReason
-from neurocal_cli.distortion.given_distortion import check_distortion
+from neurocal_cli.distortion.given_model import check_distortion
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.pipeline.result import calibration_of
 
@@ -40,28 +40,12 @@ def problem_for_method(method: str, problem: Problem) -> Problem:
 
 
 def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibration:
-    """Solve a problem by a baseline, with all of its points.
+    """Solve a problem by one of `BASELINES`, with all of its points.
 
-    Parameters
-    ----------
-    method : str
-        One of `BASELINES`.
-    problem : Problem
-    name : str
-        Of the camera.
-
-    Returns
-    -------
-    Calibration
-        Its standard deviations come from the normal matrix at the solution. If the method does not minimise
-        the reprojection error, they are those of a least-squares fit, and a warning says so.
-
-    Raises
-    ------
-    UsageError
-        The method cannot solve this kind of problem.
-    InputError, DegenerateGeometryError
-        The points do not determine a solution; the message gives the reason.
+    The standard deviations come from the normal matrix at the solution. If the method does not minimise the
+    reprojection error, they are those of a least-squares fit, and a warning says so. Raises UsageError if the
+    method cannot solve this kind of problem, and InputError or DegenerateGeometryError if the points do not
+    determine a solution; the message gives the reason.
     """
     found = BASELINES[method](problem_for_method(method, _unweighted(problem)))
     solution = _solution(found)
@@ -77,11 +61,7 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     if not found.converged:
         reason = StopReason.MAX_ITERATIONS
     return replace(
-        calibration,
-        network=None,
-        converged=found.converged,
-        stop_reason=reason.value,
-        warnings=warnings,
+        calibration, network=None, converged=found.converged, stop_reason=reason.value, warnings=warnings
     )
 
 

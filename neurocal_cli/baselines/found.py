@@ -9,29 +9,14 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 @frozen_dataclass(eq=False)
 class Found:
-    """Result of a baseline.
+    """Result of a baseline."""
 
-    Attributes
-    ----------
-    problem : Problem
-        The solved problem; a method may take more parameters as given than the user.
-    state : CameraState
-        Normalised.
-    minimised : bool
-        Whether the reprojection error is at a minimum, as with least squares on (3).
-    iterations : int
-    converged : bool
-        False if an iteration ended early.
-    remarks : tuple of str
-        Remarks for the user.
-    """
-
-    problem: Problem
-    state: CameraState
-    minimised: bool
+    problem: Problem  # as solved; a method may take more parameters as given than the user
+    state: CameraState  # normalised
+    minimised: bool  # whether the reprojection error is at a minimum, as with least squares on (3)
     iterations: int = 0
-    converged: bool = True
-    remarks: tuple[str, ...] = ()
+    converged: bool = True  # False if an iteration ended early
+    remarks: tuple[str, ...] = ()  # for the user
 
 
 def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:

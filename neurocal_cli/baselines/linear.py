@@ -23,10 +23,11 @@ necessary.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
@@ -40,17 +41,14 @@ from neurocal_cli.initialisation.cameras_from_networks import cameras_from_produ
 from neurocal_cli.initialisation.view_networks import Group, begin_flat
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
+_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
 
 
 def linear(problem: Problem) -> Found:
     """Solve a problem in closed form.
 
-    Raises
-    ------
-    UsageError
-        Distortion is to be estimated, which linear calibration cannot.
-    DegenerateGeometryError
-        A view has too few points, or noise leaves no valid camera.
+    Raises UsageError if distortion is to be estimated, which linear calibration cannot, and
+    DegenerateGeometryError if a view has too few points or noise leaves no valid camera.
     """
     if problem.free_distortion:
         raise UsageError("the method linear estimates no distortion; give distortion none, or another method")
@@ -72,18 +70,9 @@ def linear_state(problem: Problem) -> CameraState:
 
 
 def whole_groups(problem: Problem, fewest: tuple[int, int]) -> list[tuple[NDArray[np.intp], bool]]:
-    """Group the views into flat and solid ones; each view must have enough points.
+    """Group the views into flat and solid ones, which need this many points.
 
-    Parameters
-    ----------
-    problem : Problem
-    fewest : (int, int)
-        Least number of points of a flat and of a solid view.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        A view has too few points.
+    Raises DegenerateGeometryError if a view has too few.
     """
     views, flat = problem.views, begin_flat(problem)
     needed = np.where(flat, *fewest)
@@ -203,3 +192,32 @@ def _camera_of_given_poses(problem: Problem) -> CameraState:
             "of X,Y,Z (right-handed?) and of u,v (v downwards?), and the pairing"
         )
     return CameraState(entries[None], R, t)
+
+
+def smallest(rows: Array, constrained: int) -> Array:
+    """Minimise ``|C y + D z|`` over y, and over z with ``|z| = 1``, where ``rows = [C D]``.
+
+    `rows` (K, m, n) are K problems of m equations each, and D are the `constrained` last columns. The result
+    (K, n) is (y, z); its sign is arbitrary for each problem.
+
+    QR eliminates y. Then z is the smallest right singular vector of the triangular remainder of D. Faugeras
+    and Toscani (1986) do the same with the normal equations, which costs half of the digits.
+
+    Raises DegenerateGeometryError if the equations do not determine y.
+    """
+    K, m, n = rows.shape
+    if m < n:
+        rows = np.concatenate([rows, np.zeros((K, n - m, n))], axis=1)
+    R = cast("Array", np.linalg.qr(rows, mode="r"))
+    free = n - constrained
+    z = np.linalg.svd(R[:, free:, free:])[2][:, -1]
+    if not free:
+        return np.asarray(z)
+    C, right = R[:, :free, :free], R[:, :free, free:] @ z[..., None]
+    diagonal = np.abs(np.diagonal(C, axis1=1, axis2=2))
+    if not (diagonal.min(axis=1) > _SINGULAR * diagonal.max(axis=1)).all():
+        raise DegenerateGeometryError(
+            "the points do not determine the linear equations of this method; give points that spread over "
+            "the image and in depth, or use the method neuro"
+        )
+    return np.concatenate([-np.linalg.solve(C, right)[..., 0], z], axis=1)

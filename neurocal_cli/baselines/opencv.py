@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.camera.distortion import WITH_PRISM
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -32,19 +32,10 @@ def without_skew(problem: Problem) -> Problem:
 
 
 def opencv(problem: Problem) -> Found:
-    """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2).
+    """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2); the problem comes from `without_skew`.
 
-    Parameters
-    ----------
-    problem : Problem
-        From `without_skew`.
-
-    Raises
-    ------
-    UsageError
-        The problem is of type 3 or 4, or OpenCV does not have the distortion model.
-    DegenerateGeometryError
-        OpenCV refuses the points, or its result is not a valid camera.
+    Raises UsageError if the problem is of type 3 or 4, or OpenCV does not have the distortion model, and
+    DegenerateGeometryError if OpenCV refuses the points, or its result is not a valid camera.
     """
     import cv2
 
@@ -86,17 +77,9 @@ def opencv(problem: Problem) -> Found:
 
 def _flags(cv2: object, model: str) -> int:
     """Flags that free only the coefficients of a model."""
-    free = {
-        "none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 2, "plumb_bob": 3, "rational": 6,
-        "thin_prism": 6, "tilted": 6,
-    }[model]  # fmt: skip
-    names = [f"CALIB_FIX_K{n}" for n in range(free + 1, 7)]
-    if model in ("none", "k1", "k1k2"):
-        names.append("CALIB_ZERO_TANGENT_DIST")
-    if free == 6:
-        names.append("CALIB_RATIONAL_MODEL")
-    if model in WITH_PRISM:
-        names.append("CALIB_THIN_PRISM_MODEL")
-    if model == "tilted":
-        names.append("CALIB_TILTED_MODEL")
+    free = coefficient_names(model)
+    names = [f"CALIB_FIX_K{n}" for n in range(1, 7) if f"k{n}" not in free]
+    names += [] if "p1" in free else ["CALIB_ZERO_TANGENT_DIST"]
+    parts = {"k4": "CALIB_RATIONAL_MODEL", "s1": "CALIB_THIN_PRISM_MODEL", "tauX": "CALIB_TILTED_MODEL"}
+    names += [flag for first, flag in parts.items() if first in free]
     return sum(getattr(cv2, name) for name in names)

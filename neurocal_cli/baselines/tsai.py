@@ -28,11 +28,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Minimum, least_squares
-from neurocal_cli.baselines.linear import whole_groups
-from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
+from neurocal_cli.baselines.linear import smallest, whole_groups
+from neurocal_cli.baselines.nonlinear import Minimum, least_pixel_error
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -47,19 +45,10 @@ _DISTORTIONS = ("none", "k1")
 
 
 def tsai(problem: Problem) -> Found:
-    """Calibrate by radial alignment.
+    """Calibrate by radial alignment; the problem comes from `with_known_centre`.
 
-    Parameters
-    ----------
-    problem : Problem
-        From `with_known_centre`.
-
-    Raises
-    ------
-    UsageError
-        The problem is of type 4, or has a distortion other than k1, or the image centre is unknown.
-    DegenerateGeometryError
-        There are too few points, or no camera satisfies the equations.
+    Raises UsageError if the problem is of type 4, or has a distortion other than k1, or the image centre is
+    unknown, and DegenerateGeometryError if there are too few points, or no camera satisfies the equations.
     """
     if problem.type == 4:
         raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
@@ -72,18 +61,20 @@ def tsai(problem: Problem) -> Found:
             "method"
         )
     check_points(problem)
-    remarks = () if problem.type == 2 else _remarks(problem)
+    u0, v0 = problem.entries[3:]
+    remark = (
+        f"the method tsai takes the image centre for known; ({u0:g}, {v0:g}) is used, and the true centre "
+        "may be tens of pixels away"
+    )
     state, least = _camera_and_poses(problem)
+    remarks = () if problem.type == 2 else (remark,)
     return Found(problem, state, False, least.iterations, least.converged, remarks)
 
 
 def with_known_centre(problem: Problem) -> Problem:
     """The problem that Tsai's method solves: with image centre and right angles given (types 1 and 2).
 
-    Raises
-    ------
-    UsageError
-        The problem is of type 1, and the points have neither a centre nor an image size.
+    Raises UsageError for type 1 if the points have neither a centre nor an image size.
     """
     if problem.type in (3, 4):
         return problem
@@ -103,35 +94,17 @@ def with_known_centre(problem: Problem) -> Problem:
     return replace(problem, entries=entries, free=free, fixed=frozenset({"u0", "v0", "theta"}))
 
 
-def _remarks(problem: Problem) -> tuple[str, ...]:
-    u0, v0 = problem.entries[3:]
-    return (
-        f"the method tsai takes the image centre for known; ({u0:g}, {v0:g}) is used, and the true centre "
-        "may be tens of pixels away",
-    )
-
-
 @frozen_dataclass(eq=False)
 class _Alignment:
     """Result of stage 1 for a group of views.
 
-    Attributes
-    ----------
-    views : (K,) int array
-    flat : bool
-    rows : (K, 2, 4) array
-        s r_1 with s t_x, and r_2 with t_y. For flat views they are in the coordinates of the plane, up to
-        scale, and without the third column of R.
+    The rows (K, 2, 4) are s r_1 with s t_x, and r_2 with t_y. For flat views they are in the coordinates of
+    the plane, up to scale, and without the third column of R.
     """
 
     views: NDArray[np.intp]
     flat: bool
     rows: Array
-
-    @property
-    def aspect(self) -> Array:
-        """(K,) s from each solid view."""
-        return np.asarray(np.linalg.norm(self.rows[:, 0, :3], axis=1))
 
     def poses(self, s: float, sign: Array) -> tuple[Array, Array, Array]:
         """R (K, 3, 3) and t_x, t_y (K,) for an aspect s; `sign` (K,) chooses a flat view's pose."""
@@ -192,7 +165,8 @@ class _Stages:
         """Mean aspect of the solid views, weighted by their points; None if all views are flat."""
         for group in self.groups:
             if not group.flat:
-                return float(np.average(group.aspect, weights=self.views.counts[group.views]))
+                aspect = np.linalg.norm(group.rows[:, 0, :3], axis=1)
+                return float(np.average(aspect, weights=self.views.counts[group.views]))
         return None
 
     def poses(self, s: float) -> tuple[Array, Array]:
@@ -261,7 +235,6 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     model = problem.distortion.model if problem.free_distortion else "none"
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])
-    error = whitened_residuals(views)
 
     def state(p: Array) -> CameraState:
         f = np.exp(p[0])
@@ -271,5 +244,5 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
         entries = np.array([[aspect * f, 0.0, f, *centre]])
         return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
 
-    least = least_squares(lambda p: error(state(p)), start, view_of_residual(views), len(start) - V)
+    least = least_pixel_error(views, state, start, len(start) - V)
     return state(least.x), least

@@ -12,19 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera import projection
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.monotonic import is_monotonic, undistort
+from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.projection import (
-    ENTRIES,
-    Rays,
-    image_points,
-    normalised_points,
-    project_points,
-    project_with_jacobian,
-    rays_of,
-)
-from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -86,7 +77,7 @@ class Camera:
     @cached_property
     def entries(self) -> tuple[float, float, float, float, float]:
         """A11, A12, A22, A13, A23 [px] as plain numbers."""
-        a, s, b, u0, v0 = self.A[ENTRIES].tolist()
+        a, s, b, u0, v0 = self.A[projection.ENTRIES].tolist()
         return a, s, b, u0, v0
 
     @cached_property
@@ -116,7 +107,9 @@ class Camera:
         """
         X, Y, Z = _coordinates("points", points, 3)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u, v, seen = project_points(self.entries, self.model, self.distortion.coefficients, X, Y, Z)
+            u, v, seen = projection.project_points(
+                self.entries, self.model, self.distortion.coefficients, X, Y, Z
+            )
             pixels = np.stack([u, v], axis=-1)
         return np.where(seen[..., None], pixels, np.nan), seen
 
@@ -142,7 +135,7 @@ class Camera:
         k = self.distortion.coefficients
         J = np.zeros((8 + len(k), 2, len(points)))
         with np.errstate(divide="ignore", invalid="ignore"):
-            project_with_jacobian(
+            projection.project_with_jacobian(
                 self.entries, self.distortion.model, k, list(points.T), J[:5], J[5:8], J[8:]
             )
         by_camera = np.concatenate([J[:5], J[8:]])
@@ -170,7 +163,7 @@ class Camera:
         """
         u, v = _coordinates("pixels", pixels, 2)
         if self.distortion.wide:
-            x, y = normalised_points(self.entries, u, v)
+            x, y = projection.normalised_points(self.entries, u, v)
             return np.stack(unproject_directions(self.distortion, x, y), axis=-1)
         x, y = self.normalised_points(u, v)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -243,15 +236,15 @@ class Camera:
 
     def image_points(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Pixels u, v of normalised image points x, y."""
-        return image_points(self.entries, self.model, self.distortion.coefficients, x, y)
+        return projection.image_points(self.entries, self.model, self.distortion.coefficients, x, y)
 
     def normalised_points(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Undistorted normalised image points x, y of pixels u, v; nan where there are none."""
-        return undistort(self.distortion, *normalised_points(self.entries, u, v))
+        return undistort(self.distortion, *projection.normalised_points(self.entries, u, v))
 
-    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> Rays:
+    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> projection.Rays:
         """Rays of pixels u, v with derivatives; see `projection.rays_of`."""
-        return rays_of(self.entries, self.distortion, u, v, near)
+        return projection.rays_of(self.entries, self.distortion, u, v, near)
 
 
 def _coordinates(name: str, values: Array, count: int) -> Array:

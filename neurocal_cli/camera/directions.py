@@ -44,44 +44,23 @@ _TINY = 1e-24  # squared sine below which a direction is on the axis
 
 
 class Direction(NamedTuple):
-    """Image points of directions, before A, with derivatives.
-
-    Attributes
-    ----------
-    x, y : arrays
-        x' and y'.
-    by_x, by_y : three arrays each
-        Derivatives of x' and y' by X, Y, Z.
-    by_coefficient : list of pairs of arrays
-        Derivatives of x', y' by each coefficient.
-    seen : bool array
-        Whether the image radius still grows with theta.
-    """
+    """Image points (x', y') of directions, before A, with derivatives."""
 
     x: Array
     y: Array
-    by_x: tuple[Array, Array, Array]
+    by_x: tuple[Array, Array, Array]  # of x' by X, Y, Z
     by_y: tuple[Array, Array, Array]
-    by_coefficient: list[tuple[Array, Array]]
-    seen: NDArray[np.bool_]
+    by_coefficient: list[tuple[Array, Array]]  # of x', y' by each coefficient
+    seen: NDArray[np.bool_]  # whether the image radius still grows with theta
 
 
 def project_directions(
     model: str, k: Coefficients, X: Array, Y: Array, Z: Array, by_coefficients: bool = True
 ) -> Direction:
-    """Project directions with a wide lens, with derivatives.
+    """Project directions (X, Y, Z), arrays of one shape in any unit, with a wide lens, with derivatives.
 
-    Parameters
-    ----------
-    model : str
-        One of `WIDE`.
-    k : sequence of coefficients
-        Each a number or an array that broadcasts against X.
-    X, Y, Z : arrays of one shape
-        In any unit; only the direction matters.
-    by_coefficients : bool
-        Whether to compute the derivatives by the coefficients; only a rich lens, which has hundreds, leaves
-        them out. Its coefficients are numbers, the same for all points.
+    Each coefficient is a number or an array that broadcasts against X; a rich lens, which has hundreds, takes
+    numbers only. Without `by_coefficients` it leaves out the derivatives by them.
     """
     q = X * X + Y * Y
     if model == "fisheye":

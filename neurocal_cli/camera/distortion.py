@@ -9,6 +9,7 @@ The inverse is `neurocal_cli.camera.monotonic.undistort`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import field
 
 import numpy as np
@@ -50,33 +51,24 @@ _PINHOLES = {
 
 
 def coefficient_names(model: str) -> tuple[str, ...]:
-    """Names of a model's coefficients, in order.
-
-    Raises
-    ------
-    InputError
-        There is no such model.
-    """
+    """Names of a model's coefficients, in order; an InputError for an unknown model."""
     if model not in MODELS:
         raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")
     return MODELS[model]
 
 
+def radial_part(model: str, k: Sequence[float] | Array) -> list[float]:
+    """The coefficients (K,) of a model, with 0 for those that are not rotationally symmetric."""
+    names = coefficient_names(model)
+    return [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
+
+
 @frozen_dataclass(eq=False)
 class Distortion:
-    """A distortion model with its coefficients; the default is no distortion.
+    """A distortion model, one of `MODELS`, with its coefficients; the default is no distortion.
 
-    Parameters
-    ----------
-    model : str
-        One of `MODELS`.
-    coefficients : sequence of float
-        As many as the model has; missing ones are 0.
-
-    Raises
-    ------
-    InputError
-        An unknown model, too many coefficients, or one that is not finite.
+    Missing coefficients are 0. Raises InputError for an unknown model, too many coefficients, or one that is
+    not finite.
     """
 
     model: str = "none"
@@ -111,18 +103,9 @@ def pinhole_coefficients(model: str) -> Array:
 
 
 def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Distort normalised image points.
+    """Distorted points x', y' of normalised image points x, y, arrays of one shape.
 
-    Parameters
-    ----------
-    model : str
-    k : sequence of coefficients
-        Each a number or an array that broadcasts against x.
-    x, y : arrays of one shape
-
-    Returns
-    -------
-    x', y' : arrays of that shape
+    Each coefficient is a number or an array that broadcasts against x.
     """
     if model in WIDE:
         seen = project_directions(model, k, x, y, np.ones_like(x), by_coefficients=False)
@@ -131,16 +114,7 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
 
 
 def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Distorted:
-    """Distort normalised image points, with derivatives.
-
-    Returns
-    -------
-    point : (x', y')
-    by_point : four arrays
-        dx'/dx, dx'/dy, dy'/dx, dy'/dy.
-    by_coefficient : list of pairs of arrays
-        dx', dy' by each coefficient.
-    """
+    """The same with derivatives, as `Distorted`."""
     if model in WIDE:
         seen = project_directions(model, k, x, y, np.ones_like(x))
         return (seen.x, seen.y), (*seen.by_x[:2], *seen.by_y[:2]), seen.by_coefficient

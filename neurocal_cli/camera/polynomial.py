@@ -5,7 +5,11 @@
 
 with the coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which simpler models have the first 1, 2, 4, 5 or 8.
 A thin prism (Weng, Cohen and Herniou 1992) adds s1 r^2 + s2 r^4 to x' and s3 r^2 + s4 r^4 to y' (OpenCV's 12
-coefficients). A tilted sensor (`tilt`) is applied last (OpenCV's 14 coefficients).
+coefficients). A tilted sensor (Scheimpflug; Louhichi 2007) is applied last, with tauX and tauY (OpenCV's 14
+coefficients). It turns a distorted point (x, y, 1) by R = Ry(tauY) Rx(tauX) and projects it back along the
+optical axis. With the cosines and sines of tauX and tauY, that is
+
+    x' = cX x / w,  y' = (cY y - sX sY x) / w,  w = sY x - cY sX y + cY cX
 """
 
 from __future__ import annotations
@@ -15,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.camera.tilt import tilted, tilted_with_jacobian
 from neurocal_cli.geometry import Array
 
 # A number, or an array that broadcasts against the points.
@@ -39,7 +42,7 @@ def distorted(k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
 
 def _radial(k: Coefficients, r2: Array) -> tuple[Array, Any]:
     """R, and one over its denominator."""
-    k1, k2, _, _, k3, k4, k5, k6 = _all(k)
+    k1, k2, _, _, k3, k4, k5, k6 = first_eight(k)
     R = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     if len(k) <= 5:
         return R, 1.0
@@ -64,7 +67,7 @@ def _behind_prism(k: Coefficients, point: tuple[Array, Array], r2: Array) -> tup
 def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     """Distorted points, their derivatives by the points, and by each coefficient."""
     count = len(k)
-    k1, k2, p1, p2, k3, k4, k5, k6 = _all(k)
+    k1, k2, p1, p2, k3, k4, k5, k6 = first_eight(k)
     x2, y2 = x * x, y * y
     r2 = x2 + y2
     r4 = r2 * r2
@@ -101,11 +104,49 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
 
 def _on_tilted_sensor(k: Coefficients, before: Distorted) -> Distorted:
     point, (xx, xy, yx, yy), by_k = before
-    point, (a, b, c, d), by_tau = tilted_with_jacobian(k[12], k[13], *point)
+    point, (a, b, c, d), by_tau = _tilted_with_jacobian(k[12], k[13], *point)
     by_point = a * xx + b * yx, a * xy + b * yy, c * xx + d * yx, c * xy + d * yy
     return point, by_point, [*((a * dx + b * dy, c * dx + d * dy) for dx, dy in by_k), *by_tau]
 
 
-def _all(k: Coefficients) -> list[Any]:
+def first_eight(k: Coefficients) -> list[Any]:
     """The first eight coefficients; 0 for those that the model lacks."""
     return [*k[:8], *[0.0] * (8 - len(k))]
+
+
+def sensor_rotation(tau_x: float, tau_y: float) -> Array:
+    """(3, 3) R of a tilted sensor."""
+    cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    return np.array([[cY, sX * sY, -cX * sY], [0.0, cX, sX], [sY, -sX * cY, cX * cY]])
+
+
+def tilted(tau_x: Any, tau_y: Any, x: Array, y: Array) -> tuple[Array, Array]:
+    """Points x', y' on the tilted sensor of distorted points x, y; normalised, arrays of one shape."""
+    cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    w = sY * x - cY * sX * y + cY * cX
+    return cX * x / w, (cY * y - sX * sY * x) / w
+
+
+def untilted(tau_x: float, tau_y: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """The inverse of `tilted`."""
+    cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    w = cY * cX / (1 + sX * y - sY * cX * x)
+    straight = x * w / cX
+    return straight, (y * w + sX * sY * straight) / cY
+
+
+def _tilted_with_jacobian(tau_x: Any, tau_y: Any, x: Array, y: Array) -> Distorted:
+    """As `tilted`, with the derivatives by the points and by tauX and tauY."""
+    cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    inverse = 1.0 / (sY * x - cY * sX * y + cY * cX)
+    u, v = cX * x * inverse, (cY * y - sX * sY * x) * inverse
+    by_point = (
+        (cX - u * sY) * inverse, u * cY * sX * inverse,
+        -(sX * sY + v * sY) * inverse, (cY + v * cY * sX) * inverse,
+    )  # fmt: skip
+    w_x, w_y = -cY * (cX * y + sX), cY * x + sY * (sX * y - cX)
+    by_tau = [
+        ((-sX * x - u * w_x) * inverse, (-cX * sY * x - v * w_x) * inverse),
+        (-u * w_y * inverse, (-sY * y - sX * cY * x - v * w_y) * inverse),
+    ]
+    return (u, v), by_point, by_tau

@@ -32,26 +32,18 @@ Entries = Sequence[Any] | Array
 
 
 class ImagePoints(NamedTuple):
-    """Pixels of normalised image points, with derivatives.
+    """Pixels (u, v) of normalised image points, with derivatives.
 
-    Attributes
-    ----------
-    u, v : arrays
-    x, y : arrays
-        Distorted points. They are the derivatives by A's entries: ``du = x dA11 + y dA12 + dA13``,
-        ``dv = y dA22 + dA23``.
-    by_point : four arrays or numbers
-        du/dx, du/dy, dv/dx, dv/dy by the undistorted point.
-    by_coefficient : list of pairs of arrays
-        Derivatives of the distorted point by each coefficient, before A.
+    The distorted points (x, y) are the derivatives by A's entries: ``du = x dA11 + y dA12 + dA13``, ``dv = y
+    dA22 + dA23``.
     """
 
     u: Array
     v: Array
     x: Array
     y: Array
-    by_point: tuple[Any, Any, Any, Any]
-    by_coefficient: list[tuple[Array, Array]]
+    by_point: tuple[Any, Any, Any, Any]  # du/dx, du/dy, dv/dx, dv/dy by the undistorted point
+    by_coefficient: list[tuple[Array, Array]]  # of the distorted point, before A
 
 
 def image_points(entries: Entries, model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
@@ -97,26 +89,12 @@ def project_with_jacobian(
     entries: Entries, model: str, k: Coefficients, points: Sequence[Array],
     by_entries: Array, by_point: Array, by_coefficient: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:  # fmt: skip
-    """Project points in the camera's frame, and fill in the derivatives.
+    """Project points X, Y, Z, (..., n) each, in the camera's frame, and fill in the derivatives of (u, v).
 
-    Parameters
-    ----------
-    entries, model, k
-        The camera.
-    points : X, Y, Z, (..., n) arrays
-    by_entries : (..., 5, 2, n) array
-        Filled with the derivatives of (u, v) by A11, A12, A22, A13, A23, except those that are always zero,
-        which must be zero already.
-    by_point : (..., 3, 2, n) array
-        Filled with those by X, Y, Z.
-    by_coefficient : (..., K, 2, n) array
-        Filled with those by the coefficients.
-
-    Returns
-    -------
-    u, v : (..., n) arrays
-    valid : (..., n) bool array
-        Points where the distortion is monotonic and, unless the lens is wide, in front of the camera.
+    Those by A11, A12, A22, A13, A23 go to `by_entries` (..., 5, 2, n), except those that are always zero,
+    which must be zero already; those by X, Y, Z to `by_point` (..., 3, 2, n); those by the coefficients to
+    `by_coefficient` (..., K, 2, n). Returns u, v and where the distortion is monotonic and, unless the lens
+    is wide, the point in front of the camera; (..., n) each.
     """
     X, Y, Z = points
     if model in WIDE:
@@ -185,17 +163,10 @@ def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Arra
 
 
 class Rays(NamedTuple):
-    """Rays (x, y, z) of pixels, in the camera's frame.
+    """Rays (x, y, z) of pixels (u, v), in the camera's frame, with derivatives by u and v [1/px].
 
-    Attributes
-    ----------
-    u, v : arrays [px]
-    x, y : arrays
-        Undistorted normalised points; nan for pixels that the camera cannot produce.
-    xu, xv, yu, yv : arrays [1/px]
-        Derivatives of x and y by u and v.
-    z, zu, zv : arrays or floats
-        1, 0 and 0, unless rays are general directions, which may also point sideways.
+    x and y are undistorted normalised points, nan for pixels that the camera cannot produce, and z is 1,
+    unless rays are general directions, which may also point sideways.
     """
 
     u: Array
@@ -218,15 +189,9 @@ class Rays(NamedTuple):
 def rays_of(
     entries: Entries, distortion: Distortion, u: Array, v: Array, near: tuple[Array, Array] | None = None
 ) -> Rays:
-    """Rays of pixels, with derivatives; the inverse of `image_points`.
+    """Rays of pixels u, v, with derivatives; the inverse of `image_points`.
 
-    Parameters
-    ----------
-    entries : A11, A12, A22, A13, A23
-    distortion : Distortion
-    u, v : arrays of one shape [px]
-    near : (x, y), optional
-        Undistorted points of pixels nearby, to start from: quicker.
+    It is quicker from undistorted points (x, y) of pixels nearby.
     """
     x, y = undistort(distortion, *normalised_points(entries, u, v), near)
     model = "none" if distortion.is_identity else distortion.model

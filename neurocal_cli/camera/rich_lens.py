@@ -33,16 +33,7 @@ _LEAST_RADIUS = 1e-6  # |s| below which a direction is on the axis
 
 
 class Displacement(NamedTuple):
-    """A displacement with its derivatives.
-
-    Attributes
-    ----------
-    x, y : arrays
-    by_x, by_y : three arrays each
-        By X, Y, Z.
-    by_coefficient : list of pairs of arrays
-        By each of `NAMES`; empty if not requested.
-    """
+    """A displacement with its derivatives by X, Y, Z and by each of `NAMES`, these only if requested."""
 
     x: Array
     y: Array
@@ -52,16 +43,9 @@ class Displacement(NamedTuple):
 
 
 def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool = True) -> Displacement:
-    """The displacement in the given directions.
+    """The displacement with the coefficients `NAMES` in directions X, Y, Z, arrays of one shape in any unit.
 
-    Parameters
-    ----------
-    k : (n,) array
-        The coefficients `NAMES`.
-    X, Y, Z : arrays of one shape
-        In any unit; only the direction matters.
-    by_coefficients : bool
-        Whether to compute the derivatives by the coefficients, of which there are hundreds.
+    The derivatives by the coefficients, of which there are hundreds, are optional.
     """
     k, shape = np.asarray(k, dtype=float), X.shape
     X, Y, Z = X.ravel(), Y.ravel(), Z.ravel()
@@ -77,10 +61,7 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
     field = _field(nodes, sx, sy, 2 * reach_x / (GRID - 3), 2 * reach_y / (GRID - 3))
     (fx, fy), (fx_x, fy_x), (fx_y, fy_y) = field.value, field.by_x, field.by_y
     cross = sx * sy * bend
-    by_s = (
-        (scale + sx * sx * bend + fx_x, cross + fx_y),
-        (cross + fy_x, scale + sy * sy * bend + fy_y),
-    )
+    by_s = (scale + sx * sx * bend + fx_x, cross + fx_y), (cross + fy_x, scale + sy * sy * bend + fy_y)
     # ds = (dX, dY) / w - s (dX X / d + dY Y / d + dZ w / d) / w
     by = []
     for sx_, sy_ in by_s:
@@ -88,15 +69,18 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
         by.append(tuple(a.reshape(shape) for a in (sx_ / w - along * sx, sy_ / w - along * sy, -along)))
     columns: list[tuple[Array, Array]] = []
     if by_coefficients:
-        none = np.zeros(shape)
+        none = np.zeros(len(r))
         ox, oy = sx / r, sy / r
         grows = -radial.slope * r / reach
-        by_reaches = (ox * grows, oy * grows), (-fx_x * sx / reach_x, -fy_x * sx / reach_x)
-        columns += [(a.reshape(shape), b.reshape(shape)) for a, b in by_reaches]
-        columns.append(((-fx_y * sy / reach_y).reshape(shape), (-fy_y * sy / reach_y).reshape(shape)))
-        columns += [((ox * b).reshape(shape), (oy * b).reshape(shape)) for b in radial.basis()]
-        of_nodes = [b.reshape(shape) for b in field.basis()]
+        columns = [(ox * grows, oy * grows)]
+        columns += [
+            (-fx_x * sx / reach_x, -fy_x * sx / reach_x),
+            (-fx_y * sy / reach_y, -fy_y * sy / reach_y),
+        ]
+        columns += [(ox * b, oy * b) for b in radial.basis()]
+        of_nodes = field.basis()
         columns += [(b, none) for b in of_nodes] + [(none, b) for b in of_nodes]
+        columns = [(a.reshape(shape), b.reshape(shape)) for a, b in columns]
     return Displacement(
         (scale * sx + fx).reshape(shape), (scale * sy + fy).reshape(shape), by[0], by[1], columns
     )
@@ -170,14 +154,10 @@ def _field(f: Array, sx: Array, sy: Array, lx: float, ly: float) -> _Field:
 
 
 def _basis(t: Array, lowest: int, highest: int) -> tuple[NDArray[np.intp], Array, Array]:
-    """The four nonzero cubic B-splines at positions t, in units of the node spacing.
+    """The four nonzero cubic B-splines at positions t (N,), in units of the node spacing.
 
-    Returns
-    -------
-    node : (N,) int array
-        The node before t, clipped to the given limits; beyond them the values are those at the limit.
-    weights, slopes : (4, N) arrays
-        Of the nodes node - 1 to node + 2.
+    Returns the node (N,) before t, clipped to the given limits, beyond which the values are those at the
+    limit; and the weights and slopes (4, N) of the nodes node - 1 to node + 2.
     """
     t = np.clip(np.nan_to_num(t), lowest, highest + 1)
     node = np.minimum(np.floor(t), highest)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.commands.streams import each_of, note, say, some_of
-from neurocal_cli.distortion.panorama import Panorama
-from neurocal_cli.distortion.undistorted_view import Undistorted, field_of_view
+from neurocal_cli.distortion.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
 from neurocal_cli.io.writing import make_folder, write_whole

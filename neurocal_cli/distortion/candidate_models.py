@@ -26,6 +26,7 @@ from neurocal_cli.camera.distortion import (
     coefficient_names,
     distort,
     pinhole_coefficients,
+    radial_part,
 )
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.distortion.similar_lens import similar_states
@@ -64,32 +65,15 @@ _LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; al
 
 @frozen_dataclass(eq=False)
 class Candidate:
-    """A distortion model fitted to the points.
+    """A distortion model fitted to the points."""
 
-    Attributes
-    ----------
-    problem : Problem
-        With this model, and a penalty that keeps it monotonic if needed.
-    adjusted : Adjusted
-    lost : array
-        Cross-validation: squared error of each part of the data when it is held out.
-    noise : bool
-        Whether its coefficients are only noise.
-    not_monotonic : str or None
-        Where it is not monotonic: within the "points" or within the "image".
-    determined : bool
-        Whether the points determine all parameters.
-    weak : bool
-        Whether a focal length is so poorly determined that other local minima may be lower.
-    """
-
-    problem: Problem
+    problem: Problem  # with this model, and a penalty that keeps it monotonic if needed
     adjusted: Adjusted
-    lost: Array
-    noise: bool
-    not_monotonic: str | None
-    determined: bool
-    weak: bool
+    lost: Array  # cross-validation: squared error of each part of the data when it is held out
+    noise: bool  # whether its coefficients are only noise
+    not_monotonic: str | None  # where it is not monotonic: within the "points" or within the "image"
+    determined: bool  # whether the points determine all parameters
+    weak: bool  # whether a focal length is so poorly determined that other local minima may be lower
 
     @property
     def sound(self) -> bool:
@@ -105,6 +89,11 @@ class Candidate:
     def cost(self) -> float:
         """Sum of squared residuals."""
         return float(self.adjusted.cost.sum())
+
+    @property
+    def held_out(self) -> float:
+        """Sum of squared errors of data that are held out."""
+        return float(self.lost.sum())
 
     def criterion(self, n: float) -> float:
         """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
@@ -133,14 +122,8 @@ def fit_candidates(
 ) -> dict[str, Candidate]:
     """Fit every model, starting from a state of any of them.
 
-    Parameters
-    ----------
-    problem : Problem
-    state : CameraState
-    by_views : bool
-        Whether cross-validation holds out views or points.
-    wanted : str, optional
-        The only model of interest; the others serve as starts and need not be monotonic.
+    Cross-validation holds out views or points. If only one model is wanted, the others serve as starts and
+    need not be monotonic.
     """
     return _Chain(problem, by_views, radius(problem.views, state), wanted=wanted).all_from(state)
 
@@ -160,21 +143,11 @@ def judged_again(
 
 @frozen_dataclass(eq=False)
 class _Chain:
-    """Fits a chain of models to one problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    by_views : bool
-    reach : float
-        Normalised radius of the farthest point.
-    repeated : RepeatedPoses, optional
-    wanted : str, optional
-    """
+    """Fits a chain of models to one problem."""
 
     problem: Problem
     by_views: bool
-    reach: float
+    reach: float  # normalised radius of the farthest point
     repeated: RepeatedPoses | None = None
     wanted: str | None = None
 
@@ -387,15 +360,13 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # Least squares up to the farthest point: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted radius of the
     # undistorted radius r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
-    radial = [0.0 if name in NOT_RADIAL else k for name, k in old.items()]
-    distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
+    distorted = distort(state.model, radial_part(state.model, state.k), r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
     if not np.isfinite(distorted).all():  # there is a pole
         return pinhole_coefficients(model)
     found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
-    new = {name: k for name, k in old.items() if name in NOT_RADIAL} | dict(
-        zip(of_radius, found, strict=True)
-    )
+    new = {name: k for name, k in old.items() if name in NOT_RADIAL}
+    new.update(zip(of_radius, found, strict=True))
     return np.array([new.get(name, 0.0) for name in names])

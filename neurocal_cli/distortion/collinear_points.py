@@ -35,18 +35,10 @@ Index = NDArray[np.intp]
 
 @frozen_dataclass(eq=False)
 class CollinearPoints:
-    """Points of each view, grouped by the lines on which they are.
+    """Points of each view, grouped by the lines on which they are."""
 
-    Attributes
-    ----------
-    row : (M,) int array
-        Row of each point on each line. A row occurs once for each line through it.
-    first : (L,) int array
-        Where each line begins in `row`.
-    """
-
-    row: Index
-    first: Index
+    row: Index  # (M,) of each point on each line; a row occurs once for each line through it
+    first: Index  # (L,) where each line begins in `row`
 
     def __len__(self) -> int:
         return len(self.first)

@@ -41,7 +41,7 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.multi_start import FEW_VIEWS
+from neurocal_cli.distortion.given_model import FEW_VIEWS
 from neurocal_cli.geometry import Array
 
 Starts = Callable[[Problem], Iterable[CameraState]]
@@ -66,19 +66,10 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which anothe
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
     """Fit all models, starting from a solution with any of them, and select one.
 
-    Parameters
-    ----------
-    solution : Solution
-    more_starts : callable, optional
-        Yields other starting states for a problem, in case the first leads to a local minimum.
-    preferred : str
-        A model to select unless another predicts decidedly better.
-
-    Returns
-    -------
-    Solution
-        With the cross-validation errors of all fitted models. It is a refusal if the distortion is strong and
-        the model that fits is not monotonic inside the image.
+    `more_starts` yields other starting states for a problem, in case the first leads to a local minimum. The
+    `preferred` model is selected unless another predicts decidedly better. The result has the
+    cross-validation errors of all fitted models. It is a refusal if the distortion is strong and the model
+    that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
@@ -90,7 +81,8 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
     if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
         fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
-    repeated = _repeated(views, fitted)
+    closest = min(fitted.values(), key=lambda c: c.cost).adjusted.state
+    repeated = repeated_poses(views, closest, point_residuals(views, closest))
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
@@ -103,7 +95,7 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
         problem=chosen.problem,
         adjusted=replace(chosen.adjusted, iterations=iterations),
         would_take=solution.would_take | (good - {name}),
-        model_errors={name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()},
+        model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
         refusal=_refusal(fitted, chosen),
     )
 
@@ -165,12 +157,6 @@ def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: flo
             fitted[model] = candidate
 
 
-def _repeated(views: Views, fitted: dict[str, Candidate]) -> RepeatedPoses:
-    """Views that repeat a pose, according to the closest fit."""
-    state = min(fitted.values(), key=lambda c: c.cost).adjusted.state
-    return repeated_poses(views, state, point_residuals(views, state))
-
-
 def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
     problem, adjusted = solution.problem, solution.adjusted
     if problem.views.n_views == 1 or not problem.free_camera.any():
@@ -209,20 +195,22 @@ def _best(
     pool = {
         name: candidate
         for name, candidate in finite.items()
-        if name in few or all(_decidedly(candidate, other, repeated, _FAR_BETTER) for other in few.values())
+        if name in few
+        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, _FAR_BETTER) for c in few.values())
     }
-    best = min(pool, key=lambda name: _lost(pool[name]))
+    best = min(pool, key=lambda name: pool[name].held_out)
     good = {
         name
         for name, candidate in eligible.items()
-        if np.isfinite(candidate.lost).all() and not _decidedly(pool[best], candidate, repeated)
+        if np.isfinite(candidate.lost).all()
+        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
     }
     tied = []
     for name, candidate in pool.items():
         excess = _by_fold(candidate.lost - pool[best].lost, repeated)
         chance = np.sqrt(len(excess)) * excess.std()
         simpler = candidate.coefficients < pool[best].coefficients
-        if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if simpler else 0.0):
+        if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
             tied.append(name)
     return min(tied, key=lambda name: criterion[name]), good
 
@@ -233,42 +221,26 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
     if not ordinary:
         return fitted
-    lowest, least = min(c.criterion(n) for c in ordinary), min(map(_lost, ordinary))
+    lowest, least = min(c.criterion(n) for c in ordinary), min(c.held_out for c in ordinary)
     return {
         name: c
         for name, c in fitted.items()
-        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and _lost(c) <= (1 + 2 * _TIE) * least)
+        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
-
-
-def _decidedly(
-    candidate: Candidate, other: Candidate, repeated: RepeatedPoses, enough: float = _DECIDEDLY
-) -> bool:
-    return predicts_decidedly_better(candidate.lost, other.lost, repeated, enough)
 
 
 def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
     """Whether a fit predicts held-out data better than another by a given factor, and significantly.
 
-    The significance is that of the mean log ratio over the folds, so that no single fold dominates.
-
-    Parameters
-    ----------
-    lost, others : arrays
-        Squared error of each part of the data when it is held out.
-    repeated : RepeatedPoses
-    enough : float
-        Least ratio of the other's rms error to this one's.
+    `lost` and `others` are the squared errors of each part of the data when it is held out, `enough` the
+    least ratio of the other's rms error to this one's. The significance is that of the mean log ratio over
+    the folds, so that no single fold dominates.
     """
     by_fold = [np.maximum(_by_fold(array, repeated), 1e-300) for array in (lost, others)]
     if not by_fold[1].sum() > enough**2 * by_fold[0].sum():
         return False
     ratio = np.log(by_fold[1] / by_fold[0])
     return bool(ratio.sum() > _CERTAIN * np.sqrt(len(ratio)) * ratio.std())
-
-
-def _lost(candidate: Candidate) -> float:
-    return float(candidate.lost.sum())
 
 
 def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
@@ -289,7 +261,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
     sound = {name: c for name, c in monotonic.items() if c.sound}
     if not sound or not several:
         return sound or monotonic
-    lowest = [min(float(c.lost.sum()) for c in some.values()) for some in (sound, monotonic)]
+    lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
 
 
@@ -297,7 +269,7 @@ def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
     """Why the result must be refused: the model that fits is not monotonic, the selected one far worse."""
     for model, candidate in fitted.items():
         bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
-        if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
+        if bad and chosen.held_out > _FAR_WORSE**2 * candidate.held_out:
             return (
                 f"the distortion is strong, and the model {model} that fits the points is not monotonic "
                 f"(maps two directions to one pixel) inside the {candidate.not_monotonic}; give points "

@@ -26,10 +26,15 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
-from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reaches
+from neurocal_cli.camera.monotonic import (
+    largest_angle,
+    monotonic_radius,
+    radial_slope,
+    reaches,
+    unproject_directions,
+)
+from neurocal_cli.camera.polynomial import untilted
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
-from neurocal_cli.camera.tilt import untilted
-from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -55,21 +60,11 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @frozen_dataclass(eq=False)
 class MonotonicFit:
-    """`Penalty` for a distortion that is not monotonic.
+    """`Penalty` for a distortion that is not monotonic."""
 
-    Attributes
-    ----------
-    radii : (m,) array
-        Undistorted radii, or a fisheye's angles.
-    weight : float
-        w, in normalised pixels.
-    least : float
-        s0.
-    """
-
-    radii: Array
-    weight: float
-    least: float
+    radii: Array  # (m,) undistorted radii, or a fisheye's angles
+    weight: float  # w, in normalised pixels
+    least: float  # s0
 
     @_quietly
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
@@ -134,19 +129,10 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
 
 @_quietly
 def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted] | None:
-    """Fit a distortion again so that it is monotonic inside the image.
+    """Fit a distortion again so that it is monotonic inside the image, whose size the points know.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its points know the image size.
-    found : Adjusted
-        The best fit, which is monotonic among the points but not within the image.
-
-    Returns
-    -------
-    problem, adjusted
-        The problem with its penalty; None if the data contradict every such distortion.
+    Starts from the best fit, which is monotonic among the points. The resulting problem has the penalty; None
+    if the data contradict every such distortion.
     """
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))

@@ -38,23 +38,12 @@ class Distance:
 
 @frozen_dataclass(eq=False)
 class NearestCamera:
-    """A converted camera and its distance from the original.
-
-    Attributes
-    ----------
-    camera : Camera
-    over_image : Distance
-        Over the part of the image that the new camera can represent.
-    at_points : Distance, optional
-        At the given pixels.
-    lost : float
-        Share of the image's valid pixels that the new camera cannot represent.
-    """
+    """A converted camera and its distance from the original."""
 
     camera: Camera
-    over_image: Distance
-    at_points: Distance | None
-    lost: float
+    over_image: Distance  # over the part of the image that the new camera can represent
+    at_points: Distance | None  # at the given pixels
+    lost: float  # share of the image's valid pixels that the new camera cannot represent
 
 
 def with_model(distortion: Distortion, model: str) -> Distortion | None:
@@ -76,10 +65,7 @@ def with_model(distortion: Distortion, model: str) -> Distortion | None:
 def image_rays(camera: Camera) -> tuple[Array, Array]:
     """A grid of pixels over the image, (N, 2), and their rays, (N, 3), without pixels that have no ray.
 
-    Raises
-    ------
-    InputError
-        Nearly no pixel has a ray.
+    Raises InputError if nearly no pixel has one.
     """
     pixels, rays = _grid(camera, np.linspace(0, 1, _GRID))
     seen = np.isfinite(rays).all(axis=1)
@@ -91,26 +77,11 @@ def image_rays(camera: Camera) -> tuple[Array, Array]:
 
 
 def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None = None) -> NearestCamera:
-    """Fit a camera of another model.
+    """Fit a camera of another model, which keeps the skew of the old one or has perpendicular image axes.
 
-    Parameters
-    ----------
-    camera : Camera
-    model : str
-        One of `MODELS`.
-    skew : bool
-        Whether the new camera keeps the skew of the old one; otherwise its image axes are perpendicular.
-    points : (N, 2) array, optional [px]
-        Pixels at which the distance is also reported, such as those of the calibration.
-
-    Returns
-    -------
-    NearestCamera
-
-    Raises
-    ------
-    InputError
-        Nearly no pixel of the camera has a ray, or the model can represent nearly none of the rays.
+    The distance is also reported at some points (N, 2) [px], such as those of the calibration. Raises
+    InputError if nearly no pixel of the camera has a ray, or if the model can represent nearly none of the
+    rays.
     """
     pixels, rays = image_rays(camera)
     ahead = _reached(model, rays)

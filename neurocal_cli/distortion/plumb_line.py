@@ -60,22 +60,13 @@ _UNDETERMINED = (
 class PlumbLine:
     """A distortion that was estimated from lines alone.
 
-    Attributes
-    ----------
-    lines : CollinearPoints
-    centre : (2,) array [px]
-        Of the distortion.
-    scale : float [px]
-        The unit s of its radii.
-    distortion : Distortion
-    rms_before, rms : float [px]
-        Rms distance of the observed points from straight lines, and from the distorted lines, over
-        equations less unknowns. All points have the same weight.
+    `rms_before` and `rms` [px] are the rms distances of the observed points from straight lines, and from the
+    distorted lines, over equations less unknowns. All points have the same weight.
     """
 
     lines: CollinearPoints
-    centre: Array
-    scale: float
+    centre: Array  # (2,) [px] of the distortion
+    scale: float  # [px] the unit s of its radii
     distortion: Distortion
     rms_before: float
     rms: float
@@ -88,13 +79,7 @@ class PlumbLine:
         return StraightLines(len(self.lines), on_lines, (u, v), self.rms_before, self.rms)
 
     def corrected(self, points: Correspondences) -> Correspondences:
-        """Undistort points.
-
-        Raises
-        ------
-        DegenerateGeometryError
-            A pixel that the distortion does not reach.
-        """
+        """Undistort points; a DegenerateGeometryError if the distortion does not reach one of the pixels."""
         x, y = ((points.pixels - self.centre) / self.scale).T
         undistorted = np.column_stack(undistort(self.distortion, x, y))
         lost = ~np.isfinite(undistorted[:, 0])
@@ -111,16 +96,8 @@ class PlumbLine:
 def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> PlumbLine:
     """Estimate the distortion from all lines of collinear known points.
 
-    Parameters
-    ----------
-    points : Correspondences
-    centre : (2,) array, optional [px]
-        Of the distortion, where it is known.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Too few lines, or lines that do not determine the distortion.
+    Its centre (2,) [px] is estimated as well, unless it is known. Raises DegenerateGeometryError for too few
+    lines, or lines that do not determine the distortion.
     """
     lines = find_lines(points)
     equations = len(lines.row) - 2 * len(lines)
@@ -182,7 +159,7 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
 
 
 class _LineDistances:
-    """The distances from straight lines as a problem of `least_squares` with one group.
+    """The distances from straight lines, all of them `valid`, as a problem of `least_squares` with one group.
 
     The prior of the centre counts as one more residual of the size of the noise, and the noise is estimated
     from the distances. With the noise eliminated, the log-likelihood of r and c is
@@ -190,16 +167,9 @@ class _LineDistances:
 
         E = r.r exp(|c|^2 / (n prior^2))
 
-    The gradient of E is that of r.r + |c|^2 (r.r / n) / prior^2, up to a factor.
-
-    Parameters
-    ----------
-    curves : DistortedLines
-        All of them `valid`.
-    free : (n,) int array
-        Free columns of A's entries and the coefficients.
-    spare : int
-        Equations less unknowns.
+    The gradient of E is that of r.r + |c|^2 (r.r / n) / prior^2, up to a factor. n, the `spare`, is the
+    number of equations less that of the unknowns; `free` (n,) are the free columns of A's entries and the
+    coefficients.
     """
 
     def __init__(self, curves: DistortedLines, free: NDArray[np.intp], spare: int) -> None:

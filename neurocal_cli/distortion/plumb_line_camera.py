@@ -64,25 +64,10 @@ _BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
 def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
-    """Solve for distortion and camera, starting from the result of the undistorted points.
+    """Solve for distortion and camera on the observed points, from the solution of the undistorted ones.
 
-    Parameters
-    ----------
-    solution : Solution
-        Of the undistorted points, without distortion.
-    plumb : PlumbLine
-    points : Correspondences
-        As observed.
-
-    Returns
-    -------
-    Solution
-        Of the observed points, with distortion; `Solution.shared` is its covariance.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Lines and points do not determine distortion and camera.
+    `Solution.shared` of the result is its covariance. Raises DegenerateGeometryError if lines and points do
+    not determine distortion and camera.
     """
     problem, views = solution.problem, solution.problem.views
     order = slice(None) if views.order is None else views.order
@@ -120,26 +105,13 @@ def _in_camera_terms(entries: Array, observed: Array, undistorted: Array) -> Arr
 
 @frozen_dataclass(eq=False)
 class _PointEquations:
-    """The points' equations, reduced to A by elimination of the poses.
+    """The points' equations, reduced to A's f free entries by elimination of the poses."""
 
-    Attributes
-    ----------
-    by_own : (f, f + K) array
-        Q: derivatives by A's free entries and k.
-    square : (f, f) array
-        S, their variance for noise of variance 1.
-    right : (f,) array
-    gain : (V, 6, f + K) array
-        Change of a view's pose with A and k; empty where poses are given.
-    pose_step : (V, 6) array
-        Step of the poses with A and k fixed.
-    """
-
-    by_own: Array
-    square: Array
-    right: Array
-    gain: Array
-    pose_step: Array
+    by_own: Array  # (f, f + K) Q: derivatives by A's free entries and k
+    square: Array  # (f, f) S, their variance for noise of variance 1
+    right: Array  # (f,)
+    gain: Array  # (V, 6, f + K) change of a view's pose with A and k; empty where poses are given
+    pose_step: Array  # (V, 6) with A and k fixed
 
 
 class _JointEquations:
@@ -257,13 +229,7 @@ _UNDETERMINED = (
 
 
 def _solve(matrix: Array, right: Array) -> Array:
-    """Solve with rows and columns scaled to a unit diagonal.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        A singular matrix.
-    """
+    """Solve with a scaling to a unit diagonal; a DegenerateGeometryError if the matrix is singular."""
     scaled, _ = unit_diagonal(matrix)
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled).max(initial=0.0) > 1 / _SINGULAR:
         raise DegenerateGeometryError(_UNDETERMINED)

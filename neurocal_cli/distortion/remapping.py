@@ -34,24 +34,11 @@ Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]
 
 
 class Remapping:
-    """Undistorts images of one size.
+    """Undistorts images of one size [px], with one of `INTERPOLATIONS`.
 
-    Parameters
-    ----------
-    camera : Camera
-    new : Camera or Panorama
-        Without distortion. Without an image size of its own, the result has that of the images.
-    size : (width, height) [px]
-        Of the images.
-    interpolation : str
-        One of `INTERPOLATIONS`.
-    R : (3, 3) array, optional
-        From the camera's frame to that of the new one, where it is turned as well.
-
-    Raises
-    ------
-    InputError
-        A side too long for OpenCV.
+    The new camera has no distortion; without an image size of its own, the result has that of the images. R,
+    if given, is from the camera's frame to that of the new one. Raises InputError for a side too long for
+    OpenCV.
     """
 
     def __init__(
@@ -79,15 +66,8 @@ class Remapping:
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """Undistorted image of the same type; black where it has no source.
 
-        Parameters
-        ----------
-        image : (height, width) or (height, width, channels) uint8 or uint16 array
-            Also float32 or float64; at most 4 channels.
-
-        Raises
-        ------
-        InputError
-            An image of another size, or an array of another type or shape.
+        The image is a (height, width) or (height, width, channels) array of uint8, uint16, float32 or
+        float64, with at most 4 channels. Raises InputError for another size, type or shape.
         """
         size = _size(image)
         if size != self.size:

@@ -11,8 +11,17 @@ C = sum_j s_j^2 C_j, and S the posterior covariance of w. Then
 
     gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
-A wide lognormal prior bounds sizes that the points do not determine. The covariance includes the prior, and
-it is averaged over the profile's sizes (see `profile_sizes`).
+A wide lognormal prior bounds sizes that the points do not determine. The covariance includes the prior.
+
+Among the points, these determine the profile g. Farther out its prior dominates, whose sizes may be poorly
+determined: if a polynomial fits the profile among the points, the most probable sizes are small, but larger
+ones are not much less probable. So the covariance is averaged over the sizes of the profile. Let w_m be the
+posterior weight of the m-th sizes, P_m and g_m the posterior covariance and mean of g for them, g the
+reported profile, and T = dc/dg the response of all other unknowns c. Then
+
+    E = sum_m w_m (P_m + (g_m - g) (g_m - g)^T),    cov(c, g) = cov(c, g | g) + [T; 1] E [T; 1]^T
+
+is the result of Bayesian model averaging (Hoeting et al. 1999) around the reported parameters.
 """
 
 from __future__ import annotations
@@ -32,10 +41,9 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
-from neurocal_cli.distortion.profile_sizes import averaged_over_sizes
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.normal_equations import unit_diagonal
+from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
 _N = len(NODES)
 # Indices of k1 to k4 and the nodes among the coefficients; and the parts of these unknowns.
@@ -59,17 +67,9 @@ _NEARLY = 0.1  # change of the log evidence that ends the rounds
 
 
 def with_displacement(solution: Solution) -> Solution:
-    """Fit a rich lens, starting from a fisheye or a rich lens.
+    """Fit a rich lens, starting from a fisheye or a rich lens at the minimum, or near it.
 
-    Parameters
-    ----------
-    solution : Solution
-        At the minimum, or near it.
-
-    Returns
-    -------
-    Solution
-        The penalty of its problem is the prior; `shared` is the covariance with the prior.
+    The penalty of the resulting problem is the prior; `shared` is the covariance with the prior.
     """
     solution = _by_evidence(_begun(solution))
     if solution.problem.points.covariance is not None:
@@ -80,12 +80,7 @@ def with_displacement(solution: Solution) -> Solution:
 def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
     """Predicted squared error (V,) of held-out views with a rich lens, without adjusting one.
 
-    Parameters
-    ----------
-    solution : Solution
-        A fisheye, at the minimum.
-    repeated : RepeatedPoses
-        Views of one pose are held out together.
+    The solution is a fisheye, at the minimum. Views of one pose are held out together.
     """
     solution = _begun(solution)
     problem, state = solution.problem, solution.state
@@ -131,21 +126,11 @@ def _extent(directions: Array) -> Array:
 
 @frozen_dataclass(eq=False)
 class _Prior:
-    """The prior of k1 to k4 and the nodes, a `Penalty`.
+    """The prior of k1 to k4 and the nodes, a `Penalty`."""
 
-    Attributes
-    ----------
-    rows : (n, n) array
-        Square root of the precision: extra residuals of k1 to k4 and the nodes.
-    sizes : array
-        Of the processes, in units of x'.
-    scale : float
-        Rms residual of the fisheye, in the same unit.
-    """
-
-    rows: Array
-    sizes: Array
-    scale: float
+    rows: Array  # (n, n) square root of the precision: extra residuals of k1 to k4 and the nodes
+    sizes: Array  # of the processes, in units of x'
+    scale: float  # rms residual of the fisheye, in the same unit
 
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Jacobian (m, 5 + K) and residuals (m,)."""
@@ -164,7 +149,7 @@ def _by_evidence(solution: Solution) -> Solution:
         before = found.sizes
         rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
         problem = replace(problem, penalty=_Prior(rows, before, processes.scale))
-        adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
+        adjusted = problem.adjust(adjusted)
         normal = adjusted.normal
         found = _sizes(problem, adjusted.state, normal, processes, before)
         if (found.gamma * np.abs(np.log(found.sizes / before))).max() < _NEARLY:
@@ -187,6 +172,43 @@ def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
     return averaged_over_sizes(found.covariance, H, right, profile, x[_PROFILE], processes.profiles())
 
 
+def averaged_over_sizes(
+    covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]
+) -> Array:
+    """Covariance (f, f) of the shared parameters, averaged over the priors of the profile.
+
+    `covariance` is that for one of the priors; H (f, f) and `right` (f,) are the precision, and the gradient
+    at the reported values, without the profile's prior; `profile` are the places of the profile among the f
+    parameters and `value` (n,) the reported one; `priors` are prior covariances (m, n, n) and the logarithms
+    (m,) of their prior probabilities.
+    """
+    is_profile = np.zeros(len(H), dtype=bool)
+    is_profile[profile] = True
+    T = -solve_scaled(H[np.ix_(~is_profile, ~is_profile)], H[~is_profile, profile])
+    told = H[profile, profile] + H[profile, ~is_profile] @ T
+    information = right[profile] + T.T @ right[~is_profile] + told @ value
+    follow = np.zeros((len(H), len(value)))
+    follow[profile], follow[~is_profile] = np.eye(len(value)), T
+    E = _second_moment(told, information, value, *priors)
+    return np.asarray(covariance + follow @ (E - covariance[profile, profile]) @ follow.T)
+
+
+def _second_moment(
+    told: Array, information: Array, value: Array, covariances: Array, logarithm: Array
+) -> Array:
+    """E, from the profile's J^T J and J^T r at 0."""
+    root = np.linalg.cholesky(covariances)
+    turned = np.swapaxes(root, 1, 2)
+    G = np.eye(len(told)) + turned @ told @ root
+    P = root @ np.linalg.inv(G) @ turned
+    mean = P @ information
+    logarithm = logarithm + 0.5 * (mean @ information - np.linalg.slogdet(G)[1])
+    weight = np.exp(logarithm - logarithm.max())
+    away = mean - value
+    second = P + away[:, :, None] * away[:, None, :]
+    return np.asarray(np.tensordot(weight / weight.sum(), second, axes=1))
+
+
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
     """The processes and their initial sizes."""
     reaches = state.k[FIRST_NODE - len(REACHES) : FIRST_NODE]
@@ -198,21 +220,11 @@ def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Pr
 
 @frozen_dataclass(eq=False)
 class _Processes:
-    """The Gaussian processes of the prior.
+    """The Gaussian processes of the prior."""
 
-    Attributes
-    ----------
-    profile : (p, n, n) array
-    field : (f, m, m) array
-        Covariances of processes of size 1; the field's are the same for both directions.
-    of_fisheye : (4,) array
-        Standard deviations of k1 to k4.
-    scale : float
-    """
-
-    profile: Array
-    field: Array
-    of_fisheye: Array
+    profile: Array  # (p, n, n) covariances of processes of size 1
+    field: Array  # (f, m, m) the same, for both directions
+    of_fisheye: Array  # (4,) standard deviations of k1 to k4
     scale: float
 
     def inverses(self, sizes: Array) -> tuple[Array, Array]:
@@ -250,30 +262,17 @@ def _alike(distance: Array, length: float) -> Array:
 class _Found:
     """Estimated sizes of the processes, with the resulting posterior.
 
-    Attributes
-    ----------
-    sizes, gamma : arrays
-        Size of each process in units of x', and its effective number of unknowns determined by the points.
-    precision : (n, n) array
-        P, of k1 to k4 and the nodes, in units of the squared residuals.
-    covariance : (f, f) array
-        Of the free shared parameters.
-    determined : float
-        Effective number of the nodes' unknowns that the points determine.
-    variance : float
-        Of the residuals.
-    S, g : (f, f) and (f,) arrays
-        Quadratic model of the squared error around the state, with the poses eliminated.
+    S and g are the quadratic model of the squared error around the state, with the poses eliminated.
     """
 
-    sizes: Array
-    gamma: Array
-    precision: Array
-    covariance: Array
-    determined: float
-    variance: float
-    S: Array
-    g: Array
+    sizes: Array  # of each process, in units of x'
+    gamma: Array  # effective number of unknowns of each process that the points determine
+    precision: Array  # (n, n) P, of k1 to k4 and the nodes, in units of the squared residuals
+    covariance: Array  # (f, f) of the free shared parameters
+    determined: float  # effective number of the nodes' unknowns that the points determine
+    variance: float  # of the residuals
+    S: Array  # (f, f)
+    g: Array  # (f,)
 
 
 def _sizes(
@@ -298,16 +297,11 @@ def _sizes(
         inverse = _inverse(H)
         step = inverse @ right
         covariance, w = variance * inverse[own, own], x + step[own]
-        num, den = (
-            np.concatenate(
-                [
-                    _evidence(processes.profile, of_profile, w, covariance, (_PROFILE,)),
-                    _evidence(processes.field, of_field, w, covariance, (_FIELD_X, _FIELD_Y)),
-                ],
-                axis=1,
-            )
-            * sizes**2
+        of_each = (
+            _evidence(processes.profile, of_profile, w, covariance, (_PROFILE,)),
+            _evidence(processes.field, of_field, w, covariance, (_FIELD_X, _FIELD_Y)),
         )
+        num, den = np.concatenate(of_each, axis=1) * sizes**2
         determined = _N - float((P[4:, 4:] * covariance[4:, 4:]).sum())
         last, variance = variance, (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
         change = np.clip(_change(num, den, np.log(sizes / scale)), -_LONGEST, _LONGEST)

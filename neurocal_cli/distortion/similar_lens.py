@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
-from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names, radial_part
+from neurocal_cli.camera.polynomial import sensor_rotation
 from neurocal_cli.camera.projection import ENTRIES, project_points
-from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models converge from these starts.
@@ -37,17 +37,8 @@ def similar_states(
 ) -> list[CameraState]:
     """States of another model with nearly the same image, the most similar first; same poses and centre.
 
-    Parameters
-    ----------
-    state : CameraState
-        Of one camera.
-    model : str
-        A model with coefficients.
-    farthest : float
-        Largest angle from the axis that is compared [rad].
-    xi : array, optional
-        For a model with xi: return one state for each of these values, in their order, without those that
-        have no similar lens.
+    The state is of one camera, and angles up to the `farthest` [rad] are compared. If values of xi are given,
+    there is one state for each of them, in their order, without those that have no similar lens.
     """
     if (same := _with_more_coefficients(state, model)) is not None:
         return [same]
@@ -105,10 +96,8 @@ def tilted_states(state: CameraState) -> list[CameraState]:
 
 def _radius(model: str, k: Array, theta: Array) -> Array:
     """Distorted radii without tangential terms; nan outside the model's domain."""
-    names = coefficient_names(model)
-    radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
-        x, seen = _projected(model, radial, np.sin(theta), np.cos(theta))
+        x, seen = _projected(model, radial_part(model, k), np.sin(theta), np.cos(theta))
         # The domain ends where the radius first ceases to grow.
         grows = seen & (np.diff(x, prepend=0.0) > 0)
     return np.where(np.logical_and.accumulate(grows), x, np.nan)

@@ -14,6 +14,7 @@ enter.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -32,19 +33,11 @@ _MOST_STEPS = 15
 
 @frozen_dataclass(eq=False)
 class LineImages:
-    """Images of the points on lines, in any unit and from any origin.
-
-    Attributes
-    ----------
-    lines : CollinearPoints
-    pixels : (M, 2) array
-        Of each point on each line.
-    whitening : (M, 3) array or None
-        Entries (0, 0), (0, 1), (1, 1) of the factor that whitens a pixel's error.
-    """
+    """Images of the points on lines, in any unit and from any origin."""
 
     lines: CollinearPoints
-    pixels: Array
+    pixels: Array  # (M, 2) of each point on each line
+    # (M, 3) entries (0, 0), (0, 1), (1, 1) of the factor that whitens a pixel's error.
     whitening: Array | None
 
     def whiten(self, u: Array, v: Array) -> tuple[Array, Array]:
@@ -60,27 +53,14 @@ class LineImages:
 
 @frozen_dataclass(eq=False)
 class DistortedLines:
-    """Straight lines and their distorted images.
+    """Straight lines and their distorted images."""
 
-    Attributes
-    ----------
-    images : LineImages
-        Observed points.
-    entries : (5,) array
-        A11, A12, A22, A13, A23 of the camera.
-    distortion : Distortion
-    base, along : (L, 2) arrays
-        A point and the direction of each line in the normalised image.
-    feet : (M,) array
-        t of each point.
-    """
-
-    images: LineImages
-    entries: Array
+    images: LineImages  # observed points
+    entries: Array  # (5,) A11, A12, A22, A13, A23 of the camera
     distortion: Distortion
-    base: Array
-    along: Array
-    feet: Array
+    base: Array  # (L, 2) a point of each line in the normalised image
+    along: Array  # (L, 2) direction of each line
+    feet: Array  # (M,) t of each point
 
     def with_camera(self, entries: Array, coefficients: Array) -> DistortedLines:
         """The same lines with other entries of A and other coefficients of the same model."""
@@ -97,24 +77,24 @@ class DistortedLines:
         return curves
 
     def _moved(self) -> tuple[DistortedLines, float]:
-        at = _Images(self)
-        index, n = self.images.lines.line, self.normals
-        r, across = at.errors(), at.across(n[index])
+        at, n, t = self._at_feet, self.normals, self.feet
+        across = at.across(n[self.images.lines.line])
         # Each line moves by (a + b t) along its normal.
-        t = self.feet
-        sums = [
-            self.images.sum_by_line(c)
-            for c in (across * across, across * across * t, across * across * t * t)
-        ]
-        right = [self.images.sum_by_line(c) for c in (across * r, across * r * t)]
-        det = sums[0] * sums[2] - sums[1] ** 2
-        a = (sums[2] * right[0] - sums[1] * right[1]) / det
-        b = (sums[0] * right[1] - sums[1] * right[0]) / det
+        square, product = across * across, across * at.r
+        s0, s1, s2 = (self.images.sum_by_line(c) for c in (square, square * t, square * t * t))
+        r0, r1 = (self.images.sum_by_line(c) for c in (product, product * t))
+        det = s0 * s2 - s1**2
+        a, b = (s2 * r0 - s1 * r1) / det, (s0 * r1 - s1 * r0) / det
         along = self.along + b[:, None] * n
         along /= np.linalg.norm(along, axis=1)[:, None]
-        feet, shift = at.nearer()
+        u, v = at.tangent
+        shift = (u * at.error[0] + v * at.error[1]) / (u * u + v * v)
         step = float(max(np.abs(a).max(), np.abs(b).max(), np.abs(shift).max()))
-        return replace(self, base=self.base + a[:, None] * n, along=along, feet=feet), step
+        return replace(self, base=self.base + a[:, None] * n, along=along, feet=t + shift), step
+
+    @cached_property
+    def _at_feet(self) -> _Images:
+        return _Images(self)
 
     @property
     def normals(self) -> Array:
@@ -123,47 +103,39 @@ class DistortedLines:
 
     def errors(self) -> Array:
         """(M,) distances of the points from their curves, whitened, signed."""
-        return _Images(self).errors()
+        return self._at_feet.r
 
     @property
     def valid(self) -> bool:
         """Whether no line is a single point and the distortion is monotonic at all points."""
         with np.errstate(all="ignore"):
-            at = _Images(self)
-            return bool(np.isfinite(at.errors()).all() and (at.determinant > 0).all())
+            return bool(np.isfinite(self.errors()).all() and (self._at_feet.determinant > 0).all())
 
     def derivatives(self) -> tuple[Array, Array, Array]:
-        """Errors, and their derivatives by A and the distortion.
+        """Errors r (M,), their derivatives by A and the distortion, and their directions nu (M, 2).
 
-        Returns
-        -------
-        r : (M,) array
-        J : (M, 5 + K) array
-            Minus the derivative of r by A's entries and the coefficients, with the parameters of each
-            line eliminated.
-        nu : (M, 2) array
-            Direction of each error in the whitened image.
+        The second result J (M, 5 + K) is minus the derivative of r by A's entries and the coefficients, with
+        the parameters of each line eliminated. The directions are in the whitened image.
         """
-        at = _Images(self)
+        at = self._at_feet
         J = at.columns()
         across = at.across(self.normals[self.images.lines.line])
-        t = self.feet
-        basis = np.column_stack([across, across * t])
+        basis = np.column_stack([across, across * self.feet])
         gram = self.images.sum_by_line(basis[:, :, None] * basis[:, None, :])
         mixed = self.images.sum_by_line(basis[:, :, None] * J[:, None, :])
         taken = np.linalg.solve(gram, mixed)[self.images.lines.line]  # regular where `valid`
         J -= (basis[:, :, None] * taken).sum(axis=1)
-        return at.errors(), J, np.column_stack(at.nu)
+        return at.r, J, np.column_stack(at.nu)
 
 
 class _Images:
     """Predicted images of all feet, with their derivatives."""
 
     def __init__(self, curves: DistortedLines) -> None:
-        self.curves, self.images = curves, curves.images
+        self.entries, self.images = curves.entries, curves.images
         index = self.images.lines.line
-        self.along = curves.along[index]
-        x, y = (curves.base[index] + curves.feet[:, None] * self.along).T
+        along = curves.along[index]
+        x, y = (curves.base[index] + curves.feet[:, None] * along).T
         model, k = curves.distortion.model, curves.distortion.coefficients
         image = image_points_with_jacobian(curves.entries, model, k, x, y)
         self.x, self.y, self.slope, self.by_k = image.x, image.y, image.by_point, image.by_coefficient
@@ -171,9 +143,10 @@ class _Images:
         self.determinant = ux * vy - uy * vx
         u, v = self.images.pixels[:, 0] - image.u, self.images.pixels[:, 1] - image.v
         self.error = self.images.whiten(u, v)
-        self.tangent = self._through(self.along)
+        self.tangent = self._through(along)
         length = np.hypot(*self.tangent)
         self.nu = -self.tangent[1] / length, self.tangent[0] / length
+        self.r = self.nu[0] * self.error[0] + self.nu[1] * self.error[1]
 
     def _through(self, direction: Array) -> tuple[Array, Array]:
         """Distorted and whitened images of directions in the undistorted image."""
@@ -181,24 +154,14 @@ class _Images:
         uu, uv, vu, vv = self.slope
         return self.images.whiten(uu * dx + uv * dy, vu * dx + vv * dy)
 
-    def errors(self) -> Array:
-        """Whitened distances (N,) of the points across their curves."""
-        return self.nu[0] * self.error[0] + self.nu[1] * self.error[1]
-
     def across(self, direction: Array) -> Array:
         """Components across the curve of directions in the undistorted image."""
         u, v = self._through(direction)
         return self.nu[0] * u + self.nu[1] * v
 
-    def nearer(self) -> tuple[Array, Array]:
-        """Feet nearer to the points, and the shifts."""
-        u, v = self.tangent
-        shift = (u * self.error[0] + v * self.error[1]) / (u * u + v * v)
-        return self.curves.feet + shift, shift
-
     def columns(self) -> Array:
         """(M, 5 + K) derivatives of the images across their curves by A's entries and the coefficients."""
-        a, s, b, _, _ = self.curves.entries
+        a, s, b, _, _ = self.entries
         zero, one = np.zeros_like(self.x), np.ones_like(self.x)
         by = [(self.x, zero), (self.y, zero), (zero, self.y), (one, zero), (zero, one)]
         by += [(a * dx + s * dy, b * dy) for dx, dy in self.by_k]

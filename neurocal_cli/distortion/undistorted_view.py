@@ -1,8 +1,19 @@
-"""Choice of the projection of undistorted images: plane, cylinder or sphere, and field of view.
+"""The projection of undistorted images: plane, cylinder or sphere, and field of view.
 
 The optical axis keeps its pixel, scaled if the image size changes. In a panorama with a given field of view
 it lies in the middle. A plane shows less than 180 degrees, and its scale grows outwards with 1 / cos^2 of the
-angle.
+angle. On a panorama, a ray (X, Y, Z) has the longitude lambda = atan2(X, Z) and the latitude
+phi = atan2(Y, hypot(X, Z)):
+
+    cylinder          u = f lambda + u0,  v = f tan(phi) + v0
+    equirectangular   u = f lambda + u0,  v = f phi + v0
+
+and back, with lambda = (u - u0) / f:
+
+    cylinder          (sin lambda, (v - v0) / f, cos lambda)
+    equirectangular   (cos phi sin lambda, sin phi, cos phi cos lambda),  phi = (v - v0) / f
+
+On both, lines parallel to the camera's y axis are vertical. f is in pixels a radian.
 """
 
 from __future__ import annotations
@@ -10,29 +21,88 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.panorama import PANORAMAS, Panorama
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+PANORAMAS = ("cylinder", "equirectangular")
 SHAPES = ("plane", *PANORAMAS)
-Undistorted = Camera | Panorama
 
 _ALONG = 1001  # pixels along a row and a column
 _WIDEST_PLANE = 170.0  # degrees
 _NARROW = 1e-3  # rad
 
 
-class Field(NamedTuple):
-    """Field of view of an image along the row and the column of its optical axis [rad].
+@frozen_dataclass
+class Panorama:
+    """An image on a cylinder or a sphere around the camera.
 
-    Attributes
-    ----------
-    left, right, top, bottom : float
-        Angles from the axis; left and top are negative.
+    Raises InputError for another shape, or a scale that is not positive.
+    """
+
+    shape: str  # one of `PANORAMAS`
+    f: float  # px/rad
+    u0: float  # px; with v0 the pixel of the z axis
+    v0: float
+    image_size: tuple[int, int]  # (width, height) [px]
+    name: str = "camera"
+
+    def __post_init__(self) -> None:
+        if self.shape not in PANORAMAS:
+            raise InputError(f"a panorama is one of {', '.join(PANORAMAS)}, not {self.shape[:40]!r}")
+        if not (np.isfinite([self.f, self.u0, self.v0]).all() and self.f > 0):
+            raise InputError(f"a panorama needs a positive scale, found {self.f:g} px per radian")
+
+    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels of points (..., 3) of the camera's frame, and whether they exist: not at the poles."""
+        X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        across = np.hypot(X, Z)
+        shown = np.asarray(across > 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            height = Y / across if self.shape == "cylinder" else np.arctan2(Y, across)
+            pixels = np.stack([self.f * np.arctan2(X, Z) + self.u0, self.f * height + self.v0], axis=-1)
+        return np.where(shown[..., None], pixels, np.nan), shown
+
+    def unproject(self, pixels: Array) -> Array:
+        """Unit rays (..., 3) of pixels (..., 2); ``nan`` beyond half a turn, and beyond a pole."""
+        u, v = np.moveaxis(np.asarray(pixels, dtype=float), -1, 0)
+        rays = np.stack(self.directions(u, v), axis=-1)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+    def directions(self, u: Array, v: Array) -> tuple[Array, Array, Array]:
+        """The same as three arrays, which on a cylinder are not of unit length."""
+        longitude, height = (u - self.u0) / self.f, (v - self.v0) / self.f
+        longitude = np.where(np.abs(longitude) <= np.pi, longitude, np.nan)
+        if self.shape == "cylinder":
+            return np.sin(longitude), height + 0 * longitude, np.cos(longitude)
+        latitude = np.where(np.abs(height) <= np.pi / 2, height, np.nan)
+        across = np.cos(latitude)
+        return across * np.sin(longitude), np.sin(latitude) + 0 * longitude, across * np.cos(longitude)
+
+    def slopes(self, u: Array, v: Array) -> Array:
+        """(N, 3, 2) derivatives of `directions` by the pixels (N,)."""
+        X, Y, Z = self.directions(u, v)
+        by_u = np.stack([Z, 0 * Y, -X], axis=-1)
+        if self.shape == "cylinder":
+            by_v = np.stack([0 * Y, 1 + 0 * Y, 0 * Y], axis=-1)
+        else:
+            longitude = (u - self.u0) / self.f
+            by_v = np.stack([-Y * np.sin(longitude), np.hypot(X, Z), -Y * np.cos(longitude)], axis=-1)
+        return np.asarray(np.stack([by_u, by_v], axis=-1) / self.f)
+
+
+Undistorted = Camera | Panorama
+
+
+class Field(NamedTuple):
+    """Field of view of an image along the row and the column of its optical axis, as angles from it [rad].
+
+    Those to the left and the top are negative.
     """
 
     left: float
@@ -55,13 +125,7 @@ class Field(NamedTuple):
 
 
 def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
-    """The field of view of images of some size.
-
-    Raises
-    ------
-    InputError
-        The camera has no rays along that row or column.
-    """
+    """The field of view of images of some size; an InputError if that row or column has no rays."""
     u0, v0 = _axis(camera, size)
     share, ends = np.linspace(0, 1, _ALONG), []
     for row in (True, False):
@@ -99,24 +163,11 @@ def undistorted_view(
     fov: float | None = None,
     new_size: tuple[int, int] | None = None,
 ) -> Undistorted:
-    """Choose the projection of undistorted images.
+    """Choose the projection of undistorted images, one of `SHAPES`, for images of some size [px].
 
-    Parameters
-    ----------
-    camera : Camera
-    size : (width, height) [px]
-        Of its images.
-    shape : {"plane", "cylinder", "equirectangular"}
-    fov : float, optional [degrees]
-        Field of view from left to right. By default a plane keeps the scale of the image centre; the other
-        shapes show the whole field of view from left to right.
-    new_size : (width, height), optional [px]
-        Of the undistorted images; by default the same.
-
-    Raises
-    ------
-    InputError
-        The shape does not exist, or cannot show that field of view.
+    The field of view is from left to right [degrees]. By default a plane keeps the scale of the image centre;
+    the other shapes show the whole field of view. The undistorted images have the same size, unless a new one
+    is given. Raises InputError if the shape does not exist, or cannot show that field of view.
     """
     if shape not in SHAPES:
         raise InputError(f"the shape must be one of {', '.join(SHAPES)}, not {shape[:40]!r}")

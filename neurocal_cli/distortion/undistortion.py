@@ -1,7 +1,7 @@
 """Undistortion of points, and the source pixels of undistorted images.
 
 A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere
-(`panorama`). On a plane, with A' without distortion, that is
+(`undistorted_view`). On a plane, with A' without distortion, that is
 
     x = undistort(A^-1 m),   m' = A' x
 
@@ -19,10 +19,9 @@ from neurocal_cli.bundle_adjustment.measured_directions import unit
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.monotonic import monotonic_radius
+from neurocal_cli.camera.monotonic import largest_angle, monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.projection import image_points_with_jacobian, project_points
-from neurocal_cli.camera.unprojection import largest_angle
 from neurocal_cli.distortion.undistorted_view import Undistorted, plane_like, undistorted_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
@@ -40,29 +39,24 @@ def undistorted_camera(
 ) -> Camera:
     """The camera of undistorted pixels.
 
-    Parameters
-    ----------
-    camera : Camera
-    alpha : float, optional
-        See `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
-    size : (width, height), optional [px]
-        Of the images, for alpha; else the camera's.
-
-    Raises
-    ------
-    InputError
-        No image size for alpha, or a distortion that leaves no picture.
+    alpha is that of `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
+    The size of the images is needed for alpha, and is by default the camera's. Raises InputError if there is
+    none, or if the distortion leaves no picture.
     """
     size = size or camera.image_size
     intrinsics = plane_like(camera)
     if alpha is not None:
-        if size is None:
-            raise InputError(
-                "alpha needs the size of the images, which neither the camera nor the points have; add "
-                "image_size"
-            )
-        intrinsics = new_matrix(camera, size, alpha)
+        intrinsics = new_matrix(camera, _known("alpha", size), alpha)
     return Camera(intrinsics, Distortion(), size, camera.name)
+
+
+def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
+    if size is None:
+        raise InputError(
+            f"{what} needs the size of the images, which neither the camera nor the points have; add "
+            "image_size"
+        )
+    return size
 
 
 def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array | None = None) -> Array:
@@ -77,16 +71,9 @@ def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array |
 def sources(
     camera: Camera, new: Undistorted, u: Array, v: Array, R: Array | None = None
 ) -> tuple[Array, Array]:
-    """Source pixels of pixels (u, v) of an undistorted image; ``nan`` where there are none.
+    """Source pixels of pixels u, v, arrays of one shape, of an undistorted image; ``nan`` where none is.
 
-    Parameters
-    ----------
-    camera : Camera
-    new : Camera or Panorama
-        Without distortion.
-    u, v : arrays of one shape [px]
-    R : (3, 3) array, optional
-        From the camera's frame to that of the new one, where it is turned as well.
+    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
     """
     X, Y, Z = _directions(new, u, v)
     if R is not None:
@@ -127,23 +114,10 @@ def _distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
     """Camera matrix for undistorted images of the same size, as in OpenCV's getOptimalNewCameraMatrix.
 
-    Parameters
-    ----------
-    camera : Camera
-    size : (width, height) [px]
-    alpha : float
-        0: the largest rectangle of valid pixels fills the image. 1: the image shows all pixels of the
-        distorted one, and the rest is black. Values in between interpolate the two matrices.
-
-    Returns
-    -------
-    intrinsics : Intrinsics
-        Without skew. The ratio of its scale factors is that of the rectangle's sides.
-
-    Raises
-    ------
-    InputError
-        The distortion leaves no rectangle.
+    With alpha = 0 the largest rectangle of valid pixels fills the image. With 1 the image shows all pixels of
+    the distorted one, and the rest is black. Values in between interpolate the two matrices. The result has
+    no skew, and the ratio of its scale factors is that of the rectangle's sides. Raises InputError if the
+    distortion leaves no rectangle.
     """
     width, height = size
     corner = np.array([width - 1, height - 1], dtype=float)
@@ -159,11 +133,9 @@ def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsic
     least, most = _outer(camera, corner)
     least, most = np.fmin(least, low), np.fmax(most, high)
     outer = corner / (most - least)
-    (a, b), (u0, v0) = (
-        (1 - alpha) * inner + alpha * outer,
-        (1 - alpha) * -inner * low + alpha * -outer * least,
-    )
-    return Intrinsics(a, b, u0, v0)
+    scale = (1 - alpha) * inner + alpha * outer
+    centre = (1 - alpha) * -inner * low + alpha * -outer * least
+    return Intrinsics(*scale, *centre)
 
 
 def _inner(camera: Camera, corner: Array) -> tuple[Array, Array]:
@@ -246,21 +218,13 @@ def chosen_view(
 ) -> Undistorted:
     """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
 
-    Raises
-    ------
-    InputError
-        Both of them, or no image size where one is needed.
+    Raises InputError for both of them, and if there is no image size where one is needed.
     """
     if to == "plane" and fov is None and new_size is None:
         return undistorted_camera(camera, alpha, size)
     if alpha is not None:
         raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
-    size = size or camera.image_size
-    if size is None:
-        raise InputError(
-            "a field of view needs the size of the images, which neither the camera nor the points have; add "
-            "image_size"
-        )
+    size = _known("a field of view", size or camera.image_size)
     return undistorted_view(camera, size, to, fov, new_size)
 
 
@@ -275,22 +239,11 @@ def shown(
 def map_points(
     points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
 ) -> Correspondences:
-    """Convert points to the pixels of another camera with the same centre.
+    """Convert points to the pixels of another camera with the same centre, without distortion.
 
-    Parameters
-    ----------
-    points : Correspondences
-        Their covariances and the image centre, where given, are transformed as well.
-    camera : Camera
-    new : Camera or Panorama
-        Without distortion.
-    R : (3, 3) array, optional
-        From the camera's frame to that of the new one, where it is turned as well.
-
-    Raises
-    ------
-    InputError
-        A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
+    Their covariances and the image centre, where given, are transformed as well. R (3, 3) is from the
+    camera's frame to that of the new one, where it is turned as well. Raises InputError for a pixel that the
+    distortion does not reach, or that a plane cannot show, named by its file and line.
     """
     pixels = undistort_pixels(camera, new, points.pixels, R)
     lost = ~np.isfinite(pixels[:, 0])

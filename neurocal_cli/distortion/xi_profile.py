@@ -169,10 +169,8 @@ class _Profile:
         if not variance > 0 or not cov.smallest > 1e-12:
             return False
         for one in self.tried:
-            expected, found = (
-                abs(_xi(one) - _xi(best)) / np.sqrt(variance),
-                np.sqrt(max(self._excess(one), 0)),
-            )
+            expected = abs(_xi(one) - _xi(best)) / np.sqrt(variance)
+            found = np.sqrt(max(self._excess(one), 0))
             possible = min(expected, found) < np.sqrt(_POSSIBLE)
             if possible and abs(expected - found) > _AS_A_PARABOLA * max(1.0, 0.3 * expected):
                 return False

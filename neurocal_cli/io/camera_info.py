@@ -18,7 +18,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.yaml_text import flow, mapping, number, text
 
 if TYPE_CHECKING:
-    from neurocal_cli.distortion.panorama import Panorama
+    from neurocal_cli.distortion.undistorted_view import Panorama
 
 # ROS's names of our models. Others are a plumb_bob with 5 coefficients; simpler models use the first of them.
 _ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}

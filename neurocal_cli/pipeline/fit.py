@@ -16,9 +16,12 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
-from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_supported
-from neurocal_cli.distortion.given_distortion import check_distortion
-from neurocal_cli.distortion.multi_start import with_more_starts
+from neurocal_cli.distortion.given_model import (
+    DENOMINATOR,
+    check_distortion,
+    with_denominator_if_supported,
+    with_more_starts,
+)
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve

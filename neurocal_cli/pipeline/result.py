@@ -25,7 +25,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
-from neurocal_cli.verdict.pixel_values import normalised
+from neurocal_cli.verdict.odd_points import normalised
 
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity

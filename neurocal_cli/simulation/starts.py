@@ -23,8 +23,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.least_squares import least_squares
-from neurocal_cli.baselines.nonlinear import descend, nonlinear
+from neurocal_cli.baselines.nonlinear import descend, least_squares, nonlinear
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks

@@ -23,18 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import (
-    FOLDS,
-    Minimum,
-    disagreement,
-    held_out,
-    reduced,
-)
-from neurocal_cli.bundle_adjustment.outlier_views import (
-    conditions_on_views,
-    free_networks,
-    seen_from_behind,
-)
+from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
+from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
@@ -58,7 +48,7 @@ from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import Reestimated, reestimate_centre, reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.verdict.pixel_values import repeated_views
+from neurocal_cli.verdict.odd_points import repeated_views
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
@@ -80,13 +70,7 @@ _DISTANT = 10.0  # times the distance of the farthest point
 # In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def gather_evidence(calibration: Calibration) -> Evidence:
-    """Compute all measures of a calibration's quality.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        With its points.
-    """
+    """Compute all measures of the quality of a calibration, which has its points."""
     return _AtMinimum(calibration).evidence()
 
 
@@ -167,7 +151,9 @@ class _AtMinimum:
             )
         )  # fmt: skip
         self.normal = known.basis.normal
+        self.minimum = Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
         self.spare = max(known.basis.n_equations - self.unknowns, 1)
+        self.variance = self.cost / self.spare
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
         self.covariance, self.wide = known.found.entries, known.wide
 
@@ -183,7 +169,7 @@ class _AtMinimum:
         precision, contradiction = self._precision()
         # Residuals beyond an estimated target come from bends that differ from view to view.
         found = self.calibration.target is not None
-        noise = self.cost / self.spare * (max(contradiction, 1.0) ** 2 if found else 1.0)
+        noise = self.variance * (max(contradiction, 1.0) ** 2 if found else 1.0)
         alike, residuals = correlation(views, self.errors), self._residuals()
         stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
@@ -220,7 +206,7 @@ class _AtMinimum:
             return found
         views = self.views if target is None else self._arranged(target.as_given(self.points))
         simpler = reestimate_centre(
-            views, normalised(self.given, views), given, self.free_poses, self.cost / self.spare
+            views, normalised(self.given, views), given, self.free_poses, self.variance
         )
         farther = {a.name: a for a in simpler}
         for a in found:
@@ -246,11 +232,8 @@ class _AtMinimum:
         """(V,) squared error of a free network for each view."""
         return free_networks(self.views, self.state)
 
-    def _minimum(self) -> Minimum:
-        return Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
-
     def _held_out(self) -> float:
-        lost = held_out(self._minimum())
+        lost = held_out(self.minimum)
         if self.camera.distortion.model == "rich":
             lost = self._held_out_with_prior()
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
@@ -264,7 +247,7 @@ class _AtMinimum:
         free, shared = _stored(self.calibration, self.views.pixel_scale)
         q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
         S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
-        inverse = shared / (self.cost / self.spare)
+        inverse = shared / self.variance
         steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
         return q.at(np.asarray(steps[fold], dtype=float))
 
@@ -276,7 +259,7 @@ class _AtMinimum:
         own = float(self.networks.sum()) / own_spare
         px = self.views.pixel_scale
         floor = (1e-9 * px) ** 2
-        ratio = np.sqrt((self.cost / self.spare + floor) / (own + floor))
+        ratio = np.sqrt((self.variance + floor) / (own + floor))
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
@@ -287,16 +270,17 @@ class _AtMinimum:
         change = view_change(
             self.views, self.state, self.free, scores, self.repeated.group, variance, self.spare
         )
+        if change is None or change.pattern != "groups" or self.calibration.target is None:
+            return change
         # A board that bends differently in each view mimics two slightly different groups of views.
-        flexes = self.calibration.target is not None and change is not None and change.pattern == "groups"
-        return None if flexes and change is not None and abs(change.amount) < _BY_FLEXING else change
+        return None if abs(change.amount) < _BY_FLEXING else change
 
     def _board(self) -> BoardShape | None:
         if not self.free[0] or not self.free_poses or self.calibration.target is not None:
             return None
         std = float(np.sqrt(self.covariance[0, 0]))
         times = float(self.repeated.variance.mean())
-        return board_shape(self.views, self.state, self.free, self.cost / self.spare, self.spare, times, std)
+        return board_shape(self.minimum, self.variance, self.spare, times, std)
 
     def _missing(self) -> MissingCoefficients | None:
         selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
@@ -304,12 +288,12 @@ class _AtMinimum:
             return None
         std = np.zeros(len(self.free))
         std[self.free] = np.sqrt(np.diagonal(self.covariance))
-        return missing_coefficients(self.views, self.state, self.normal, self.free, self.free_poses, std[:5])
+        return missing_coefficients(self.minimum, std[:5])
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
-        difference, cov = disagreement(self._minimum())
+        difference, cov = disagreement(self.minimum)
         if not np.isfinite(cov).all():
             return np.nan
         chi = chi_squared(difference, cov)
@@ -328,23 +312,16 @@ class _AtMinimum:
                 (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
             )
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
-        state, camera, normal, free = self.state, self.camera, self.normal, self.free
-        shared = self.covariance
+        m, camera, shared = self.minimum, self.camera, self.covariance
         if self.wide is not None:
-            richer = self.wide.open
-            state, normal, free, shared = (
-                richer.state(state),
-                self.wide.normal,
-                richer.free,
-                self.wide.entries,
-            )
-            camera = replace(camera, distortion=Distortion(richer.model, richer.k))
+            lens, shared = self.wide.open, self.wide.entries
+            m = replace(m, state=lens.state(m.state), normal=self.wide.normal, free=lens.free)
+            camera = replace(camera, distortion=Distortion(lens.model, lens.k))
         if camera.distortion.model == "rich":
             free, shared = _stored(self.calibration, self.views.pixel_scale)
-        return projection_uncertainty(
-            self.views, state, camera, normal, free, self.free_poses, self.cost / self.spare,
-            image_grid(self.points.image_size), depths, shared, angle,
-        )  # fmt: skip
+            m = replace(m, free=free)
+        pixels = image_grid(self.points.image_size)
+        return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
 
 
 def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -37,59 +38,29 @@ _ACROSS = 11  # points of a grid on the board
 class BoardShape:
     """Estimated bend or stretch of a target that is given as flat.
 
-    Attributes
-    ----------
-    bend : float
-        Height between its highest and lowest point over the mean plane [world unit]; 0 if it is stretched.
-    stretch, shear : float
-        Relative stretch of the longer side against the shorter one; deviation of the angle between the sides
-        from a right angle [rad]. 0 if the board is bent.
-    side : str
-        World axis nearest to the longer side.
-    focal_length : float
-        Relative change of the focal length if this shape were used.
-    sigmas : float
-        The same in standard deviations.
-    explained : float
-        Share of the squared error that the shape explains.
+    If it is bent, the bend is the height between its highest and lowest point over the mean plane [world
+    unit], and the other two are 0. Else the bend is 0, and the others are the relative stretch of the longer
+    side against the shorter one, and the deviation of the angle between the sides from a right angle [rad].
     """
 
     bend: float
     stretch: float
     shear: float
-    side: str
-    focal_length: float
-    sigmas: float
-    explained: float
+    side: str  # world axis nearest to the longer side
+    focal_length: float  # relative change of the focal length if this shape were used
+    sigmas: float  # the same in standard deviations
+    explained: float  # share of the squared error that the shape explains
 
 
-def board_shape(
-    views: Views,
-    state: CameraState,
-    free: NDArray[np.bool_],
-    variance: float,
-    spare: float,
-    times: float,
-    std: float,
-) -> BoardShape | None:
+def board_shape(m: Minimum, variance: float, spare: float, times: float, std: float) -> BoardShape | None:
     """Test whether the board is bent or stretched; None if it is not, or if the test is impossible.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised, at the minimum, with estimated poses.
-    free : (5 + K,) bool array
-    variance : float
-        Of the residuals, normalised.
-    spare : float
-        Equations beyond the unknowns.
-    times : float
-        Variance of sums over views relative to that of independent views (`repeated_poses`).
-    std : float
-        Standard deviation of A11, normalised.
+    The poses are estimated. `variance` is that of the residuals and `std` that of A11, both normalised;
+    `spare` are the equations beyond the unknowns, and `times` is the variance of sums over views relative to
+    that of independent views (`repeated_poses`).
     """
-    if views.n_views < _FEWEST or not free[0] or not views.nearly_flat.all():
+    views, state, free = m.views, m.state, m.free
+    if views.n_views < _FEWEST or not views.nearly_flat.all():
         return None
     frame = _Frame.of(views)
     if frame is None:
@@ -113,7 +84,6 @@ def board_shape(
     if not chi >= _least(len(group)):
         return None
     moved = float(step[0])
-    explained = chi * times * seen / views.n_views / spare
     bent = group is _BENT
     stretch, shear = (0.0, 0.0) if bent else (float(value) for value in step[f:])
     return BoardShape(
@@ -123,7 +93,7 @@ def board_shape(
         side="XYZ"[int(np.argmax(np.abs(frame.axes[:, 0])))],
         focal_length=moved / float(state.entries[0, 0]),
         sigmas=abs(moved) / std,
-        explained=explained,
+        explained=chi * times * seen / views.n_views / spare,
     )
 
 
@@ -145,23 +115,12 @@ def _least(n: int) -> float:
 
 @frozen_dataclass(eq=False)
 class _Frame:
-    """The board's own axes.
-
-    Attributes
-    ----------
-    centre : (3,) array
-    axes : (3, 3) array
-        Columns: along the board, across it, its normal.
-    size : float
-        Farthest point along it [world unit].
-    aspect : float
-        Across over along.
-    """
+    """The board's own axes."""
 
     centre: Array
-    axes: Array
-    size: float
-    aspect: float
+    axes: Array  # (3, 3) columns: along the board, across it, its normal
+    size: float  # farthest point along it [world unit]
+    aspect: float  # across over along
 
     @classmethod
     def of(cls, views: Views) -> _Frame | None:

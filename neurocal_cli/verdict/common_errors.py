@@ -39,15 +39,8 @@ Cause = TypeVar("Cause", BoardShape, ViewChange, ViewGroups)
 def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) -> Iterator[Finding]:
     """Findings about a camera that is not the same in all views, or a board that is not flat.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    unit : str
-        Of the world.
-    wide : bool
-        Whether the lens is wide, and so may have no single centre of projection.
-    estimated : bool
-        Whether the target was estimated.
+    A wide lens may have no single centre of projection. `unit` is that of the world, and `estimated` tells
+    whether the target was estimated.
     """
     change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
     missing = evidence.missing
@@ -141,20 +134,17 @@ def _changed(change: ViewChange, wide: bool) -> Finding:
     size = abs(change.amount)
     percent, grows = f"{100 * size:.2g} %", "grows" if change.amount > 0 else "shrinks"
     what = "the focal length" if change.what == "focal length" else "the size of the image"
-    if change.pattern == "line":
-        reason = f"{what} {grows} by {percent} along the sequence of the views, so zoom or focus moves"
-    elif change.pattern == "distance":
-        reason = f"{what} {grows} by {percent} from the farthest to the nearest view, so the focus moves"
-        if wide:
-            reason += ", or the rays of this wide lens do not meet in one point"
-    elif change.pattern.startswith("tilt"):
-        ends = "to the left to those to the right" if change.pattern.endswith("u") else "upwards to downwards"
-        reason = (
-            f"{what} {grows} by {percent} from views of the target turned {ends}, so the target changes its "
-            "shape as it is turned, or the lens gives way"
-        )
-    elif change.pattern == "step":
-        reason = f"{what} {grows} by {percent} from view {change.views[0]} on, so zoom or focus has moved"
+    turned = "the target changes its shape as it is turned, or the lens gives way"
+    rays = ", or the rays of this wide lens do not meet in one point" if wide else ""
+    how = {
+        "line": "along the sequence of the views, so zoom or focus moves",
+        "distance": f"from the farthest to the nearest view, so the focus moves{rays}",
+        "tilt along u": f"from views of the target turned to the left to those to the right, so {turned}",
+        "tilt along v": f"from views of the target turned upwards to downwards, so {turned}",
+        "step": f"from view {change.views[0]} on, so zoom or focus has moved",
+    }
+    if change.pattern in how:
+        reason = f"{what} {grows} by {percent} {how[change.pattern]}"
     else:
         reason = (
             f"{name_some(change.views)}: these views are scaled by {1 + change.amount:.4g} against the "

@@ -7,7 +7,6 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 _CELLS = 6  # across and down
@@ -20,24 +19,12 @@ _THIRDS = (
 
 @frozen_dataclass
 class Coverage:
-    """Coverage by the points of a calibration.
+    """Coverage by the points of a calibration."""
 
-    Attributes
-    ----------
-    image : float
-        Share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown.
-    empty : str
-        The emptiest part of the image, such as "upper left"; "" if all parts are covered.
-    tilt : float
-        Largest angle between the planes of two views' targets [degrees]; 90 for targets that are not flat.
-    relief : float
-        Depth of the deepest target over its distance; nan if all are flat.
-    """
-
-    image: float
-    empty: str
-    tilt: float
-    relief: float
+    image: float  # share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown
+    empty: str  # the emptiest part of the image, such as "upper left"; "" if all parts are covered
+    tilt: float  # largest angle between two views' targets [degrees]; 90 for targets that are not flat
+    relief: float  # depth of the deepest target over its distance; nan if all are flat
 
 
 def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:
@@ -52,10 +39,12 @@ def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage
         return Coverage(np.nan, "", tilt, relief)
     size = np.array(points.image_size, dtype=float)
     inside = ((points.pixels >= -0.5) & (points.pixels <= size - 0.5)).all(axis=1)
-    held = _held(points.pixels[inside], size)
+    held = np.zeros((_CELLS, _CELLS))  # whether each cell of the image, row by row, holds a point
+    column, row = np.clip(((points.pixels[inside] + 0.5) / size * _CELLS).astype(int), 0, _CELLS - 1).T
+    held[row, column] = 1.0
     thirds = held.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
-    row, column = np.unravel_index(int(np.argmin(thirds)), thirds.shape)
-    empty = _THIRDS[row][column] if thirds[row, column] < 0.5 else ""
+    v, u = np.unravel_index(int(np.argmin(thirds)), thirds.shape)
+    empty = _THIRDS[v][u] if thirds[v, u] < 0.5 else ""
     return Coverage(float(held.mean()), empty, tilt, relief)
 
 
@@ -66,11 +55,3 @@ def _relief(points: Correspondences, views: Views, state: CameraState) -> float:
     away = np.linalg.norm(state.t * views.scale[:, None], axis=1)  # of each view's centroid
     along = [points.world[points.view_index == k] @ views.basis[k][:, 2] for k in solid]
     return max(float(np.ptp(one)) / float(away[k]) for one, k in zip(along, solid, strict=True))
-
-
-def _held(pixels: Array, size: Array) -> Array:
-    """(6, 6) whether each cell of the image, row by row, holds a point."""
-    held = np.zeros((_CELLS, _CELLS))
-    column, row = np.clip(((pixels + 0.5) / size * _CELLS).astype(int), 0, _CELLS - 1).T
-    held[row, column] = 1.0
-    return held

@@ -15,63 +15,31 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """Measures of a calibration's quality.
+    """Measures of a calibration's quality; the last four are None if there is nothing of the kind."""
 
-    Attributes
-    ----------
-    rmse_px : float [px]
-        Rms reprojection error of the calibration.
-    held_out_px : float [px]
-        Five-fold cross-validation error; nan if no data can be left out.
-    precision_px : float [px]
-        Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
-        networks are no freer than the camera.
-    contradiction : float
-        The camera's rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone.
-    disagreement : float
-        Chi-squared per parameter of the difference between two halves of the data; 1 if the reported
-        standard deviations hold.
-    correlation : float
-        Correlation of neighbouring residuals; 0 for noise.
-    condition : float
-        Condition of the normal matrix scaled to a unit diagonal.
-    coverage : Coverage
-    projection : ProjectionUncertainty or None
-        At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
-        image size is unknown.
-    repeated, mirrored : tuple of str
-        Views that are copies of others; views that show the target mirrored.
-    reestimated : tuple of Reestimated
-        Given parameters, estimated from the points.
-    noise : tuple of Finding
-        Residuals that do not look like measurement noise, or contradict the stated noise.
-    groups : ViewGroups or None
-        Two cameras among the views, or a changing focal length; None if there is neither.
-    poses : int
-        Number of different poses among the views (`repeated_poses`).
-    change : ViewChange or None
-        Change of the camera between views; None if there is none.
-    board : BoardShape or None
-        Bend or stretch of a target that is given as flat; None if there is none.
-    missing : MissingCoefficients or None
-        Effect of coefficients that the chosen distortion model lacks; None if it lacks none.
-    """
-
-    rmse_px: float
-    held_out_px: float
+    rmse_px: float  # rms reprojection error of the calibration
+    held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
+    # Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
+    # networks are no freer than the camera.
     precision_px: float
-    contradiction: float
+    contradiction: (
+        float  # rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone
+    )
+    # Chi-squared per parameter of the difference between two halves of the data; 1 if the reported standard
+    # deviations hold.
     disagreement: float
-    correlation: float
-    condition: float
+    correlation: float  # of neighbouring residuals; 0 for noise
+    condition: float  # of the normal matrix scaled to a unit diagonal
     coverage: Coverage
+    # At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
+    # image size is unknown.
     projection: ProjectionUncertainty | None
-    repeated: tuple[str, ...]
-    mirrored: tuple[str, ...]
-    reestimated: tuple[Reestimated, ...]
-    noise: tuple[Finding, ...]
-    groups: ViewGroups | None
-    poses: int
-    change: ViewChange | None
-    board: BoardShape | None
-    missing: MissingCoefficients | None
+    repeated: tuple[str, ...]  # views that are copies of others
+    mirrored: tuple[str, ...]  # views that show the target mirrored
+    reestimated: tuple[Reestimated, ...]  # given parameters, estimated from the points
+    noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
+    poses: int  # number of different poses among the views (`repeated_poses`)
+    groups: ViewGroups | None  # two cameras among the views, or a changing focal length
+    change: ViewChange | None  # of the camera between views
+    board: BoardShape | None  # bend or stretch of a target that is given as flat
+    missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks

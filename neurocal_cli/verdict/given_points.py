@@ -23,38 +23,16 @@ _ROUNDING = 1e-4  # of the pixels' spread: smaller errors are negligible
 
 @frozen_dataclass
 class GivenPoints:
-    """The error of a calibration on given points.
+    """The error of a calibration on given points."""
 
-    Attributes
-    ----------
-    rmse_px : float [px]
-        nan if no point lies in front of the camera.
-    n_points, n_behind : int
-    fit : Calibration or None
-        The views whose poses were fitted to these points, with the camera given.
-    """
-
-    rmse_px: float
+    rmse_px: float  # px; nan if no point lies in front of the camera
     n_points: int
     n_behind: int
-    fit: Calibration | None = None
+    fit: Calibration | None = None  # the views whose poses were fitted to these points, with the camera given
 
 
 def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Verdict:
-    """Add the findings about given points to a verdict.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        Of the calibration.
-    calibration : Calibration
-    given : GivenPoints
-
-    Returns
-    -------
-    Verdict
-        No better than before.
-    """
+    """Add the findings about given points to the verdict of the calibration, which becomes no better."""
     findings = [given_error(verdict, calibration.rmse_px, calibration.points, given)]
     return with_findings(verdict, [*findings, *given_camera(calibration, given.fit)])
 
@@ -86,17 +64,8 @@ def given_error(
 ) -> Finding:
     """The finding about the error on given points.
 
-    Parameters
-    ----------
-    verdict : Verdict
-        Of the calibration.
-    rmse_px : float [px]
-        Reprojection error of the calibration.
-    own_points : Correspondences
-        From which it was calibrated.
-    given : GivenPoints
-    same : str
-        What should not have changed, for the advice.
+    The verdict, the reprojection error [px] and its own points are those of the calibration; `same` names
+    what should not have changed, for the advice.
     """
     error, seen = given.rmse_px, given.n_points - given.n_behind
     if 2 * seen < given.n_points:

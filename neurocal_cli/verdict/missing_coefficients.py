@@ -10,13 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum, reduced
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
-from neurocal_cli.bundle_adjustment.residual_correlation import (
-    correlation,
-    effective_number,
-    point_residuals,
-)
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -32,60 +28,33 @@ _CENTRE = slice(3, 5)  # of A's entries
 
 @frozen_dataclass
 class MissingCoefficients:
-    """Effect of the coefficients that a distortion model lacks.
+    """Effect of the coefficients that a distortion model lacks."""
 
-    Attributes
-    ----------
-    model : str
-        The model that has them.
-    explained : float
-        Share of the squared error that they explain.
-    focal_length : float
-        Relative change of the focal length with them.
-    centre : float [px]
-        Shift of the image centre with them.
-    sigmas : float
-        Largest change of an intrinsic parameter, in its standard deviations.
-    """
-
-    model: str
-    explained: float
-    focal_length: float
-    centre: float
-    sigmas: float
+    model: str  # that has them
+    explained: float  # share of the squared error that they explain
+    focal_length: float  # relative change of the focal length with them
+    centre: float  # shift of the image centre with them [px]
+    sigmas: float  # largest change of an intrinsic parameter, in its standard deviations
 
 
-def missing_coefficients(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool, std: Array
-) -> MissingCoefficients | None:
+def missing_coefficients(m: Minimum, std: Array) -> MissingCoefficients | None:
     """Test whether the distortion model lacks coefficients; None if it lacks none, or not significantly.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised, at the minimum.
-    normal : array
-        Normal matrices of the views at the state.
-    free : (5 + K,) bool array
-        Which of A's entries and of the distortion coefficients are estimated.
-    free_poses : bool
-    std : (5,) array
-        Standard deviations of A's entries, normalised; 0 if given.
+    `std` (5,) are the standard deviations of A's entries, normalised; 0 if given.
     """
+    views, state, normal, free = m.views, m.state, m.normal, m.free
     if state.model not in POLYNOMIAL_MODELS[:-1]:
         return None
     if views.n_views > _ENOUGH:
         some = np.linspace(0, views.n_views - 1, _ENOUGH).astype(np.intp)
-        views, state = views.subset(some), state.of_views(some)
-        normal = normal[some]
+        views, state, normal = views.subset(some), state.of_views(some), normal[some]
     before, n_coefficients = float(normal[:, -1, -1].sum()), len(state.k)
     richer = [state.with_model(m) for m in POLYNOMIAL_MODELS[POLYNOMIAL_MODELS.index(state.model) + 1 :]]
-    if not before > 0 or not _promises_enough(views, richer[-1], free, free_poses, before):
+    if not before > 0 or not _promises_enough(views, richer[-1], free, m.free_poses, before):
         return None
     best, lowest = None, -_DECISIVE
     for start in richer:
-        found = adjust(views.batches, start, _all_free(free, start), free_poses, _STEPS)
+        found = adjust(views.batches, start, _all_free(free, start), m.free_poses, _STEPS)
         left = float(found.cost.sum()) / before
         n = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
         criterion = n * np.log(max(left, _ROUNDING)) + (len(start.k) - n_coefficients) * np.log(n)

@@ -27,14 +27,9 @@ _FACTOR = 2.0  # between views whose sigma is too small and the others
 
 
 def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
-    """Findings about a direction, or views, with much larger residuals than the others.
+    """Findings about a direction, or views, with much larger residuals (N, 2) [px] than the others.
 
-    Parameters
-    ----------
-    points : Correspondences
-    residuals : (N, 2) array [px]
-    correlation : float
-        Of neighbouring residuals; correlated ones are no measurement noise.
+    Neighbouring residuals that are correlated are no measurement noise.
     """
     if points.covariance is not None or len(points) < _FEWEST or correlation > _SYSTEMATIC:
         return
@@ -63,13 +58,9 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
 
 
 def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]:
-    """Findings about views whose sigma is too small, and about sigmas unrelated to the residuals.
+    """Findings about views whose sigma is too small, and about sigmas unrelated to the residuals (N, 2) [px].
 
-    Parameters
-    ----------
-    points : Correspondences
-        Covariances measured by a detector are not judged here, because `reweighting` handles them.
-    residuals : (N, 2) array [px]
+    Covariances measured by a detector are not judged here, because `reweighting` handles them.
     """
     covariance = points.covariance
     if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
-from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum
+from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
@@ -31,21 +31,11 @@ _BEYOND, _LEAST = 1.1, 1.2
 
 @frozen_dataclass(eq=False)
 class ProjectionUncertainty:
-    """Standard deviation of projected pixels over the image.
+    """Standard deviation of projected pixels over the image."""
 
-    Attributes
-    ----------
-    pixels : (G, 2) array [px]
-        Positions in the image; `std` is nan outside the domain of the lens.
-    depths : (D,) array
-        Distances along the optical axis [world unit].
-    std : (D, G) array [px]
-        Standard deviation of both coordinates together, ``sqrt(var u + var v)``.
-    """
-
-    pixels: Array
-    depths: Array
-    std: Array
+    pixels: Array  # (G, 2) [px] positions in the image
+    depths: Array  # (D,) distances along the optical axis [world unit]
+    std: Array  # (D, G) [px] of both coordinates, ``sqrt(var u + var v)``; nan outside the domain of the lens
 
     @property
     def worst(self) -> float:
@@ -63,42 +53,20 @@ def image_grid(size: tuple[int, int]) -> Array:
 
 
 def projection_uncertainty(
-    views: Views,
-    state: CameraState,
-    camera: Camera,
-    normal: Array,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    variance: float,
-    pixels: Array,
-    depths: Array,
-    shared: Array,
-    farthest: float | None = None,
-) -> ProjectionUncertainty:
-    """Propagate the covariance of a calibration to projected pixels.
+    m: Minimum, camera: Camera, variance: float, pixels: Array, depths: Array, shared: Array,
+    farthest: float | None,
+) -> ProjectionUncertainty:  # fmt: skip
+    """Propagate the covariance of a calibration to projected pixels (G, 2) [px] at depths (D,).
 
-    Parameters
-    ----------
-    views, state, normal
-        At the minimum, normalised.
-    camera : Camera
-        The same in pixels.
-    free : (5 + K,) bool array
-    free_poses : bool
-    variance : float
-        Of the residuals, normalised.
-    pixels : (G, 2) array [px]
-    depths : (D,) array
-    shared : (f, f) array
-        Covariance of the free entries and coefficients (`view_covariance`).
-    farthest : float, optional
-        Angle from the axis of the farthest point of a wide lens [rad]. Pixels much farther out lie beyond its
-        image circle.
+    The minimum is normalised, the camera is the same in pixels, and `variance` is that of the residuals,
+    normalised. `shared` (f, f) is the covariance of the free entries and coefficients (`view_covariance`).
+    Pixels of a wide lens that are much farther out than the angle [rad] of the `farthest` point lie beyond
+    its image circle.
     """
-    columns = camera_columns(len(free) - 5)[np.flatnonzero(free)]
-    gain, motion = _motions(views, state, normal, columns, free_poses)
-    by_camera, by_point, rays = _derivatives(camera, pixels, views.pixel_scale, farthest)
-    by_camera = by_camera[:, :, np.flatnonzero(free)]
+    free = np.flatnonzero(m.free)
+    gain, motion = _motions(m, camera_columns(len(m.free) - 5)[free])
+    by_camera, by_point, rays = _derivatives(camera, pixels, m.views.pixel_scale, farthest)
+    by_camera = by_camera[:, :, free]
     std = np.empty((len(depths), len(pixels)))
     for k, depth in enumerate(depths):
         p = depth * rays
@@ -111,19 +79,17 @@ def projection_uncertainty(
     return ProjectionUncertainty(pixels, depths, std)
 
 
-def _motions(
-    views: Views, state: CameraState, normal: Array, shared: NDArray[np.intp], free_poses: bool
-) -> tuple[Array, Array]:
+def _motions(m: Minimum, shared: NDArray[np.intp]) -> tuple[Array, Array]:
     """Gain G (6, f) and cov(e) (6, 6) of the motion, in world units, for residuals of unit variance."""
-    if not free_poses:
+    if not m.free_poses:
         return np.zeros((6, len(shared))), np.zeros((6, 6))
-    V = views.n_views
-    B_inverse = inverse_or_nan(normal[:, POSE, POSE])
-    C = normal[:, shared, POSE]
+    V, scale = m.views.n_views, m.views.scale[:, None, None]
+    B_inverse = inverse_or_nan(m.normal[:, POSE, POSE])
+    C = m.normal[:, shared, POSE]
     M = np.zeros((V, 6, 6))
     M[:, :3, :3] = np.eye(3)
-    M[:, 3:, :3] = views.scale[:, None, None] * cross_matrix(state.t)
-    M[:, 3:, 3:] = views.scale[:, None, None] * np.eye(3)
+    M[:, 3:, :3] = scale * cross_matrix(m.state.t)
+    M[:, 3:, 3:] = scale * np.eye(3)
     gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
     motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
     return gain, motion

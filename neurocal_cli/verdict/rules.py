@@ -14,9 +14,7 @@ from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import Reestimated
-from neurocal_cli.verdict.pixel_values import normalised, odd_pixels, points_given_twice
-from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
-from neurocal_cli.verdict.units_of_views import views_of_another_scale
+from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
@@ -54,12 +52,7 @@ _TOLD = 3.0  # standard deviations
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
-    """Apply the rules to the measures of a calibration.
-
-    Returns
-    -------
-    Verdict
-    """
+    """Apply the rules to the measures of a calibration."""
     projection = evidence.projection
     worst = projection.worst if projection is not None else float("nan")
     measures = {
@@ -161,11 +154,7 @@ def given_parameters(
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    points = with_rejected(calibration)
-    yield from rejected_points(calibration)
-    yield from odd_pixels(points)
-    yield from points_given_twice(points)
-    yield from views_of_another_scale(calibration.points)
+    yield from odd_points(calibration)
     yield from e.noise
     if e.repeated:
         twice = "the rows are given twice, in the view itself or in another one"
@@ -219,7 +208,9 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
-    if calibration.type == 2 and _is_middle(calibration):
+    size = calibration.image_size
+    is_middle = size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    if calibration.type == 2 and is_middle:
         yield (
             1,
             "the given image centre is the middle of the image, from which those of real cameras differ by "
@@ -231,7 +222,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
     if e.projection is not None and calibration.type != 3:
         worst = e.projection.worst
-        diagonal = float(np.hypot(*(calibration.image_size or (np.nan, np.nan))))
+        diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
         yield (
             _PROJECTION.grade(worst / diagonal),
             f"the std of predicted pixels is up to {worst:.2g} px",
@@ -273,11 +264,6 @@ def _lean(target: Target) -> float:
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]
     return abs(float((stretches(given)[1] * linear).sum()))
-
-
-def _is_middle(calibration: Calibration) -> bool:
-    A, size = calibration.intrinsics, calibration.image_size
-    return size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
 def _oblong(calibration: Calibration) -> bool:

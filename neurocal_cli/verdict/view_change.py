@@ -47,29 +47,17 @@ _MEAN, _TWO, _TWO_ROOT, _SHARE = 2.0 / np.pi, 6.5, 2.75, 1.06
 class ViewChange:
     """A change of the camera between views.
 
-    Attributes
-    ----------
-    what : str
-        "focal length" or "image size".
-    pattern : str
-        "line", "distance", "tilt along u", "tilt along v", "step" or "groups".
-    amount : float
-        Relative change: from the first view to the last, from the farthest to the nearest, from the view
-        turned most to the left (or upwards) to that turned most to the right (or downwards), or of the second
-        group against the first.
-    sigmas : float
-        The same in standard deviations.
-    explained : float
-        Share of the squared error that it explains.
-    views : tuple of str
-        The second group; for the linear patterns all views, in their sequence.
+    The amount is relative: from the first view to the last, from the farthest to the nearest, from the view
+    turned most to the left (or upwards) to that turned most to the right (or downwards), or of the second
+    group against the first. `views` is the second group; for the linear patterns all views, in their
+    sequence.
     """
 
-    what: str
-    pattern: str
+    what: str  # "focal length" or "image size"
+    pattern: str  # "line", "distance", "tilt along u", "tilt along v", "step" or "groups"
     amount: float
-    sigmas: float
-    explained: float
+    sigmas: float  # the amount in standard deviations
+    explained: float  # share of the squared error that it explains
     views: tuple[str, ...]
 
 
@@ -94,20 +82,9 @@ def view_change(
 ) -> ViewChange | None:
     """Find the most significant change of the camera between views; None if there is none.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised, at the minimum.
-    free : (5 + K,) bool array
-    scores : Quadratics
-        Of the poses (`view_covariance.scores_of_poses`).
-    group : (V,) int array
-        Pose of each view (`repeated_poses`).
-    variance : float
-        Of the residuals, normalised.
-    spare : float
-        Equations beyond the unknowns.
+    The state is normalised, at the minimum, `variance` is that of its residuals, and `spare` are the
+    equations beyond the unknowns. The scores are those of the poses (`view_covariance.scores_of_poses`), and
+    `group` (V,) is the pose of each view (`repeated_poses`).
     """
     order = in_sequence(views.names)
     place = np.empty(len(order))
@@ -154,22 +131,12 @@ def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> It
 
 @frozen_dataclass(eq=False)
 class _ScoreTest:
-    """Scores of one parameter.
+    """Scores of one parameter."""
 
-    Attributes
-    ----------
-    s : (P,) array
-    information : (P,) array
-        a.S_v a.
-    B : (P, f) array
-    S_inverse : (f, f) array
-    variance : float
-    """
-
-    s: Array
-    information: Array
-    B: Array
-    S_inverse: Array
+    s: Array  # (P,)
+    information: Array  # (P,) a.S_v a
+    B: Array  # (P, f)
+    S_inverse: Array  # (f, f)
     variance: float
 
     @classmethod

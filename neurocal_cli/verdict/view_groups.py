@@ -38,24 +38,13 @@ _ADJUSTED = 4  # clustering rounds with adjusted cameras, after those with the q
 
 @frozen_dataclass(eq=False)
 class ViewGroups:
-    """Two cameras among the views, or a focal length for each view.
+    """Two cameras among the views, or a focal length for each view."""
 
-    Attributes
-    ----------
-    names : two tuples of str
-        The views of each camera, the smaller group first; empty if only the focal length changes.
-    cameras : (2, 5) array [px]
-        A11, A12, A22, A13 and A23 of both; nan if only the focal length changes.
-    scale : (V,) array
-        Focal length of each view over the common one; empty if there are two cameras.
-    explained : float
-        Share of the squared error that this explains.
-    """
-
+    # The views of each camera, the smaller group first; empty if only the focal length changes.
     names: tuple[tuple[str, ...], tuple[str, ...]]
-    cameras: Array
-    scale: Array
-    explained: float
+    cameras: Array  # (2, 5) [px] A11, A12, A22, A13 and A23 of both; nan if only the focal length changes
+    scale: Array  # (V,) focal length of each view over the common one; empty if there are two cameras
+    explained: float  # share of the squared error that this explains
 
     @property
     def apart(self) -> float:
@@ -71,15 +60,8 @@ def view_groups(
 ) -> ViewGroups | None:
     """Find two cameras among the views, or a changing focal length; None if neither explains the error.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        The common camera, at its minimum with all poses free.
-    normal : (V, 12 + K, 12 + K) array
-    free : (5 + K,) bool array
-    networks : (V,) array, optional
-        Result of `free_networks`, if known.
+    The state is the common camera, at its minimum with all poses free; `networks` (V,) is the result of
+    `free_networks`, if known.
     """
     conditions = conditions_on_views(views, state)
     n_free = int(free[:5].sum())
@@ -94,18 +76,14 @@ def view_groups(
     own = float(free_networks(views, state, OWN_STEPS).sum())
     noise = _NOISE * own / freedom
     quadratics = reduced(normal, free, True)
-    scale = _scales(quadratics, state, free)
-    gain = _gain_of_scales(quadratics, state, free)
+    scale, gain = _focal_lengths(quadratics, state, free)
     one_each = (cost - gain - own) / max(spare - views.n_views + 1, 1)
-    if (
-        spare - views.n_views < _SPARE - 1
-        or np.ptp(scale) < _DIFFERENT
-        or not (np.abs(scale - 1) < 0.5).all()
-    ):
+    told_apart = spare - views.n_views >= _SPARE - 1 and np.ptp(scale) >= _DIFFERENT
+    if not (told_apart and (np.abs(scale - 1) < 0.5).all()):
         one_each = np.inf
     found = _two_cameras(views, state, quadratics, free)
     two = np.inf
-    if found is not None and _differ(found.cameras):
+    if found is not None and found.differs:
         two = (found.cost - own) / (spare - n_free)
     if min(one_each, two) > noise:
         return None
@@ -124,15 +102,16 @@ def view_groups(
     )
 
 
-def _differ(cameras: Array) -> bool:
-    return bool((np.abs(cameras[0] - cameras[1])[[0, 2, 3, 4]] > _DIFFERENT * cameras[0, 0]).any())
-
-
 @frozen_dataclass(eq=False)
 class _Split:
     member: NDArray[np.bool_]
     cameras: Array  # (2, 5), normalised
     cost: float
+
+    @property
+    def differs(self) -> bool:
+        first, second = self.cameras[:, [0, 2, 3, 4]]
+        return bool((np.abs(first - second) > _DIFFERENT * first[0]).any())
 
 
 def _two_cameras(
@@ -185,26 +164,19 @@ def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Arra
     return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
 
 
-def _direction(state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """Step of the free parameters for a relative change of the focal length."""
-    scaled = np.zeros(len(free))
-    scaled[:3] = state.entries[0][:3]
-    return np.asarray(scaled[free])
+def _focal_lengths(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> tuple[Array, float]:
+    """(V,) focal length of each view over the common one, by one Gauss-Newton step.
 
-
-def _scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """(V,) focal length of each view over the common one, by one Gauss-Newton step."""
-    d = _direction(state, free)
-    return np.asarray(1 + (q.g @ d) / np.einsum("i,vij,j->v", d, q.S, d))
-
-
-def _gain_of_scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> float:
-    """Drop in squared error with a focal length for each view and all other parameters in common."""
-    d = _direction(state, free)
+    The second result is the drop in squared error with them and all other parameters in common.
+    """
+    d = np.zeros(len(free))
+    d[:3] = state.entries[0][:3]
+    d = d[free]  # step of the free parameters for a relative change of the focal length
     Sd, gd = q.S @ d, q.g @ d
     weight = 1 / np.maximum(Sd @ d, 1e-300)
     S = (q.S - weight[:, None, None] * Sd[:, :, None] * Sd[:, None, :]).sum(axis=0)
     g = (q.g - (weight * gd)[:, None] * Sd).sum(axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diagonal(q.S.sum(axis=0)), 1e-300))
     common = np.linalg.pinv(S * np.outer(scale, scale), rcond=1e-9, hermitian=True) @ (scale * g)
-    return float((weight * gd**2).sum() + (scale * g) @ common)
+    gain = float((weight * gd**2).sum() + (scale * g) @ common)
+    return np.asarray(1 + gd / np.einsum("i,vij,j->v", d, q.S, d)), gain

@@ -11,8 +11,8 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.monotonic import largest_angle
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.camera.unprojection import largest_angle
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
 
