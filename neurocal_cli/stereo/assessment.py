@@ -19,8 +19,8 @@ from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
+from neurocal_cli.stereo.covariance import rig_covariance
 from neurocal_cli.stereo.depth_uncertainty import depth_std
-from neurocal_cli.stereo.pair_covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
-from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.adjust import RigProblem
 
 # Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
 # than so many standard deviations of a pixel. The tests of named faults in tests/test_stereo_evaluation.py
@@ -76,7 +76,7 @@ def find_consensus(problem: RigProblem) -> RigConsensus:
 
 def _poses(problem: RigProblem) -> _Poses:
     left, right = problem.cameras
-    scale = problem.frames.scale[problem.paired][:, None]
+    scale = problem.scale[problem.paired][:, None]
     return _Poses(
         (left.R[problem.paired], right.R[problem.paired_right]),
         (left.t[problem.paired] * scale, right.t[problem.paired_right] * scale),
@@ -85,7 +85,7 @@ def _poses(problem: RigProblem) -> _Poses:
 
 def _distance(problem: RigProblem, poses: _Poses, R: Array, t: Array) -> Array:
     """(H, P) distance of each pair's target from its prediction by each rig; pairs agree below 1."""
-    offsets = problem.spread * problem.frames.scale[problem.paired][:, None, None]
+    offsets = problem.spread * problem.scale[problem.paired][:, None, None]
     targets = [
         offsets @ np.swapaxes(R_k, 1, 2) + m_k[:, None, :] for R_k, m_k in zip(poses.R, poses.m, strict=True)
     ]

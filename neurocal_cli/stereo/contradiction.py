@@ -83,7 +83,6 @@ class _Explanation:
     at: int
     gain: float
     values: Array
-    columns: NDArray[np.intp]
     shift: Array
 
 
@@ -215,9 +214,7 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
         before = follow[k] @ values[k]
         after = before.copy()
         after[columns] -= values[k]
-        yield _Explanation(
-            kind, int(starts[k]), float(gains[k]), values[k], columns, np.stack([before, after])
-        )
+        yield _Explanation(kind, int(starts[k]), float(gains[k]), values[k], np.stack([before, after]))
 
 
 def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
@@ -240,4 +237,4 @@ def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
         value = right / block
         if 0 < value < 1:
             shift = np.broadcast_to(follow * value, (2, len(follow)))
-            yield _Explanation(kind, 0, right * value, np.array([value]), np.zeros(0, dtype=np.intp), shift)
+            yield _Explanation(kind, 0, right * value, np.array([value]), shift)

@@ -55,6 +55,5 @@ def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
     state, seen = poses.problem.cameras[side], poses.problem.observations[side]
     values = np.concatenate([state.entries[0], state.k])
     values[poses.problem.estimated[side]] += step[poses.own[side]]
-    entries = values[:5] * seen.pixel_scale
-    entries[3:] += seen.pixel_centre
-    return Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), Distortion(state.model, values[5:]))
+    A = intrinsic_matrix(seen.in_pixels(values[:5]))
+    return Camera(Intrinsics.from_matrix(A), Distortion(state.model, values[5:]))

@@ -11,18 +11,21 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.stereo.adjust import RigFit, adjust_rig
+from neurocal_cli.stereo.adjust import RigFit, RigProblem, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
-from neurocal_cli.stereo.open_covariance import covariance_of_stretch
-from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
+from neurocal_cli.stereo.covariance import (
+    covariance_of_stretch,
+    not_smaller,
+    rig_covariance,
+    with_target_uncertainty,
+)
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
-from neurocal_cli.stereo.problem import RigProblem, free_parameters, rig_problem
+from neurocal_cli.stereo.problem import free_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import relative_poses
 from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import sound_pairs
-from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
 # Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
 # refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
@@ -125,7 +128,7 @@ def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None
-    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.frames.unit))
+    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.unit))
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
@@ -182,8 +185,5 @@ def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: Vie
     problem = rig_problem(*cameras, views)
     start = problem.start(rig)
     state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
-    frames = problem.frames
-    return {
-        name: Pose(state.view_R[k], state.view_t[k] * frames.scale[k] - state.view_R[k] @ frames.centre[k])
-        for k, name in enumerate(problem.names[0])
-    }
+    R, t = problem.world_poses(state, side=0)
+    return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}

@@ -29,7 +29,7 @@ from neurocal_cli.geometry import Array, cross_matrix, rotation_vector
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.adjust import RigProblem
 
 _POSE = np.arange(POSE.start, POSE.stop)
 _MUCH_LARGER = 2.0  # ratio of a view's variance to that of all; 50 equations reach it once in 10 million
@@ -98,7 +98,7 @@ class RelativePoses:
     @property
     def unit(self) -> float:
         """Unit of the rig's translation [world unit]."""
-        return self.problem.frames.unit
+        return self.problem.unit
 
     def __len__(self) -> int:
         return len(self.names)
@@ -136,12 +136,13 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     place = {pair: k for k, pair in enumerate(problem.pairs)}
     order = np.array([place[pair] for pair in names], dtype=np.intp)
     first, second = problem.paired[order], problem.paired_right[order]
-    frames, (left, right) = problem.frames, problem.cameras
-    scale = frames.scale[first] / frames.unit
+    left, right = problem.cameras
+    size = problem.scale[first]
+    scale = size / problem.unit
     R = right.R[second] @ np.swapaxes(left.R[first], 1, 2)
     centre = (R @ left.t[first][..., None])[..., 0]
     t = scale[:, None] * (right.t[second] - centre)
-    offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / frames.unit], axis=1)
+    offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / problem.unit], axis=1)
     # A step of the right view's pose is by_rig times one of the rig plus by_pose times one of the left view.
     by_rig, by_pose = np.zeros((len(order), 6, 6)), np.zeros((len(order), 6, 6))
     by_rig[:, :3, :3] = np.eye(3)
@@ -166,11 +167,11 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     weighted = np.swapaxes(design, 1, 2) @ weight
     cost = np.einsum("pi,pij,pj->p", offset, weight, offset)
     pairs = Quadratics(weighted @ design, (weighted @ offset[..., None])[..., 0], cost)
-    counts = [_equations(problem, side) for side in (0, 1)]
+    counts = [observed.equations_by_view for observed in problem.observations]
     return RelativePoses(
         problem, tuple(names), _both(problem, sides, places, len(columns)), pairs, first, places, rig,
         (places[0][sides[0].focal], places[1][sides[1].focal]), offset, design, covariance,
-        frames.scale[first], centre * scale[:, None],
+        size, centre * scale[:, None],
         _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
         counts[0][first] + counts[1][second],
         sum(side.spare for side in sides),
@@ -191,7 +192,7 @@ class _Alone:
         variance = least / self.spare
         self.follow, self.step = solved[..., :-1], solved[..., -1]
         own = np.linalg.pinv(normal[:, _POSE[:, None], _POSE], hermitian=True)
-        larger = cost / (variance * np.maximum(_equations(problem, side) - len(_POSE), 1.0))
+        larger = cost / (variance * np.maximum(observed.equations_by_view - len(_POSE), 1.0))
         # A view with a much larger error, for example of a board that bends, is more uncertain accordingly.
         times = np.where(larger > _MUCH_LARGER, larger, 1.0)[:, None, None]
         self.covariance = np.asarray(times * variance * own, dtype=float)
@@ -204,7 +205,7 @@ def _both(
     problem: RigProblem, sides: Sequence[_Alone], places: Sequence[NDArray[np.intp]], width: int
 ) -> Quadratics:
     """Information of the views of both cameras about the cameras, by frame."""
-    n = len(problem.frames.scale)
+    n = len(problem.scale)
     S, g, cost = np.zeros((n, width, width)), np.zeros((n, width)), np.zeros(n)
     for side, place in enumerate(places):
         view, own = problem.observations[side].view, sides[side].quadratics
@@ -216,13 +217,6 @@ def _both(
 
 def _transformed(J: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
-
-
-def _equations(problem: RigProblem, side: int) -> Array:
-    """Equations of each view of one camera."""
-    observed = problem.observations[side]
-    counts = observed.batches.counts
-    return np.asarray(counts * (observed.n_equations / counts.sum()))
 
 
 def _motion(R: Array, t: Array, scale: Array, of_right: Array) -> Array:

@@ -14,10 +14,11 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.median import median
+from neurocal_cli.stereo.adjust import RigProblem
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pairing import ViewPairs
-from neurocal_cli.stereo.problem import RigProblem, rig_problem
+from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.verdict.findings import name_some
 
