@@ -30,20 +30,11 @@ _TURNS = (90, 270, 180)
 
 @frozen_dataclass(eq=False)
 class RigConsensus:
-    """The rig that most pairs of views support.
+    """The rig that most pairs of views support."""
 
-    Attributes
-    ----------
-    rig : Pose
-        ``X_right = R X_left + t`` [world unit].
-    agree : (P,) bool array
-    reasons : tuple of str
-        Fault of each pair; empty for those that agree.
-    """
-
-    rig: Pose
-    agree: NDArray[np.bool_]
-    reasons: tuple[str, ...]
+    rig: Pose  # X_right = R X_left + t [world unit]
+    agree: NDArray[np.bool_]  # (P,)
+    reasons: tuple[str, ...]  # fault of each pair; empty for those that agree
 
 
 @frozen_dataclass(eq=False)

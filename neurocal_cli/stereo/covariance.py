@@ -28,7 +28,7 @@ from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.stereo.adjust import Observations, RigFit, RigProblem
-from neurocal_cli.stereo.contradiction import Contradiction, is_significant
+from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.relative_poses import RelativePoses
 from neurocal_cli.target import Target, is_flat
 from neurocal_cli.target_shape.information import Information, point_terms
@@ -47,7 +47,7 @@ def rig_covariance(poses: RelativePoses, used: Mask, found: Contradiction) -> Ar
     S, _ = poses.normal(used)
     model = solve_scaled(S, np.eye(len(S)))
     model = 0.5 * (model + model.T)
-    if not is_significant(found.scatter**2 * found.degrees, found.degrees):
+    if not found.is_significant:
         return np.asarray(model)
     if used.sum() < _LEAST_PAIRS:
         return np.asarray(found.scatter**2 * model)

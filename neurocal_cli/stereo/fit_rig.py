@@ -13,7 +13,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.stereo.adjust import RigFit, RigProblem, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
-from neurocal_cli.stereo.contradiction import contradiction, is_significant
+from neurocal_cli.stereo.contradiction import contradiction
 from neurocal_cli.stereo.covariance import (
     covariance_of_stretch,
     not_smaller,
@@ -133,7 +133,7 @@ def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
         return None
     used = np.ones(len(poses), dtype=bool)
     found = contradiction(poses, used, seek_odd=False)
-    if not held and not is_significant(found.scatter**2 * found.degrees, found.degrees):
+    if not held and not found.is_significant:
         return None
     moved = fit.free[estimated]
     return rig_covariance(poses, used, found)[np.ix_(moved, moved)]

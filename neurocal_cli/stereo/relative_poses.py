@@ -42,58 +42,26 @@ class RelativePoses:
 
     The F unknowns are the free parameters of the left camera, those of the right one, and the step of the
     rig: rotation [rad] and translation [`unit`].
-
-    Attributes
-    ----------
-    problem : RigProblem
-    names : tuple of (left name, right name)
-    cameras : Quadratics
-        Information of each frame's views about the cameras alone, V groups.
-    pairs : Quadratics
-        Term that each pair adds: the cost of the common fit beyond that of the cameras alone, P groups.
-    frame : (P,) int array
-        Frame of each pair.
-    own : two of (f,) int arrays
-        Columns of the left and of the right camera's parameters.
-    rig : (6,) int array
-        Columns of the rig's step.
-    focal : two of (0, 1 or 2) int arrays
-        Columns of alpha_u and alpha_v of each camera, if they are free.
-    offset : (P, 6) array
-        z.
-    design : (P, 6, F) array
-        Of z by the unknowns.
-    covariance : (P, 6, 6) array
-        C.
-    size : (P,) array
-        Of each target [world unit].
-    centre : (P, 3) array
-        Of each target, in the left camera's directions turned by the rig.
-    motion : (P, 2, 6) array
-        Steps of the relative pose if the right image showed the next, or the previous, pair's pose; nan at
-        the ends.
-    n_equations : (P,) array
-        Equations of both views of each pair.
-    spare : float
-        Equations of both cameras alone less their unknowns.
     """
 
     problem: RigProblem
-    names: tuple[tuple[str, str], ...]
-    cameras: Quadratics
-    pairs: Quadratics
-    frame: NDArray[np.intp]
-    own: tuple[NDArray[np.intp], NDArray[np.intp]]
-    rig: NDArray[np.intp]
-    focal: tuple[NDArray[np.intp], NDArray[np.intp]]
-    offset: Array
-    design: Array
-    covariance: Array
-    size: Array
-    centre: Array
+    names: tuple[tuple[str, str], ...]  # left and right name of each pair
+    cameras: Quadratics  # information of each frame's views about the cameras alone, V groups
+    pairs: Quadratics  # the cost of the common fit beyond that of the cameras alone, P groups
+    frame: NDArray[np.intp]  # (P,) of each pair
+    own: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of the left and the right camera's parameters
+    rig: NDArray[np.intp]  # (6,) columns of the rig's step
+    focal: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of alpha_u and alpha_v, if they are free
+    offset: Array  # (P, 6) z
+    design: Array  # (P, 6, F) of z by the unknowns
+    covariance: Array  # (P, 6, 6) C
+    size: Array  # (P,) of each target [world unit]
+    centre: Array  # (P, 3) of each target, in the left camera's directions turned by the rig
+    # (P, 2, 6) steps of the relative pose if the right image showed the next, or the previous, pair's pose;
+    # nan at the ends.
     motion: Array
-    n_equations: Array
-    spare: float
+    n_equations: Array  # (P,) of both views of each pair
+    spare: float  # equations of both cameras alone less their unknowns
 
     @property
     def unit(self) -> float:
@@ -115,19 +83,10 @@ class RelativePoses:
 
 
 def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None:
-    """Relative poses of all pairs of a problem.
+    """Relative poses of all pairs of a problem; None if a view does not determine its pose.
 
-    Parameters
-    ----------
-    problem : RigProblem
-        The cameras need not be at their own minimum; one step leads there.
-    reference : Pose
-        A rig near those of most pairs.
-
-    Returns
-    -------
-    RelativePoses or None
-        None if a view does not determine its pose.
+    The cameras need not be at their own minimum; one step leads there. `reference` is a rig near those of
+    most pairs.
     """
     sides = [_Alone(problem, side) for side in (0, 1)]
     if not all(side.determined for side in sides):

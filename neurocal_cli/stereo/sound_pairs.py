@@ -16,7 +16,7 @@ from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.median import median
 from neurocal_cli.stereo.adjust import RigProblem
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
-from neurocal_cli.stereo.contradiction import contradiction, is_significant
+from neurocal_cli.stereo.contradiction import contradiction
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
@@ -31,27 +31,13 @@ Pair = tuple[str, str]
 
 @frozen_dataclass(eq=False)
 class SoundPairs:
-    """Pairs that determine the rig, and the faults of the others.
+    """Pairs that determine the rig, and the faults of the others."""
 
-    Attributes
-    ----------
-    problem : RigProblem
-        Of all pairs.
-    rig : Pose
-        The rig of most pairs, the start of an adjustment.
-    left_out : dict of str by (left name, right name)
-        Pairs that do not determine the rig, with the reason.
-    moved : str
-        Message about a rig that moved between two pairs; empty if it did not.
-    by_chance : bool
-        Whether the pairs differ by no more than chance.
-    """
-
-    problem: RigProblem
-    rig: Pose
-    left_out: Mapping[Pair, str] = field(default_factory=dict)
-    moved: str = ""
-    by_chance: bool = False
+    problem: RigProblem  # of all pairs
+    rig: Pose  # the rig of most pairs, the start of an adjustment
+    left_out: Mapping[Pair, str] = field(default_factory=dict)  # pairs that do not determine it, and why
+    moved: str = ""  # message about a rig that moved between two pairs
+    by_chance: bool = False  # whether the pairs differ by no more than chance
 
     def contradiction(self, n_pairs: int, outliers: str = "reject") -> str:
         """Message with the pairs that are left out and their faults."""
@@ -114,8 +100,7 @@ def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs)
     if why.kind == "moved":
         found = replace(found, left_out={**found.left_out, **odd})
         return _larger_part(poses, used & ~why.odd, why.at, found)
-    by_chance = not is_significant(why.scatter**2 * why.degrees, why.degrees)
-    return replace(found, left_out={**odd, **found.left_out}, by_chance=by_chance)
+    return replace(found, left_out={**odd, **found.left_out}, by_chance=not why.is_significant)
 
 
 def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: SoundPairs) -> SoundPairs:
@@ -136,18 +121,9 @@ def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: 
 
 
 def describe_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
-    """Describe a rig that has two geometries, with advice.
+    """Describe a rig that has two geometries, the second from pair `at` on, with advice.
 
-    Parameters
-    ----------
-    names : sequence of (left name, right name)
-        All pairs in order.
-    size : (P,) array
-        Of each target.
-    at : int
-        First pair of the second geometry.
-    kept : sequence of (left name, right name)
-        The part that determines the rig; empty if both do.
+    `size` (P,) is that of each target, and `kept` the part that determines the rig; empty if both do.
     """
     this = f"; this is that of {span(kept)}" if kept else ""
     (large, larger), (small, smaller) = sorted(

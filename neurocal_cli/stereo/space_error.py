@@ -21,22 +21,13 @@ _POINTS_PER_DEPTH = 20
 
 @frozen_dataclass
 class DepthError:
-    """Errors of the points in an interval of depths.
+    """Errors of the points in an interval of depths."""
 
-    Attributes
-    ----------
-    nearest, farthest : float [world unit]
-    n_points : int
-    rmse : float [world unit]
-    relative : float
-        Rms of the error over the depth.
-    """
-
-    nearest: float
+    nearest: float  # [world unit]
     farthest: float
     n_points: int
-    rmse: float
-    relative: float
+    rmse: float  # [world unit]
+    relative: float  # rms of the error over the depth
 
 
 @frozen_dataclass(eq=False)
@@ -90,18 +81,10 @@ def space_error(
     alpha_u: float,
     alpha_v: float,
 ) -> SpaceError:
-    """Compare triangulated points with their true positions.
+    """Compare triangulated points with their true positions (N, 3), both in the left camera's frame.
 
-    Parameters
-    ----------
-    triangulated, true : (N, 3) arrays
-        In the left camera's frame; rows of `triangulated` that are nan count as behind.
-    epipolar : (N,) array [px]
-    view : (N,) int array
-        Indices into `names`.
-    names : list of str
-    alpha_u, alpha_v : float [px]
-        Of the left camera, for NSCE.
+    Rows of `triangulated` that are nan count as behind. `epipolar` (N,) is in pixels, `view` (N,) are indices
+    into `names`, and the scale factors [px] are those of the left camera, for NSCE.
 
     Raises
     ------
