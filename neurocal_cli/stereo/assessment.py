@@ -95,7 +95,7 @@ def assess_rig(rig: Rig) -> Verdict | None:
 def _evidence(rig: Rig) -> _Evidence:
     pairs = (*rig.pairs, *rig.left_out)
     cameras = assess(rig.left), assess(rig.right)
-    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ())), rig.pose)
+    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs)), rig.pose)
     if poses is None:
         return _Evidence(cameras, pairs, np.zeros(0))
     used = np.array([pair not in rig.left_out for pair in poses.names])
@@ -157,7 +157,7 @@ def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array
     pairs; nan for points that are behind a camera.
     """
     sides = rig.left.points, rig.right.points
-    rows = pair_points(*sides, ViewPairs(rig.pairs, (), ()))
+    rows = pair_points(*sides, ViewPairs(rig.pairs))
     step = max(1, len(rows.left) // _MOST_POINTS)
     pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
 

@@ -227,7 +227,7 @@ class _Evaluator:
         """The pose of each view in the left camera that fits both cameras best."""
         poses = {name: view.pose for name, view in rig.left.views.items()}
         if self.fitted is not None:
-            poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new), (), ())))
+            poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
         return [poses[a] for a, _ in self.views.both]
 
     def _used(self, rig: Rig) -> NDArray[np.bool_]:

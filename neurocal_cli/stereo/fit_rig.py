@@ -80,7 +80,7 @@ def fit_rig(
     problem = sound.problem
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
-        problem = rig_problem(left, right, ViewPairs(kept, (), ()))
+        problem = rig_problem(left, right, ViewPairs(kept))
     fit, warnings = _adjusted(problem, sound.rig, refine_cameras)
     least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:

@@ -32,35 +32,20 @@ _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as
 
 @frozen_dataclass
 class ViewPairs:
-    """Names of paired and of single views.
+    """Names of paired and of single views."""
 
-    Attributes
-    ----------
-    both : tuple of (left name, right name)
-        In the order of the left camera.
-    left_only, right_only : tuple of str
-    """
-
-    both: tuple[tuple[str, str], ...]
-    left_only: tuple[str, ...]
-    right_only: tuple[str, ...]
+    both: tuple[tuple[str, str], ...]  # left and right, in the order of the left camera
+    left_only: tuple[str, ...] = ()
+    right_only: tuple[str, ...] = ()
 
 
 @frozen_dataclass(eq=False)
 class Pairs:
-    """Points of both cameras.
-
-    Attributes
-    ----------
-    left, right : (N,) int arrays
-        Rows of each camera's points.
-    view : (N,) int array
-        Number of the pair of views of each, sorted.
-    """
+    """Points of both cameras: rows of each camera's points (N,), and the pair of views of each."""
 
     left: NDArray[np.intp]
     right: NDArray[np.intp]
-    view: NDArray[np.intp]
+    view: NDArray[np.intp]  # (N,) number of the pair, sorted
 
 
 def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:

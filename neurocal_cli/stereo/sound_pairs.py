@@ -151,7 +151,7 @@ def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
         pairs = in_order(views.both)
         first, second = (pairs[:-1], pairs[1:]) if by > 0 else (pairs[1:], pairs[:-1])
         moved = tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
-        agree = find_consensus(rig_problem(left, right, ViewPairs(moved, (), ()))).agree
+        agree = find_consensus(rig_problem(left, right, ViewPairs(moved))).agree
         if agree.mean() > _AGREED:
             return (
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
