@@ -118,19 +118,7 @@ class Topology:
 
 
 def respond(topology: Topology, weights: Array, x: Array) -> Array:
-    """Outputs of a stack of networks.
-
-    Parameters
-    ----------
-    topology : Topology
-    weights : (B, P) array
-    x : (n, D) array
-        Controls, scaled to about [-1, 1].
-
-    Returns
-    -------
-    y : (B, n) array
-    """
+    """Outputs (B, n) of a stack of networks (B, P) at controls (n, D), scaled to about [-1, 1]."""
     return _layers(topology, weights, x)[0]
 
 

@@ -31,26 +31,14 @@ _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 
 @frozen_dataclass(eq=False)
 class StaticFit:
-    """Independent calibrations.
+    """Independent calibrations."""
 
-    Attributes
-    ----------
-    local : (S, L) array
-    theta : (S,) array
-    R, t : (V, 3, 3), (V, 3) arrays
-        Pose of each view.
-    good : (S,) bool array
-        Where the calibration succeeded. Elsewhere the values are those of the nearest good setting.
-    reasons : dict of str by setting
-        Of the failures.
-    """
-
-    local: Array
-    theta: Array
-    R: Array
+    local: Array  # (S, L)
+    theta: Array  # (S,)
+    R: Array  # (V, 3, 3) and (V, 3): pose of each view
     t: Array
-    good: NDArray[np.bool_]
-    reasons: dict[int, str]
+    good: NDArray[np.bool_]  # (S,) calibrated; the values elsewhere are those of the nearest good setting
+    reasons: dict[int, str]  # of the failures, by setting
 
 
 def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
@@ -144,13 +132,13 @@ def common_tables(
 
 def fit_local(data: PixelData, local: Array, constants: Constants) -> Tables:
     """Minimise the reprojection error over the local parameters alone."""
-    return _minimum(data, local, constants, 0, None)
+    return _minimum(data, local, constants, 0)
 
 
 def _minimum(
-    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None
+    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None = None
 ) -> Tables:
-    """Minimise over the local parameters and some constants; the local ones are eliminated."""
+    """Minimise over the local parameters, which are eliminated, and some constants."""
     tried = count()
 
     def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
