@@ -42,28 +42,16 @@ _GRID = 13  # values of each control at which networks are compared
 class Budget:
     """Numbers of networks to train and to keep.
 
-    Parameters
-    ----------
-    topologies : tuple of (int, int), optional
-        Default: those that suit the number of settings.
-    starts : int
-        Random starts of each topology.
-    best : int
-        Networks of the highest evidence that may be in the committee.
-    members : int
-        Size of the committee.
-    schedule : Schedule
-
     Raises
     ------
     UsageError
         Topologies that are not pairs of whole numbers.
     """
 
-    topologies: tuple[tuple[int, int], ...] | None = None
-    starts: int = 12
-    best: int = 20
-    members: int = 12
+    topologies: tuple[tuple[int, int], ...] | None = None  # None: those that suit the number of settings
+    starts: int = 12  # random starts of each topology
+    best: int = 20  # networks of the highest evidence that may be in the committee
+    members: int = 12  # size of the committee
     schedule: Schedule = field(default_factory=Schedule)
 
     def __post_init__(self) -> None:
@@ -102,8 +90,7 @@ def fit_committee(
         Normal matrices at the tables, for the variances of the targets; None where they are unknown.
     variance : float [px^2]
         Of the noise.
-    rng : numpy.random.Generator
-    budget : Budget
+    rng, budget
     report : callable
         Called with the share that is done.
 

@@ -27,14 +27,10 @@ _LEAST_ERROR = 5.0  # times the noise, in the image
 
 
 def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Array]:
-    """Errors at settings, each predicted from all others.
+    """Errors at settings (S,), each predicted from all others.
 
-    Returns
-    -------
-    pixels : (S,) array [px]
-        Rms reprojection error.
-    normalised : (S,) array
-        Squared error of the local parameters over its expectation, a mean over them; about 1.
+    The first are rms reprojection errors [px]. The second are squared errors of the local parameters over
+    their expectation, a mean over them; about 1.
     """
     tables, variance = start.tables, start.variance
     scatter = joint.nets.local_scatter(tables.local)
@@ -66,13 +62,7 @@ def most_suspect(pixels: Array, normalised: Array) -> int | None:
 def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | None:
     """Reason to reject setting s, given a lens that was fitted without it; None to keep it.
 
-    Parameters
-    ----------
-    lens : ZoomLens
-    setting : (D,) array
-    tables : Tables
-        Fitted with the setting.
-    s : int
+    The tables were fitted with the setting, whose controls are `setting` (D,).
     """
     try:
         prediction = lens.predict(setting[None])

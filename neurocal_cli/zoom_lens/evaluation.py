@@ -24,16 +24,9 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 @frozen_dataclass
 class SettingError:
-    """Reprojection error at one setting.
+    """Reprojection error at one setting."""
 
-    Attributes
-    ----------
-    values : dict of float by control
-    n_points : int
-    rmse_px, max_px : float [px]
-    """
-
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # by control
     n_points: int
     rmse_px: float
     max_px: float

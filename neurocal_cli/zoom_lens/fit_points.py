@@ -27,8 +27,7 @@ from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, take_turn
 from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
-from neurocal_cli.zoom_lens.target import lens_target, on_target
-from neurocal_cli.zoom_lens.target_coupling import target_coupling
+from neurocal_cli.zoom_lens.target import lens_target, on_target, target_coupling
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
 
 TRAININGS = ("joint", "alternating")

@@ -15,7 +15,8 @@ from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
-from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
+
+_LEAST_INFORMATION = 0.02  # least share of a direction of the target's offsets that remains
 
 
 @frozen_dataclass(eq=False)
@@ -99,7 +100,7 @@ class ZoomLens:
     target : Target or None
         The target estimated from several settings together, to which the lens was fitted.
     target_coupling : (S, L + Q, r) array or None
-        Effect of the target's uncertainty on each setting; see `zoom_lens.target_coupling`.
+        Effect of the target's uncertainty on each setting; see `zoom_lens.target`.
     free_pose_px : float [px]
         Of a still camera: the noise floor if each view had a pose of its own; nan where unknown.
     """
@@ -292,3 +293,16 @@ def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants,
     )
     mean = Constants(float(theta.mean()), R, t.mean(axis=0))
     return mean, np.column_stack([theta - theta.mean(), omega, t - mean.t])
+
+
+def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance: float) -> Array:
+    """Covariance of weights and constants (P + Q, P + Q), including the uncertainty of the target.
+
+    J (S, L, P) are the derivatives of the local parameters; `target` says what the coupling (S, L + Q, r) is.
+    """
+    L = J.shape[1]
+    K = np.concatenate([np.einsum("slp,slr->pr", J, coupling[:, :L]), coupling[:, L:].sum(axis=0)]) / variance
+    follow = covariance @ K
+    values, vectors = np.linalg.eigh(np.eye(K.shape[1]) - K.T @ follow)
+    follow = follow @ (vectors / np.sqrt(np.maximum(values, _LEAST_INFORMATION)))
+    return covariance + follow @ follow.T
