@@ -34,11 +34,7 @@ Baseline = Callable[[Array], tuple[Array, Constants]]
 def baselines_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Baseline]:
     """All baselines that the settings determine, by name; those fitted jointly end in ``_joint``.
 
-    Parameters
-    ----------
-    lens : ZoomLens
-    scale : str, optional
-        Of alpha_u; default that of the networks.
+    The scale of alpha_u is by default that of the networks.
     """
     scale = scale or lens.members[0].nets.scale
     x = lens.scaled(lens.settings)
@@ -81,30 +77,21 @@ def _polynomial(table: Tables, variance: float, scale: str, x: Array, powers: Ar
     spread = variance * np.einsum("sij,sjk,sik->si", by_local, covariance, by_local)
     Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
-    coefficients = np.column_stack(
-        [
-            np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0]
-            for y, w in zip(outputs.T, weight.T, strict=True)
-        ]
-    )
-    return lambda to: (outputs_to_local(scale, monomials(to, powers) @ coefficients)[0], table.constants)
+    fits = [
+        np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0]
+        for y, w in zip(outputs.T, weight.T, strict=True)
+    ]
+    found = _Polynomials(scale, powers, np.column_stack(fits))
+    return lambda to: (found.local(to), table.constants)
 
 
 @frozen_dataclass(eq=False)
 class _Polynomials:
-    """A polynomial of the controls for each output: a `quadratic_error.LocalModel`.
+    """A polynomial of the controls for each output: a `quadratic_error.LocalModel`."""
 
-    Attributes
-    ----------
-    scale : str
-        Of alpha_u.
-    powers : (K, D) array
-    coefficients : (K, L) array
-    """
-
-    scale: str
-    powers: Array
-    coefficients: Array
+    scale: str  # of alpha_u
+    powers: Array  # (K, D)
+    coefficients: Array  # (K, L)
 
     @property
     def weights(self) -> Array:
@@ -140,7 +127,7 @@ def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Ba
     constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
     error = QuadraticError(x, table.local, table.normal, lens.variance)
     found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
-    moved = table.constants.moved(shared) if len(shared) else table.constants
+    moved = table.constants.moved(shared)
     return lambda to: (found.local(to), moved)
 
 

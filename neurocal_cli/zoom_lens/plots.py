@@ -118,16 +118,8 @@ def _draw_errors(
         axes.plot(settings[:, 0], values, "o-", color=INK, markersize=3, linewidth=0.8)
         axes.set(xlabel=controls[0], ylabel="rms [px]", ylim=(0, 1.15 * float(np.nanmax(values))))
         return
-    drawn = axes.scatter(
-        settings[:, 0],
-        settings[:, 1],
-        c=values,
-        s=90,
-        marker="s",
-        cmap="viridis",
-        edgecolors="0.4",
-        linewidths=0.4,
-    )
+    x, y = settings.T
+    drawn = axes.scatter(x, y, c=values, s=90, marker="s", cmap="viridis", edgecolors="0.4", linewidths=0.4)
     axes.set(xlabel=controls[0], ylabel=controls[1])
     axes.margins(0.1)
     figure.colorbar(drawn, ax=axes, shrink=0.9)

@@ -24,8 +24,12 @@ _POOR_FIT = 1.5
 def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens without its errors and warnings."""
     still = start.data.still
-    scatter = np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0)
     averaged = fit_local(start.data, start.tables.local, first_constants(start.static, start.lens, still))
+
+    def of_lens(constants: Constants) -> Constants:
+        # The poses of the views of a moving camera are not part of the lens.
+        return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
+
     return ZoomLens(
         controls=start.lens.controls,
         settings=start.lens.settings,
@@ -33,11 +37,11 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         model=start.data.model,
         still=still,
         known=False,
-        members=tuple(Member(joint.nets, _without_views(joint.constants, still)) for joint in joints),
-        tables=replace(start.tables, constants=_without_views(start.tables.constants, still)),
-        static=replace(averaged, constants=_without_views(averaged.constants, still)),
+        members=tuple(Member(joint.nets, of_lens(joint.constants)) for joint in joints),
+        tables=replace(start.tables, constants=of_lens(start.tables.constants)),
+        static=replace(averaged, constants=of_lens(averaged.constants)),
         variance=start.variance,
-        scatter=scatter,
+        scatter=np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0),
         free_theta=options.free_theta,
         counts=start.data.counts,
         rmse=np.full(start.lens.n_settings, np.nan),
@@ -49,11 +53,6 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         image_size=start.lens.points.image_size,
         unit=start.lens.points.unit,
     )
-
-
-def _without_views(constants: Constants, still: bool) -> Constants:
-    """Remove the poses of the views of a moving camera, which are not part of the lens."""
-    return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
 
 
 def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
