@@ -182,12 +182,13 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
     inverse = solve_scaled(S, np.eye(len(S)), ROUNDING)
     x = inverse @ g
     starts = places[_LEAST_PAIRS : len(places) - _LEAST_PAIRS + 1]
-    pairs = np.where(used[:, None, None], poses.pairs.S, 0.0), np.where(used[:, None], poses.pairs.g, 0.0)
-    after_S, after_g = (np.cumsum(block[::-1], axis=0)[::-1][starts] for block in pairs)
-    own_S, own_g = (
-        np.cumsum(block[poses.frame][::-1], axis=0)[::-1][starts]
-        for block in (poses.cameras.S, poses.cameras.g)
-    )
+
+    def from_starts(of_pairs: Array) -> Array:
+        return np.cumsum(of_pairs[::-1], axis=0)[::-1][starts]
+
+    after_S = from_starts(np.where(used[:, None, None], poses.pairs.S, 0.0))
+    after_g = from_starts(np.where(used[:, None], poses.pairs.g, 0.0))
+    own_S, own_g = (from_starts(of[poses.frame]) for of in (poses.cameras.S, poses.cameras.g))
     kinds = [("moved", poses.rig, after_S, after_g)]
     for kind, columns in zip(("left focal", "right focal"), poses.focal, strict=True):
         if len(columns) == 2:

@@ -119,7 +119,12 @@ def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[R
             return fit, warnings
         for side in not_monotonic:
             moving[side] = False
-            warnings.append(_kept_warning(("left", "right")[side]))
+            warnings.append(
+                f"after the common bundle adjustment the distortion model of the {('left', 'right')[side]} "
+                "camera is not monotonic (maps two directions to one pixel) inside the image, where there "
+                "are no points; the result of its own views is kept; add views that show the board in the "
+                "image's corners"
+            )
 
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
@@ -139,21 +144,12 @@ def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     return rig_covariance(poses, used, found)[np.ix_(moved, moved)]
 
 
-def _kept_warning(name: str) -> str:
-    return (
-        f"after the common bundle adjustment the distortion model of the {name} camera is not monotonic "
-        "(maps two directions to one pixel) inside the image, where there are no points; the result of its "
-        "own views is kept; add views that show the board in the image's corners"
-    )
-
-
 def _refuse_one_place(rig: Rig) -> None:
     if rig.baseline > _BASELINE_SIGMAS * rig.std["baseline"]:
         return
     raise CoincidentCamerasError(
         f"both cameras are at the same place: the baseline is {rig.baseline:.3g} +- "
-        f"{rig.std['baseline']:.2g} "
-        f"{rig.unit}; give the points (or calibrations) of two different cameras"
+        f"{rig.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two different cameras"
     )
 
 
@@ -169,18 +165,9 @@ def _swapped(rig: Rig) -> tuple[str, ...]:
 
 
 def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: ViewPairs) -> dict[str, Pose]:
-    """Poses of views in the left camera's frame that fit both cameras of a known rig best.
+    """Poses of views in the left camera's frame that fit both cameras of a known rig best, by its names.
 
-    Parameters
-    ----------
-    rig : Pose
-    cameras : two of Calibration
-        With the poses of the views in each camera alone.
-    views : ViewPairs
-
-    Returns
-    -------
-    poses : dict of Pose by the left camera's view name
+    The cameras have the poses of the views in each camera alone.
     """
     problem = rig_problem(*cameras, views)
     start = problem.start(rig)

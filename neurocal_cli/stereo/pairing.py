@@ -51,10 +51,7 @@ class Pairs:
 def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     """Pair the names of two cameras' views.
 
-    Raises
-    ------
-    InputError
-        No view, no pair, ambiguous names, or names that show that the cameras are swapped.
+    Errors are no view, no pair, ambiguous names, and names that show that the cameras are swapped.
     """
     for side, names in (("left", left), ("right", right)):
         if not names:
@@ -116,10 +113,7 @@ def _listed(names: Sequence[str]) -> str:
 def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs) -> Pairs:
     """Pair the points of paired views.
 
-    Raises
-    ------
-    InputError
-        Different units, no common point, ids of different places, or several points at one place.
+    Errors are different units, no common point, ids of different places, and several points at one place.
     """
     if left.unit != right.unit:
         raise InputError(

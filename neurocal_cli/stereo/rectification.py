@@ -36,11 +36,6 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
 
     The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
     pixels of the original images, and values in between interpolate. With None nothing is scaled.
-
-    Raises
-    ------
-    UsageError
-        alpha is not between 0 and 1.
     """
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")

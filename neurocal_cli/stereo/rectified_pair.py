@@ -47,13 +47,7 @@ class RowError:
 
 
 def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
-    """Rectify the cameras of a rig; for alpha see `rectification.rectify`.
-
-    Raises
-    ------
-    InputError
-        Images of unknown or of different sizes.
-    """
+    """Rectify the cameras of a rig, whose images must have one known size; see `rectification.rectify`."""
     matrices = rectify(rig, alpha)
     if matrices is None:
         raise InputError(
@@ -72,12 +66,8 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
 def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
     """Convert points of one camera, 0 left or 1 right, to its rectified camera.
 
-    Points of a wide lens behind the rectified image plane are left out.
-
-    Raises
-    ------
-    InputError
-        Another image size; a pixel that the distortion does not reach.
+    Points of a wide lens behind the rectified image plane are left out. Another image size and a pixel that
+    the distortion does not reach are errors.
     """
     size = pair.cameras[side].image_size
     if points.image_size not in (None, size):
@@ -93,13 +83,8 @@ def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> C
 def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences) -> RowError:
     """Distance of the rows (columns, for cameras above each other) of the same points, rectified.
 
-    The points are those that `rectify_points` returns. Mid-points that were measured only along the row are
-    left out.
-
-    Raises
-    ------
-    InputError
-        No point is in both.
+    The points are those that `rectify_points` returns; some must be in both. Mid-points that were measured
+    only along the row are left out.
     """
     common = pair_points(left, right, pair_views(left.view_names, right.view_names))
     across = 1 - pair.axis

@@ -43,12 +43,8 @@ def assemble_rig(
     """Convert an adjusted rig to the user's units.
 
     `least` (f, f) is a lower bound of the covariance of the free shared parameters, normalised. `stretched`
-    is the covariance to add to it because the print may be stretched.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the parameters.
+    is the covariance to add to it because the print may be stretched. Points that do not determine the
+    parameters are an error.
     """
     return _RigAssembly(fit, least, stretched).rig(left_out)
 

@@ -70,13 +70,7 @@ def span(pairs: Sequence[Pair]) -> str:
 
 
 def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> SoundPairs:
-    """Find the pairs that determine the rig.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Half of the pairs, or more, contradict each other.
-    """
+    """Find the pairs that determine the rig; an error if half of them or more contradict each other."""
     problem = rig_problem(left, right, views)
     consensus = find_consensus(problem)
     reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -136,8 +137,7 @@ def grid_axes(x: Array) -> list[Array] | None:
     axes = [np.unique(column) for column in x.T]
     if np.prod([len(axis) for axis in axes]) != len(x) or min(len(axis) for axis in axes) < 2:
         return None
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, x.shape[1])
-    return axes if np.array_equal(grid, x) else None
+    return axes if np.array_equal(list(product(*axes)), x) else None
 
 
 def spline_matrix(axes: list[Array], x: Array, degree: int) -> Array:
@@ -176,8 +176,7 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
 def powers_up_to(nodes: Array, degree: int) -> Array:
     """Powers of the controls (K, D) up to a total degree that the values of the settings (S, D) determine."""
     most = [len(np.unique(column)) - 1 for column in nodes.T]
-    ranges = np.meshgrid(*[np.arange(min(limit, degree) + 1) for limit in most], indexing="ij")
-    powers = np.stack(ranges, axis=-1).reshape(-1, nodes.shape[1])
+    powers = np.array(list(product(*(range(min(limit, degree) + 1) for limit in most))))
     return np.asarray(powers[powers.sum(axis=1) <= degree])
 
 

@@ -13,7 +13,6 @@ from neurocal_cli.errors import DegenerateGeometryError, check_choice, check_see
 from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.cross_validation import contradiction, left_out_errors, most_suspect
 from neurocal_cli.zoom_lens.initialisation import (
     CalibratedSettings,
     FitOptions,
@@ -22,7 +21,7 @@ from neurocal_cli.zoom_lens.initialisation import (
     choose_model,
 )
 from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, take_turns, train_joint
-from neurocal_cli.zoom_lens.result import assemble, provisional
+from neurocal_cli.zoom_lens.result import assemble, contradiction, left_out_errors, most_suspect, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.target import lens_target, on_target, target_coupling
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens

@@ -36,21 +36,11 @@ _LARGEST_TILT = 0.99
 
 @frozen_dataclass
 class Topology:
-    """Numbers of units of a network.
+    """Numbers of units of a network."""
 
-    Parameters
-    ----------
-    controls : int
-        Inputs, D.
-    own : int
-        Tanh units of the first hidden layer for each control, beside its rational unit.
-    hidden : int
-        Units of the second hidden layer, H.
-    """
-
-    controls: int
-    own: int
-    hidden: int
+    controls: int  # inputs, D
+    own: int  # tanh units of the first hidden layer for each control, beside its rational unit
+    hidden: int  # units of the second hidden layer, H
 
     @property
     def width(self) -> int:

@@ -42,13 +42,7 @@ class StaticFit:
 
 
 def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
-    """Calibrate each setting alone, from random weights.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than 3 settings, or fewer than half, can be calibrated.
-    """
+    """Calibrate each setting alone, from random weights; at least 3 and half of them must succeed."""
     S, V = lens.n_settings, lens.points.n_views
     local = np.zeros((S, len(data.names)))
     theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))

@@ -37,18 +37,11 @@ class RejectedSetting:
 
 @frozen_dataclass(eq=False)
 class Prediction:
-    """Predicted parameters at some settings.
+    """Predicted parameters at some settings."""
 
-    Attributes
-    ----------
-    local : (n, L) array
-    constants : Constants
-    covariance : (n, L + Q, L + Q) array
-        Of the local parameters and of theta; of omega, t_x, t_y as well for a still camera.
-    """
-
-    local: Array
+    local: Array  # (n, L)
     constants: Constants
+    # (n, L + Q, L + Q) of the local parameters and of theta; of omega, t_x, t_y as well for a still camera
     covariance: Array
 
     @property
@@ -172,19 +165,10 @@ class ZoomLens:
     def setting_of(
         self, values: dict[str, float | None], extrapolate: bool = False
     ) -> tuple[Array, list[str]]:
-        """Check a setting and put it in the order of the controls.
+        """Check a setting, put it in the order of the controls (D,), and return it with warnings.
 
-        Parameters
-        ----------
-        values : dict
-            Value of each control; None for one that is not given.
-        extrapolate : bool
-            Whether a setting outside the calibrated range gives a warning and not an error.
-
-        Returns
-        -------
-        setting : (D,) array
-        warnings : list of str
+        The value of a control that is not given is None. A setting outside the calibrated range is an error,
+        or a warning with `extrapolate`.
 
         Raises
         ------
@@ -217,12 +201,7 @@ class ZoomLens:
         return setting, [f"{text}: the networks extrapolate there" for text in outside]
 
     def _numbers(self, settings: Array, dimensions: int) -> Array:
-        """One setting or several as an array of one or two dimensions.
-
-        Raises
-        ------
-        InputError
-        """
+        """One setting or several as an array of one or two dimensions."""
         try:
             found = np.asarray(settings, dtype=float)
         except (TypeError, ValueError):
