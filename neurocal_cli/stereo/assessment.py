@@ -81,11 +81,12 @@ def assess_rig(rig: Rig) -> Verdict | None:
             return None
     evidence = _evidence(rig)
     found = evidence.contradiction
+    growth, scatter = (np.nan, np.nan) if found is None else (found.growth, found.scatter)
     measures = {
         "held_out_px": evidence.held_out_px,
-        "alone_px": np.nan if found is None else rig.rmse_px / found.growth,
-        "growth": np.nan if found is None else found.growth,
-        "scatter": np.nan if found is None else found.scatter,
+        "alone_px": rig.rmse_px / growth,
+        "growth": growth,
+        "scatter": scatter,
         "depth": evidence.depth,
         "depth_share": evidence.depth_share,
     }

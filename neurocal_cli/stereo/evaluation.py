@@ -31,40 +31,19 @@ from neurocal_cli.verdict.given_points import GivenPoints, given_camera, given_e
 
 @frozen_dataclass(eq=False)
 class StereoEvaluation:
-    """Errors of two cameras at points of known position.
-
-    Attributes
-    ----------
-    unit : str
-    by_view : SpaceError
-        Triangulated with each view's own poses of the two cameras.
-    rig : SpaceError or None
-        Triangulated through one rig for all views, as for points of unknown position; None where no rig
-        fits all views.
-    baseline : float [world unit]
-        Of the rig; nan without a rig.
-    pairs : tuple of (left name, right name)
-    alone : two tuples of str
-        Views of the left and of the right camera without a pair, which are not used.
-    fitted : tuple of str
-        Views of the left camera whose poses were estimated from the same points.
-    models : (left, right) str
-        Distortion models of the cameras.
-    warnings : tuple of str
-    judgement : callable
-        Computes the verdict.
-    """
+    """Errors of two cameras at points of known position."""
 
     unit: str
-    by_view: SpaceError
+    by_view: SpaceError  # triangulated with each view's own poses of the two cameras
+    # Triangulated through one rig for all views, as for points of unknown position; None if no rig fits them.
     rig: SpaceError | None
-    baseline: float
-    pairs: tuple[tuple[str, str], ...]
-    alone: tuple[tuple[str, ...], tuple[str, ...]]
-    fitted: tuple[str, ...]
-    models: tuple[str, str]
+    baseline: float  # of the rig [world unit]; nan without a rig
+    pairs: tuple[tuple[str, str], ...]  # left and right names
+    alone: tuple[tuple[str, ...], tuple[str, ...]]  # views of each camera without a pair, which are not used
+    fitted: tuple[str, ...]  # views of the left camera whose poses were estimated from the same points
+    models: tuple[str, str]  # distortion models of the cameras
     warnings: tuple[str, ...]
-    judgement: Callable[[], Verdict | None]
+    judgement: Callable[[], Verdict | None]  # computes the verdict
 
     @cached_property
     def verdict(self) -> Verdict | None:

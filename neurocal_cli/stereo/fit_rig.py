@@ -76,7 +76,7 @@ def fit_rig(
     pair_points(left.points, right.points, views)
     sound = sound_pairs(left, right, views)
     if sound.left_out and outliers == "keep":
-        raise DegenerateGeometryError(sound.contradiction(len(views.both), outliers))
+        raise DegenerateGeometryError(sound.contradiction(outliers))
     problem = sound.problem
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
@@ -95,7 +95,7 @@ def fit_rig(
     rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched[1])
     _refuse_one_place(rig)
     if sound.left_out:
-        warnings.insert(0, sound.contradiction(len(views.both)))
+        warnings.insert(0, sound.contradiction())
     return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
 
 

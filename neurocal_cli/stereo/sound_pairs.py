@@ -39,10 +39,11 @@ class SoundPairs:
     moved: str = ""  # message about a rig that moved between two pairs
     by_chance: bool = False  # whether the pairs differ by no more than chance
 
-    def contradiction(self, n_pairs: int, outliers: str = "reject") -> str:
+    def contradiction(self, outliers: str = "reject") -> str:
         """Message with the pairs that are left out and their faults."""
         if self.moved:
             return self.moved
+        n_pairs = len(self.problem.paired)
         found = describe_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
@@ -83,7 +84,7 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
         found = _explained(poses, used, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
         shifted = _shifted(left, right, views)
-        raise DegenerateGeometryError(shifted or found.contradiction(len(views.both)))
+        raise DegenerateGeometryError(shifted or found.contradiction())
     return found
 
 

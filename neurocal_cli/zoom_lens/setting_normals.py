@@ -172,7 +172,7 @@ class PixelData:
         C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
         C[:, 8:10, 9 + K : 11 + K] = np.eye(2) / scale
         C[:, -1, -1] = 1.0
-        return self._in_pixels(np.swapaxes(C, 1, 2) @ N @ C)
+        return np.swapaxes(C, 1, 2) @ N @ C * self.views.pixel_scale**2
 
     def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
         """Normal matrices over local parameters, theta and the residual, with the poses eliminated."""
@@ -183,7 +183,4 @@ class PixelData:
         C = np.zeros((V, 6 + K, 6 + K))
         C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta
         C[:, -1, -1] = 1.0
-        return self._in_pixels(np.swapaxes(C, 1, 2) @ U @ C)
-
-    def _in_pixels(self, normal: Array) -> Array:
-        return normal * self.views.pixel_scale**2
+        return np.swapaxes(C, 1, 2) @ U @ C * self.views.pixel_scale**2

@@ -64,7 +64,12 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
         if cal.distortion_model == data.model:
             local[s, 4 + data.still :] = cal.distortion
         theta[s], good[s] = K.theta, np.isfinite(cal.rmse_px)
-    _refuse_failures(lens, good, reasons)
+    if good.sum() < max(3, (S + 1) // 2):
+        first = next(iter(reasons))
+        raise DegenerateGeometryError(
+            f"{int((~good).sum())} of {S} settings cannot be calibrated, the first at "
+            f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
+        )
     nearest = _nearest_good(lens, good)
     for v, s in enumerate(lens.view_setting):
         if not good[s]:
@@ -85,16 +90,6 @@ def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Ca
         if model == "none":
             raise
         return calibrated("none")
-
-
-def _refuse_failures(lens: LensPoints, good: NDArray[np.bool_], reasons: dict[int, str]) -> None:
-    if good.sum() >= max(3, (len(good) + 1) // 2):
-        return
-    first = next(iter(reasons))
-    raise DegenerateGeometryError(
-        f"{int((~good).sum())} of {len(good)} settings cannot be calibrated, the first at "
-        f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
-    )
 
 
 def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
