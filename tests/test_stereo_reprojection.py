@@ -7,9 +7,9 @@ from support.rigs import RigScene, all_residuals, random_rig
 from neurocal_cli import calibrate
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.adjust import RigProblem, RigState, adjust_rig
-from neurocal_cli.stereo.consensus import find_consensus
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
+from neurocal_cli.stereo.sound_pairs import find_consensus
 
 
 def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigProblem, RigState]:

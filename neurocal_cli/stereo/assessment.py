@@ -24,14 +24,13 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
-from neurocal_cli.stereo.consensus import UNSYNCHRONISED
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
 from neurocal_cli.stereo.covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.sound_pairs import MOVED, describe_faults, describe_move, pair_name
+from neurocal_cli.stereo.sound_pairs import MOVED, UNSYNCHRONISED, describe_faults, describe_move, pair_name
 from neurocal_cli.stereo.triangulation import triangulate
 from neurocal_cli.verdict.assessment import assess
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of

@@ -100,10 +100,10 @@ class JointLearner:
 
     def linearise(self) -> float:
         """Recompute the normal matrices at the present networks; 2 E."""
-        self.reference = self.nets.local(self.x)
-        normal, self.constants = self.data.linearise(self.reference, self.constants)
-        self.normal = with_scatter(normal, self.scatter, self.variance)
-        self.error = QuadraticError(self.x, self.reference, self.normal, self.variance)
+        reference = self.nets.local(self.x)
+        normal, self.constants = self.data.linearise(reference, self.constants)
+        normal = with_scatter(normal, self.scatter, self.variance)
+        self.error = QuadraticError(self.x, reference, normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
         return self.error.cost(self.nets, self.shared)
 
@@ -156,7 +156,7 @@ def take_turns(learner: JointLearner) -> float:
 
 def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> tuple[LensNets, Array]:
     """One step of the calibrating network at every setting and one iteration of each other network."""
-    normal, local = learner.normal, nets.local(learner.x)
+    normal, local = learner.error.normal, nets.local(learner.x)
     L = local.shape[1]
     pull = normal.g - learner.error.offset(local, shared)[1]
     _, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))
