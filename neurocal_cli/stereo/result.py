@@ -87,7 +87,11 @@ class _RigAssembly:
             _squared_errors(observed, problem.camera(state, side))
             for side, observed in enumerate(problem.observations)
         ]
-        left, right = (self._calibration(side, squares[side]) for side in (0, 1))
+        sums = [
+            observed.batches.sum_by_view(part.sum(axis=1))
+            for observed, part in zip(problem.observations, squares, strict=True)
+        ]
+        left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
         pose = Pose(state.R, state.t * problem.unit)
         covariance, std = self._rig_covariance(pose)
         n_points = sum(observed.n_points for observed in problem.observations)
@@ -99,7 +103,7 @@ class _RigAssembly:
             covariance,
             tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
             dict(left_out),
-            rmse_px=float(np.sqrt(sum(part.sum() for part in squares) / n_points)),
+            rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
             max_px=float(np.sqrt(max(part.max() for part in squares))),
             converged=left.converged,
             stop_reason=left.stop_reason,
@@ -132,14 +136,13 @@ class _RigAssembly:
         block[np.ix_(free, free)] = self.covariance.shared[np.ix_(rows, rows)]
         return block
 
-    def _calibration(self, side: int, squares: Array) -> Calibration:
-        """One camera after the common bundle adjustment; squares (T, n) are its pixel errors."""
+    def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
+        """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
         given, observed = self.problem.calibrations[side], self.problem.observations[side]
         intrinsics, batches, reason = _intrinsics(self.fit, side), observed.batches, self._stop_reason()
         changes: dict[str, Any] = {}
         if self.fit.free[self.columns.cameras[side]].any():
             changes = self._intrinsic_changes(side, intrinsics)
-        sums = batches.sum_by_view(squares.sum(axis=1))
         rms = np.sqrt(sums / batches.counts)
         R, t = self.problem.world_poses(self.state, side)
         stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
@@ -155,7 +158,7 @@ class _RigAssembly:
             given,
             views=views,
             rmse_px=rmse,
-            max_px=float(np.sqrt(squares.max())),
+            max_px=float(np.sqrt(largest)),
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
             network=_network(given.network, intrinsics, views, rmse, self.fit.iterations),
