@@ -50,10 +50,7 @@ class LensCameras:
     ) -> LensCameras:
         """Read columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
 
-        Raises
-        ------
-        InputError
-            A missing column, impossible values, or one setting only.
+        A missing column, impossible values, and one setting only are errors.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
         coefficients = coefficient_names(model)

@@ -92,19 +92,10 @@ def train(
     weights: Array,
     schedule: Schedule | None = None,
 ) -> TrainedNets:
-    """Train a stack of networks, all at once.
+    """Train a stack of networks, all at once, from initial weights (B, P).
 
-    Parameters
-    ----------
-    topology : Topology
-    x : (n, D) array
-        Controls, scaled to about [-1, 1].
-    targets, variance : (n,) arrays
-        Targets, centred and scaled to a spread of about 1, and their variances: 0 where unknown, so that the
-        scatter is the noise.
-    weights : (B, P) array
-        Initial weights.
-    schedule : Schedule, optional
+    The controls x (n, D) are scaled to about [-1, 1], the targets (n,) centred and scaled to a spread of
+    about 1. Their variances (n,) are 0 where unknown, so that the scatter is the noise.
     """
     learner = _NetworkStack(topology, x, targets, variance, weights)
     schedule = schedule or Schedule()
