@@ -17,8 +17,16 @@ from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, write
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.result_files import lean_calibration
-from neurocal_cli.planning.advice import Candidate, _Known, _target, advise, candidates
-from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
+from neurocal_cli.planning.advice import (
+    Candidate,
+    _Known,
+    _target,
+    advise,
+    candidates,
+    pixel_changes,
+    view_information,
+    worst_std,
+)
 from neurocal_cli.planning.report import advice_lines
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")

@@ -19,9 +19,9 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.stereo import open_covariance
+from neurocal_cli.stereo import covariance
 from neurocal_cli.stereo.adjust import adjust_rig
-from neurocal_cli.stereo.open_covariance import covariance_of_stretch
+from neurocal_cli.stereo.covariance import covariance_of_stretch
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.target_shape import open_stretch as open_stretch_module
@@ -85,7 +85,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     problem = rig_problem(left, right, pair_views(left.points.view_names, right.points.view_names))
     free = np.concatenate([*problem.estimated, [True] * 6])
     adjusted = adjust_rig(problem, problem.start(scene.rig), free)
-    only(0, monkeypatch, open_covariance)
+    only(0, monkeypatch, covariance)
     found = covariance_of_stretch(adjusted)
     assert found is not None
     stretch = np.eye(3) + EPS * stretches(left.points.world)[0]

@@ -11,15 +11,14 @@ from support.wrong_rigs import in_parts, jolted, loose, scene, seen, turned, zoo
 
 from neurocal_cli import Correspondences, calibrate, fit_rig
 from neurocal_cli.geometry import rotation_step, rotation_vector
-from neurocal_cli.stereo.adjust import adjust_rig
-from neurocal_cli.stereo.consensus import find_consensus
-from neurocal_cli.stereo.contradiction import Contradiction, contradiction
-from neurocal_cli.stereo.odd_pairs import odd_pairs
-from neurocal_cli.stereo.pair_covariance import not_smaller
+from neurocal_cli.stereo.adjust import RigProblem, adjust_rig
+from neurocal_cli.stereo.contradiction import Contradiction, contradiction, odd_pairs
+from neurocal_cli.stereo.covariance import not_smaller
 from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import RigProblem, rig_problem
+from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.stereo.sound_pairs import find_consensus
 
 Points = tuple[Correspondences, Correspondences]
 

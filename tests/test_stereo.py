@@ -222,7 +222,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, 6]] = False
     state = adjust_rig(problem, state, free).state
-    V, step = len(problem.frames.scale), 1e-7
+    V, step = len(problem.scale), 1e-7
     rows = []
     for n in np.flatnonzero(np.concatenate([free, np.ones(6 * V, dtype=bool)])):
         change = np.zeros(columns.n_shared + 6 * V)
@@ -237,7 +237,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     weight = np.sqrt(np.mean([s.weight / s.pixel_scale**2 for s in problem.observations]))
     covariance = np.linalg.inv(J @ J.T) * weight**2
     place = np.flatnonzero(np.flatnonzero(free) == columns.rig[3])[0]
-    t_x = np.sqrt(covariance[place, place]) * problem.frames.unit
+    t_x = np.sqrt(covariance[place, place]) * problem.unit
     assert bound(scene)[11] == pytest.approx(t_x, rel=0.1)
 
 

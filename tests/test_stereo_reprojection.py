@@ -6,11 +6,10 @@ from support.rigs import RigScene, all_residuals, random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.adjust import adjust_rig
-from neurocal_cli.stereo.consensus import find_consensus
+from neurocal_cli.stereo.adjust import RigProblem, RigState, adjust_rig
 from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import RigProblem, rig_problem
-from neurocal_cli.stereo.reprojection import RigState, rig_normal_blocks
+from neurocal_cli.stereo.problem import rig_problem
+from neurocal_cli.stereo.sound_pairs import find_consensus
 
 
 def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigProblem, RigState]:
@@ -30,9 +29,9 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
 def test_derivatives_are_those_of_finite_differences(lens: str) -> None:
     _, problem, state = made_problem(lens)
     columns = state.columns
-    normal, sensible = rig_normal_blocks(problem.frames, problem.observations, state)
+    normal, sensible = problem.normal(state)
     assert sensible
-    V = len(problem.frames.scale)
+    V = len(problem.scale)
     r = all_residuals(problem, state)
     assert normal[:, -1, -1].sum() == pytest.approx((r**2).sum(), rel=1e-12)
 
@@ -79,7 +78,7 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
     free[[1, columns.right[1]]] = False  # no skew
     adjusted = adjust_rig(problem, state, free)
     assert adjusted.converged
-    V, places = len(problem.frames.scale), np.flatnonzero(free)
+    V, places = len(problem.scale), np.flatnonzero(free)
 
     def errors(x: Array) -> Array:
         shared = np.zeros(columns.n_shared)
@@ -96,4 +95,4 @@ def test_without_noise_the_truth_is_found_exactly() -> None:
     free[[1, 6]] = False
     found = adjust_rig(problem, state, free).state
     assert pytest.approx(scene.rig.R, abs=1e-10) == found.R
-    assert found.t * problem.frames.unit == pytest.approx(scene.rig.t, abs=1e-7)
+    assert found.t * problem.unit == pytest.approx(scene.rig.t, abs=1e-7)

@@ -15,7 +15,7 @@ from neurocal_cli.zoom_lens.evaluation import evaluate_lens
 from neurocal_cli.zoom_lens.fit_points import fit_lens
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.target import lens_target, on_target
-from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
+from neurocal_cli.zoom_lens.zoom_lens import with_target_uncertain
 
 SIGMA = 0.1
 ZOOMS = np.linspace(0, 1000, 6)

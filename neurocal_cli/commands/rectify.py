@@ -236,7 +236,7 @@ class _Work:
 
     def _rectify_pair(self, pair: tuple[str, str]) -> None:
         from neurocal_cli.io.images import encode_image, encode_png, read_picture
-        from neurocal_cli.stereo.pair_picture import pair_picture
+        from neurocal_cli.stereo.rectified_pair import pair_picture
 
         pictures = []
         for remapping, path in zip(self._remappings(), pair, strict=True):

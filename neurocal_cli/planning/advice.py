@@ -1,4 +1,14 @@
-"""Choose the views that reduce the uncertainty of a camera most, one after the other."""
+"""Choose the views that reduce the uncertainty of a camera most, one after the other.
+
+Each view adds the normal matrix of the camera's parameters with the view's pose eliminated, ``A - C B^-1
+C^T``. It needs no observed pixels, so views that were not taken can be compared. All points have equal
+weight, with the noise of the calibration.
+
+Changes of the camera that a motion of its frame compensates do not count, as in
+`verdict.projection_uncertainty`. There the frame moves with the poses of the views. Here it moves so that the
+pixels of near and far points all over the image move least, which does not depend on the views. So no view
+can make the camera less certain, and the numbers of both modules are similar but not equal.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +26,6 @@ from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
-from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.verdict.projection_uncertainty import image_grid
 
 _POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # shares of the image's width and height
@@ -26,65 +35,34 @@ _ROLLS = (0.0, 90.0)  # degrees
 _FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # distances of judged points, relative to that of the views
 _FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
 _LEAST_SIGMA = 1e-4  # px; least noise, for perfect fits
+_SINGULAR = 1e-13  # eigenvalue of a matrix with unit diagonal, below which it is rounding
 
 
 @frozen_dataclass(eq=False)
 class Candidate:
-    """A possible view.
-
-    Attributes
-    ----------
-    pose : Pose
-    position : (2,) array
-        Position of the target's middle, as shares of the image's width and height.
-    width : float
-        Width of the target in a frontal view, as a share of the image's width.
-    tilt, way : float [degrees]
-        Angle of the tilt, and direction of the side that comes nearer: 0 is right, 90 is down.
-    roll : float [degrees]
-        Clockwise rotation of the target in its plane.
-    outline : (n, 2) array [px]
-        Corners of the target in the image.
-    """
+    """A possible view."""
 
     pose: Pose
-    position: Array
-    width: float
-    tilt: float
-    way: float
-    roll: float
-    outline: Array
+    position: Array  # (2,) of the target's middle, as shares of the image's width and height
+    width: float  # of the target in a frontal view, as a share of the image's width
+    tilt: float  # [degrees]
+    way: float  # direction of the side that comes nearer [degrees]: 0 is right, 90 is down
+    roll: float  # clockwise rotation of the target in its plane [degrees]
+    outline: Array  # (n, 2) corners of the target in the image [px]
 
 
 @frozen_dataclass(eq=False)
 class Advice:
-    """Views to take next, in this order.
-
-    Attributes
-    ----------
-    views : tuple of Candidate
-    before : float [px]
-        Largest standard deviation of a projected pixel without the views.
-    after : tuple of float [px]
-        The same after adding each of the views.
-    image_size : (width, height) [px]
-    """
+    """Views to take next, in this order."""
 
     views: tuple[Candidate, ...]
-    before: float
-    after: tuple[float, ...]
+    before: float  # largest standard deviation of a projected pixel without the views [px]
+    after: tuple[float, ...]  # the same after adding each of the views [px]
     image_size: tuple[int, int]
 
 
 def advise(calibration: Calibration, count: int = 3) -> Advice:
     """Choose views greedily: each reduces the largest uncertainty most, given the previous ones.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        With points and image size.
-    count : int
-        Number of views.
 
     Raises
     ------
@@ -110,26 +88,13 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
 
 @frozen_dataclass(eq=False)
 class _Known:
-    """Information on a camera from the views taken so far.
+    """Information on a camera from the views taken so far."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Including open coefficients that its model lacks (`open_coefficients`), as 0.
-    free : (5 + K,) bool array
-    information : (f, f) array
-        Normal matrix of the free parameters, with the prior of the open coefficients.
-    places : (g, 2, f) array
-        Derivatives of the judged pixels, see `pixel_changes`.
-    sigma : float [px]
-        Noise of the points.
-    """
-
-    camera: Camera
-    free: NDArray[np.bool_]
-    information: Array
-    places: Array
-    sigma: float
+    camera: Camera  # with open coefficients that its model lacks (`open_coefficients`), as 0
+    free: NDArray[np.bool_]  # (5 + K,)
+    information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
+    places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`
+    sigma: float  # noise of the points [px]
 
     def worst(self, more: Array | float = 0.0) -> float:
         """Largest standard deviation of a projected pixel [px], with the information of further views."""
@@ -244,3 +209,51 @@ def _tilted(tilt: float, way: float) -> Array:
     a, b = np.radians(tilt), np.radians(way)
     K = cross_matrix(np.array([-np.sin(b), np.cos(b), 0.0]))
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
+
+
+def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array) -> Array:
+    """Information (f, f) of a view of points (N, 3) on the camera.
+
+    It is the normal matrix of the free ones of A11, A12, A22, A13, A23 and the coefficients with the pose
+    eliminated, for residuals of unit variance.
+    """
+    points = pose.to_camera(world)
+    J, P = _derivatives(camera, free, points)
+    J, P = J.reshape(-1, J.shape[2]), P.reshape(-1, 6)
+    C = J.T @ P
+    return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T)
+
+
+def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array) -> Array:
+    """Derivatives (g, 2, f) of pixels by the free parameters, without what a motion of the frame compensates.
+
+    The pixels (G, 2) are all over the image; those without a ray are left out. Each has a point at each of
+    the depths (D,).
+    """
+    rays = camera.seen_points(pixels)
+    rays = rays[np.isfinite(rays[:, 0])]
+    J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]))
+    motion = np.linalg.lstsq(P.reshape(-1, 6), J.reshape(-1, J.shape[2]), rcond=None)[0]
+    return np.asarray(J - P @ motion)
+
+
+def worst_std(normal: Array, changes: Array, sigma: float) -> float:
+    """Largest standard deviation of a projected pixel [px]; infinite if the views determine no camera.
+
+    `normal` (f, f) is the sum of the views' information, `changes` (g, 2, f) are from `pixel_changes`, and
+    `sigma` [px] is the noise of the points, in u and in v.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    S = normal / np.outer(scale, scale)
+    if np.linalg.eigvalsh(S)[0] < _SINGULAR:
+        return float("inf")
+    scaled = changes / scale
+    variance = np.sum((scaled @ np.linalg.inv(S)) * scaled, axis=(1, 2))
+    return sigma * float(np.sqrt(variance.max()))
+
+
+def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array) -> tuple[Array, Array]:
+    """Derivatives of pixels by the free parameters (N, 2, f) and a motion of the points' frame (N, 2, 6)."""
+    by_camera, by_point = camera.project_jacobian(points)
+    moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
+    return by_camera[:, :, free], by_point @ moved

@@ -8,24 +8,18 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.planning.advice import Advice
-from neurocal_cli.plots.figure import picture, style
+from neurocal_cli.plots.figure import ACCENT, INK, picture, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_DOTS = 4000
 
-_COLOURS = ("#c0392b", "#1f4e79", "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
+_COLOURS = (ACCENT, INK, "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
 
 
 def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> bytes:
-    """Draw the outlines of the advised views over the points of the views taken so far.
-
-    Parameters
-    ----------
-    advice : Advice
-    calibration : Calibration
-    kind : {"png", "pdf", "svg"}
+    """Draw the outlines of the advised views (png, pdf or svg) over the points of the views taken so far.
 
     Raises
     ------

@@ -1,36 +1,74 @@
-"""Measure the quality of a rig beyond the error of the common fit, and reach a verdict.
+"""The verdict on a rig, good, usable or poor, with reasons and advice: its measures and its rules.
 
 Everything is computed from the rig and its points, so a file can be judged like a fresh result:
 
 * the verdict on each camera by its own points (`verdict.assessment`);
 * whether the pairs of views agree on one rig (`contradiction`);
 * the cross-validation error over pairs;
-* the uncertainty of triangulated depth (`depth_uncertainty`).
+* the uncertainty of triangulated depth, from the covariance of the rig and its cameras.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration import Verdict
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
-from neurocal_cli.stereo.consensus import UNSYNCHRONISED
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
-from neurocal_cli.stereo.depth_uncertainty import depth_std
-from neurocal_cli.stereo.pair_covariance import rig_covariance
+from neurocal_cli.stereo.covariance import rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.rules import RigEvidence, reach_rig_verdict
-from neurocal_cli.stereo.sound_pairs import MOVED
+from neurocal_cli.stereo.sound_pairs import MOVED, UNSYNCHRONISED, describe_faults, describe_move, pair_name
+from neurocal_cli.stereo.triangulation import triangulate
 from neurocal_cli.verdict.assessment import assess
+from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
+
+# Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,
+# in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 3 times as
+# much as noise explains.
+_SCATTER = Limit(3.5, 10.0)
+_GROWTH = Limit(1.6, 2.3)
+_CHANGE = Limit(0.0, 10.0)  # standard deviations for each unknown of the explanation
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DEPTH = Limit(0.01, 0.05)  # std over the depth
+_BASELINE = Limit(0.01, 0.05)  # std over the baseline
+_LEFT_OUT = Limit(0.0, 0.34)  # share of the pairs
+
+_MOMENT = (
+    "trigger both cameras at the same moment, or hold the target still; check that the cameras are fixed"
+)
 
 _FOLDS = 5
 _MOST_POINTS = 400  # most points that are triangulated for the uncertainty of depth
+_STEP = 1e-2  # standard deviations: small enough to be linear, large against rounding
+_LEAST_STEP = 1e-9
+
+
+@frozen_dataclass(eq=False)
+class _Evidence:
+    """Measures of a rig's quality; nan and None if a view does not determine its pose."""
+
+    cameras: tuple[Verdict | None, Verdict | None]  # by their own points
+    names: tuple[tuple[str, str], ...]  # of all pairs, in order
+    size: Array  # (P,) of each pair's target [world unit]
+    moved: Contradiction | None = None  # of all pairs, if the rig moved
+    contradiction: Contradiction | None = None  # of the pairs that determine the rig
+    displacement: float = np.nan  # rms distance of the targets from their predicted positions [world unit]
+    held_out_px: float = np.nan  # five-fold cross-validation error over pairs, if any can be left out
+    depth: float = np.nan  # median depth of the points [world unit]
+    depth_share: float = np.nan  # median std of triangulated depth over the depth, for exact pixels
 
 
 def assess_rig(rig: Rig) -> Verdict | None:
@@ -40,28 +78,30 @@ def assess_rig(rig: Rig) -> Verdict | None:
         names = set(camera.points.view_names)
         if not pairs or names != set(camera.views) or not names >= {pair[side] for pair in pairs}:
             return None
-    return reach_rig_verdict(rig, gather_rig_evidence(rig))
+    evidence = _evidence(rig)
+    found = evidence.contradiction
+    growth, scatter = (np.nan, np.nan) if found is None else (found.growth, found.scatter)
+    measures = {
+        "held_out_px": evidence.held_out_px,
+        "alone_px": rig.rmse_px / growth,
+        "growth": growth,
+        "scatter": scatter,
+        "depth": evidence.depth,
+        "depth_share": evidence.depth_share,
+    }
+    return verdict_of(_findings(rig, evidence), measures)
 
 
-def gather_rig_evidence(rig: Rig) -> RigEvidence:
-    """Compute all measures of a rig's quality.
-
-    Parameters
-    ----------
-    rig : Rig
-        With the points of both cameras.
-    """
+def _evidence(rig: Rig) -> _Evidence:
     pairs = (*rig.pairs, *rig.left_out)
     cameras = assess(rig.left), assess(rig.right)
-    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs, (), ())), rig.pose)
-    nan = float("nan")
+    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs)), rig.pose)
     if poses is None:
-        return RigEvidence(cameras, pairs, np.zeros(0), None, None, nan, nan, nan, nan)
+        return _Evidence(cameras, pairs, np.zeros(0))
     used = np.array([pair not in rig.left_out for pair in poses.names])
     found = contradiction(poses, used, seek_odd=False)
-    covariance = rig_covariance(poses, used, found)
-    depth, std = depth_std(rig, poses, covariance, _some_points(rig))
-    return RigEvidence(
+    depth, std = _depth_std(rig, poses, rig_covariance(poses, used, found))
+    return _Evidence(
         cameras=cameras,
         names=poses.names,
         size=poses.size,
@@ -69,15 +109,15 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
         contradiction=found,
         displacement=_displacement(poses, used),
         held_out_px=_held_out(rig, poses, used),
-        depth=_share(depth),
-        depth_share=_share(std / depth),
+        depth=_typical(depth),
+        depth_share=_typical(std / depth),
     )
 
 
-def _share(of_points: Array) -> float:
+def _typical(of_points: Array) -> float:
     """Median of the finite values; nan if there are none."""
     fine = np.isfinite(of_points)
-    return float(median(of_points[fine])) if fine.any() else float("nan")
+    return float(median(of_points[fine])) if fine.any() else np.nan
 
 
 def _moved(
@@ -110,9 +150,129 @@ def _held_out(rig: Rig, poses: RelativePoses, used: NDArray[np.bool_]) -> float:
     return rig.rmse_px * float(np.sqrt(lost.sum() / max(cost.sum(), 1e-300)))
 
 
-def _some_points(rig: Rig) -> tuple[Array, Array]:
-    """Pixels of some points in both cameras, evenly spaced over the pairs."""
+def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array, Array]:
+    """Depths of some points in the left camera [world unit], and their standard deviations for exact pixels.
+
+    `covariance` (F, F) is that of the unknowns of the relative poses. The points are evenly spaced over the
+    pairs; nan for points that are behind a camera.
+    """
     sides = rig.left.points, rig.right.points
-    rows = pair_points(*sides, ViewPairs(rig.pairs, (), ()))
+    rows = pair_points(*sides, ViewPairs(rig.pairs))
     step = max(1, len(rows.left) // _MOST_POINTS)
-    return sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
+    pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
+
+    def depths(step: Array) -> Array:
+        left, right = (_moved_camera(poses, side, step) for side in (0, 1))
+        w, tau = np.split(step[poses.rig], 2)
+        pose = Pose(rotation_step(w) @ rig.R, rig.t + tau * poses.unit)
+        found = triangulate(left, right, pose, *pixels)
+        return np.where(found.behind, np.nan, found.points[:, 2])
+
+    depth = depths(np.zeros(len(covariance)))
+    steps = np.maximum(_STEP * np.sqrt(np.abs(np.diagonal(covariance))), _LEAST_STEP)
+    J = np.stack([(depths(row) - depth) / row.max() for row in np.diag(steps)], axis=1)
+    return depth, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, covariance, J), 0.0))
+
+
+def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
+    """One camera after a step of the unknowns."""
+    state, seen = poses.problem.cameras[side], poses.problem.observations[side]
+    values = np.concatenate([state.entries[0], state.k])
+    values[poses.problem.estimated[side]] += step[poses.own[side]]
+    A = intrinsic_matrix(seen.in_pixels(values[:5]))
+    return Camera(Intrinsics.from_matrix(A), Distortion(state.model, values[5:]))
+
+
+def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
+    if not rig.converged:
+        yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
+    yield from _pairs(rig, e)
+    yield from _precision(rig, e)
+    for side, verdict in zip(("left", "right"), e.cameras, strict=True):
+        if verdict is not None:
+            # Reasons and advice come the worst first.
+            for k, reason in enumerate(verdict.reasons):
+                yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
+            for k, advice in enumerate(verdict.advice):
+                yield (1 if k else WORDS.index(verdict.word)), "", advice
+
+
+def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
+    """Findings about pairs that do not agree on one rig."""
+    if len(rig.pairs) == 1:
+        yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
+    if e.moved is not None:
+        yield _rig_moved(rig, e, e.moved)
+    odd = {
+        pair: why for pair, why in rig.left_out.items() if not (e.moved is not None and why.startswith(MOVED))
+    }
+    if odd:
+        yield (
+            _LEFT_OUT.grade(len(odd) / len(e.names)),
+            f"{describe_faults(odd, len(e.names))} and were left out",
+            "look at the views of these pairs, and take them again",
+        )
+    found = e.contradiction
+    if found is None:
+        return
+    if found.kind in ("left focal", "right focal", "late", "early"):
+        yield _changed(e, found)
+        return
+    if found.kind == "moved":
+        return
+    poor = "the relative pose of the cameras differs from pair to pair"
+    yield (
+        max(_SCATTER.grade(found.rest), _GROWTH.grade(found.growth)),
+        f"{poor}, by {found.rest:.2g} times what noise explains (rms {rig.rmse_px:.3g} px together, "
+        f"{rig.rmse_px / found.growth:.3g} px each camera alone): the target moved by about "
+        f"{e.displacement:.2g} {rig.unit} between the left and the right image, as they were not taken at "
+        "the same moment, or the cameras are not fixed to each other",
+        _MOMENT,
+    )
+
+
+def _rig_moved(rig: Rig, e: _Evidence, found: Contradiction) -> Finding:
+    used = set(rig.pairs)
+    kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
+    text, advice = describe_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
+    return _CHANGE.grade(found.gain), text, advice
+
+
+def _changed(e: _Evidence, found: Contradiction) -> Finding:
+    """Finding about a focal length that changed, or images taken at different moments."""
+    grade = _CHANGE.grade(found.gain)
+    if found.kind in ("late", "early"):
+        sense, way = {"late": ("later", "to the next"), "early": ("earlier", "back to the previous")}[
+            found.kind
+        ]
+        return (
+            grade,
+            f"the two cameras were not triggered at the same moment: the right images were taken {sense}, as "
+            f"they show the target {100 * found.amount:.2g} % of the way {way} pair's place",
+            _MOMENT,
+        )
+    side = found.kind.partition(" ")[0]
+    return (
+        grade,
+        f"the focal length of the {side} camera changed by {100 * found.amount:+.2g} % between "
+        f"{pair_name(e.names[found.at - 1])} and {pair_name(e.names[found.at])}",
+        "calibrate each part by itself, and lock zoom and focus",
+    )
+
+
+def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
+    more = "add pairs of views in which the target is near, tilted and fills both images"
+    yield (
+        _DEPTH.grade(e.depth_share),
+        f"the std of triangulated depth is {100 * e.depth_share:.2g} % of the depth",
+        more,
+    )
+    share = rig.std["baseline"] / rig.baseline if rig.baseline > 0 else np.inf
+    yield _BASELINE.grade(share), f"the std of the baseline is {100 * share:.2g} % of its length", more
+    if e.contradiction is not None and rig.rmse_px > 0:
+        yield (
+            _HELD_OUT.grade(e.held_out_px / rig.rmse_px),
+            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
+            f"{rig.rmse_px:.3g} px",
+            "add pairs of views",
+        )

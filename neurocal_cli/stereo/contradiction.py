@@ -7,7 +7,7 @@ on, or a share of the target's motion from pair to pair. The Bayesian informatio
     N log(s^2) + p log N,
 
 with N equations, p added unknowns and s^2 the sum of squares over its degrees of freedom, but at least 1,
-because smaller values arise by chance.
+because smaller values arise by chance. Pairs that contradict most others are found by least trimmed squares.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.stereo.odd_pairs import odd_pairs
+from neurocal_cli.median import median
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
 # Kass and Raftery (1995) call a difference of 10 in the criterion very strong evidence.
@@ -31,48 +31,43 @@ _LEVEL = 3.09  # standard deviations of a normal variable, exceeded by chance on
 # that merely scatter often fall into two unequal parts; test_scatter_is_not_taken_for_a_change repeats it.
 _LEFT = 0.3
 _LEAST_PAIRS = 2  # of each part; a single pair that differs is an odd one
+# The squared distance of a sound pair from the rig is a chi-squared variable of 6 degrees of freedom, whose
+# median is 5.35. Real cameras deviate from their models, so the median distance of all pairs replaces it
+# where it is larger. The limit of 60 has the probability 5e-11;
+# test_a_pair_not_taken_at_the_same_moment_is_named has pairs on both sides.
+_MEDIAN = 5.35
+_SUSPECT = 60.0
+# The distance must also exceed this multiple of the pair's equations: the pair's rms error is twice as large
+# with the rig as without it.
+_OWN_SHARE = 3.0
+_MOST_STARTS = 40
+_STEPS = 10  # most concentration steps; fewer suffice
 
 
 @frozen_dataclass(eq=False)
 class Contradiction:
     """How much the pairs contradict one rig, and why.
 
-    Attributes
-    ----------
-    kind : {"", "odd", "moved", "left focal", "right focal", "late", "early"}
-        The best explanation: pairs that contradict the others; the rig moved between two pairs; the focal
-        length of a camera changed between two pairs; the right images were taken later, or earlier, than
-        the left ones. Empty where none is needed, or none is found.
-    at : int
-        First pair after the change.
-    amount : float
-        Relative change of the focal length, or the share of the motion to the next (previous) pair.
-    degrees : int
-        Of freedom of the scatter.
-    odd : (P,) bool array
-        Pairs that contradict the others.
-    scatter : float
-        Rms of the relative poses about one rig, of all pairs but the odd ones, over what noise explains.
-    rest : float
-        The same after the explanation.
-    gain : float
-        Rms of what the explanation explains over what noise explains.
-    growth : float
-        Rms residual of the common fit over that of both cameras alone.
-    shift : (2, F) array
-        By how much the unknowns of the common fit are off before and after the change; 0 without one.
+    The best explanation is one of: pairs that contradict the others ("odd"); the rig moved between two pairs;
+    the focal length of a camera changed between two pairs; the right images were taken later ("late"), or
+    earlier, than the left ones. It is empty where none is needed, or none is found.
     """
 
-    kind: str
-    at: int
-    amount: float
-    degrees: int
-    odd: NDArray[np.bool_]
-    scatter: float
-    rest: float
-    gain: float
-    growth: float
-    shift: Array
+    kind: str  # "", "odd", "moved", "left focal", "right focal", "late", "early"
+    at: int  # first pair after the change
+    amount: float  # relative change of the focal length, or share of the motion to the next (previous) pair
+    degrees: int  # of freedom of the scatter
+    odd: NDArray[np.bool_]  # (P,) pairs that contradict the others
+    scatter: float  # rms of the relative poses of all but the odd pairs about one rig, over that of noise
+    rest: float  # the same after the explanation
+    gain: float  # rms of what the explanation explains, over that of noise
+    growth: float  # rms residual of the common fit over that of both cameras alone
+    shift: Array  # (2, F) how far off the unknowns of the common fit are before and after a change
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the pairs scatter about one rig by more than chance."""
+        return is_significant(self.scatter**2 * self.degrees, self.degrees)
 
 
 @frozen_dataclass(eq=False)
@@ -83,7 +78,6 @@ class _Explanation:
     at: int
     gain: float
     values: Array
-    columns: NDArray[np.intp]
     shift: Array
 
 
@@ -101,16 +95,10 @@ def is_significant(squares: float, degrees: int) -> bool:
 def contradiction(
     poses: RelativePoses, used: NDArray[np.bool_] | None = None, seek_odd: bool = True
 ) -> Contradiction:
-    """Explain how the relative poses of the used pairs differ.
+    """Explain how the relative poses of the used pairs (P,) differ; by default of all.
 
-    Parameters
-    ----------
-    poses : RelativePoses
-    used : (P,) bool array, optional
-        Pairs that are not known to be wrong; default all.
-    seek_odd : bool
-        Whether pairs that contradict most others are one of the explanations. Not after such pairs have been
-        left out, because some of the remaining ones would always be the oddest.
+    Pairs that contradict most others are one of the explanations, but not with `seek_odd` False, after such
+    pairs have been left out: some of the remaining ones would always be the oddest.
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
     found = _best(poses, used)
@@ -194,12 +182,13 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
     inverse = solve_scaled(S, np.eye(len(S)), ROUNDING)
     x = inverse @ g
     starts = places[_LEAST_PAIRS : len(places) - _LEAST_PAIRS + 1]
-    pairs = np.where(used[:, None, None], poses.pairs.S, 0.0), np.where(used[:, None], poses.pairs.g, 0.0)
-    after_S, after_g = (np.cumsum(block[::-1], axis=0)[::-1][starts] for block in pairs)
-    own_S, own_g = (
-        np.cumsum(block[poses.frame][::-1], axis=0)[::-1][starts]
-        for block in (poses.cameras.S, poses.cameras.g)
-    )
+
+    def from_starts(of_pairs: Array) -> Array:
+        return np.cumsum(of_pairs[::-1], axis=0)[::-1][starts]
+
+    after_S = from_starts(np.where(used[:, None, None], poses.pairs.S, 0.0))
+    after_g = from_starts(np.where(used[:, None], poses.pairs.g, 0.0))
+    own_S, own_g = (from_starts(of[poses.frame]) for of in (poses.cameras.S, poses.cameras.g))
     kinds = [("moved", poses.rig, after_S, after_g)]
     for kind, columns in zip(("left focal", "right focal"), poses.focal, strict=True):
         if len(columns) == 2:
@@ -215,9 +204,7 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
         before = follow[k] @ values[k]
         after = before.copy()
         after[columns] -= values[k]
-        yield _Explanation(
-            kind, int(starts[k]), float(gains[k]), values[k], columns, np.stack([before, after])
-        )
+        yield _Explanation(kind, int(starts[k]), float(gains[k]), values[k], np.stack([before, after]))
 
 
 def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
@@ -240,4 +227,64 @@ def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
         value = right / block
         if 0 < value < 1:
             shift = np.broadcast_to(follow * value, (2, len(follow)))
-            yield _Explanation(kind, 0, right * value, np.array([value]), np.zeros(0, dtype=np.intp), shift)
+            yield _Explanation(kind, 0, right * value, np.array([value]), shift)
+
+
+def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find the pairs that contradict most of the used ones, (P,) bool; none where there is no majority."""
+    none = np.zeros(len(poses), dtype=bool)
+    places = np.flatnonzero(used)
+    half = len(places) // 2 + 1
+    if len(places) < 3:
+        return none
+    starts = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_STARTS)).astype(int))]
+    best, lowest = none, np.inf
+    for start in starts:
+        distance, core = _concentrated(poses, places, half, _from_one(poses, start))
+        sum_of_core = float(np.sort(distance[places])[:half].sum())
+        if sum_of_core < lowest:
+            best, lowest = core, sum_of_core
+    for _ in range(_STEPS):
+        distance = _predicted(poses, best)
+        limit = _SUSPECT * max(1.0, float(median(distance[places])) / _MEDIAN)
+        odd = used & (distance > limit) & (distance > _OWN_SHARE * poses.n_equations)
+        if (best == (used & ~odd)).all():
+            break
+        best = used & ~odd
+    return odd if 2 * odd.sum() < len(places) else none
+
+
+def _from_one(poses: RelativePoses, start: int) -> Array:
+    """(P,) squared distances of all relative poses from that of one pair."""
+    apart = poses.offset - poses.offset[start]
+    together = poses.covariance + poses.covariance[start]
+    return np.asarray((apart * np.linalg.solve(together, apart[..., None])[..., 0]).sum(axis=1))
+
+
+def _concentrated(
+    poses: RelativePoses, places: NDArray[np.intp], half: int, distance: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Distances from the rig of the nearest half of the pairs, repeated until that half stays the same."""
+    core = np.zeros(len(poses), dtype=bool)
+    for _ in range(_STEPS):
+        nearest = np.zeros_like(core)
+        nearest[places[np.argsort(distance[places], kind="stable")[:half]]] = True
+        if (nearest == core).all():
+            break
+        core = nearest
+        distance = _predicted(poses, core)
+    return distance, core
+
+
+def _predicted(poses: RelativePoses, core: NDArray[np.bool_]) -> Array:
+    """(P,) squared distances from the rig of some pairs; of the others, with the uncertainty of that rig.
+
+    Few pairs determine the rig poorly, because errors of both cameras bias it. Without this uncertainty,
+    sound pairs might seem far off.
+    """
+    S, g = poses.normal(core)
+    solved = solve_scaled(S, np.column_stack([np.eye(len(S)), g]))
+    apart = poses.offset - poses.design @ solved[:, -1]
+    spread = poses.design @ solved[:, :-1] @ np.swapaxes(poses.design, 1, 2)
+    covariance = poses.covariance + np.where(core[:, None, None], 0.0, spread)
+    return np.asarray((apart * solve_scaled(covariance, apart[..., None])[..., 0]).sum(axis=1))

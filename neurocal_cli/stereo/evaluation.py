@@ -31,45 +31,24 @@ from neurocal_cli.verdict.given_points import GivenPoints, given_camera, given_e
 
 @frozen_dataclass(eq=False)
 class StereoEvaluation:
-    """Errors of two cameras at points of known position.
-
-    Attributes
-    ----------
-    unit : str
-    by_view : SpaceError
-        Triangulated with each view's own poses of the two cameras.
-    rig : SpaceError or None
-        Triangulated through one rig for all views, as for points of unknown position; None where no rig
-        fits all views.
-    baseline : float [world unit]
-        Of the rig; nan without a rig.
-    pairs : tuple of (left name, right name)
-    alone : two tuples of str
-        Views of the left and of the right camera without a pair, which are not used.
-    fitted : tuple of str
-        Views of the left camera whose poses were estimated from the same points.
-    models : (left, right) str
-        Distortion models of the cameras.
-    warnings : tuple of str
-    judgement : Verdict or callable, optional
-        The verdict, or the function that computes it; see `verdict`.
-    """
+    """Errors of two cameras at points of known position."""
 
     unit: str
-    by_view: SpaceError
+    by_view: SpaceError  # triangulated with each view's own poses of the two cameras
+    # Triangulated through one rig for all views, as for points of unknown position; None if no rig fits them.
     rig: SpaceError | None
-    baseline: float
-    pairs: tuple[tuple[str, str], ...]
-    alone: tuple[tuple[str, ...], tuple[str, ...]]
-    fitted: tuple[str, ...]
-    models: tuple[str, str]
-    warnings: tuple[str, ...] = ()
-    judgement: Verdict | Callable[[], Verdict | None] | None = None
+    baseline: float  # of the rig [world unit]; nan without a rig
+    pairs: tuple[tuple[str, str], ...]  # left and right names
+    alone: tuple[tuple[str, ...], tuple[str, ...]]  # views of each camera without a pair, which are not used
+    fitted: tuple[str, ...]  # views of the left camera whose poses were estimated from the same points
+    models: tuple[str, str]  # distortion models of the cameras
+    warnings: tuple[str, ...]
+    judgement: Callable[[], Verdict | None]  # computes the verdict
 
     @cached_property
     def verdict(self) -> Verdict | None:
         """Verdict on the rig, computed when it is first read; None without a rig with points of its own."""
-        return self.judgement() if callable(self.judgement) else self.judgement
+        return self.judgement()
 
 
 def evaluate_stereo(
@@ -97,20 +76,15 @@ def evaluate_stereo(
     DegenerateGeometryError
         Cameras at one place, or points that cannot be triangulated.
     """
-    warnings: list[str] = []
-    judgement: Verdict | Callable[[], Verdict | None] | None = None
     left, right = on_one_target(left, right)
     try:
-        rig = fit_rig(left, right)
-        warnings += rig.warnings
-        judgement = partial(assess_rig, rig)
+        rig: Rig | None = fit_rig(left, right)
+        failure = ""
     except CoincidentCamerasError:
         raise
     except DegenerateGeometryError as error:
-        rig = None
-        warnings.append(f"no rig fits all views: {error}")
-        judgement = Verdict("poor", (warnings[0],), ("calibrate both cameras together: neurocal stereo",), {})
-    return _Evaluator((left, right), rig, points, method, warnings, judgement).evaluation()
+        rig, failure = None, f"no rig fits all views: {error}"
+    return _Evaluator((left, right), rig, points, method, failure).evaluation()
 
 
 def evaluate_rig(
@@ -135,8 +109,7 @@ def evaluate_rig(
     """
     if points is None and not (len(rig.left.points) and len(rig.right.points)):
         raise InputError("the rig has no points of its own; give the points to evaluate it on")
-    judgement = partial(assess_rig, rig)
-    return _Evaluator((rig.left, rig.right), rig, points, method, list(rig.warnings), judgement).evaluation()
+    return _Evaluator((rig.left, rig.right), rig, points, method).evaluation()
 
 
 class _Evaluator:
@@ -146,36 +119,36 @@ class _Evaluator:
         rig: Rig | None,
         points: tuple[Correspondences, Correspondences] | None,
         method: str,
-        warnings: list[str],
-        judgement: Verdict | Callable[[], Verdict | None] | None,
+        failure: str = "",
     ) -> None:
-        self.judgement = judgement
-        self.cameras, self.rig, self.method, self.warnings = cameras, rig, method, warnings
-        target = cameras[0].target
+        self.cameras, self.rig, self.method, self.failure = cameras, rig, method, failure
+        self.warnings = [failure] if rig is None else list(rig.warnings)
+        self.given, target = points is not None, cameras[0].target
         if points is not None and target is not None:
             points = target.applied(points[0]), target.applied(points[1])
         self.points = points or (cameras[0].points, cameras[1].points)
-        if points is not None:
-            for camera, given in zip(cameras, points, strict=True):
+        if self.given:
+            for camera, given in zip(cameras, self.points, strict=True):
                 _refuse_other(camera, given)
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
         known = [
-            camera.views.keys() - (() if points is None else other_images(camera, some))
+            camera.views.keys() - (other_images(camera, some) if self.given else ())
             for camera, some in zip(cameras, self.points, strict=True)
         ]
         self.new = [pair for pair in self.views.both if pair[0] not in known[0] or pair[1] not in known[1]]
-        self.given = points is not None
+        self.fitted = self._fit_new() if self.new else None
 
     def evaluation(self) -> StereoEvaluation:
         """The errors of all points, through the poses of the views and through the rig."""
-        fitted = self._fit_new() if self.new else None
-        by_view = self._by_view(fitted)
-        poses = None if self.rig is None else self._poses_on(self.rig, fitted)
-        through = None if self.rig is None or poses is None else self._through_rig(self.rig, poses)
-        judgement = self.judgement
-        if self.given and self.rig is not None and poses is not None:
-            judgement = partial(self._judged, self.rig, poses, fitted)
+        rig, by_view, through = self.rig, self._by_view(), None
+        judgement: Callable[[], Verdict | None] = self._judgement
+        if rig is not None:
+            poses, used = self._poses_on(rig), self._used(rig)
+            # None if all views contradict the rig.
+            through = self._error(poses, [rig.pose], used) if used.any() else None
+            if self.given:
+                judgement = partial(self._judged, rig, poses)
         for error in (by_view, through):
             if error is not None and error.n_behind:
                 self.warnings.append(
@@ -186,7 +159,7 @@ class _Evaluator:
             self.points[0].unit,
             by_view,
             through,
-            float("nan") if self.rig is None else self.rig.baseline,
+            float("nan") if rig is None else rig.baseline,
             self.views.both,
             (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
@@ -194,6 +167,13 @@ class _Evaluator:
             tuple(self.warnings),
             judgement,
         )
+
+    def _judgement(self) -> Verdict | None:
+        """The verdict on the rig by its own points."""
+        if self.rig is not None:
+            return assess_rig(self.rig)
+        advice = ("calibrate both cameras together: neurocal stereo",)
+        return Verdict("poor", (self.failure,), advice, {})
 
     def _fit_new(self) -> tuple[Calibration, Calibration]:
         """Poses of the new views in each camera alone (type 3)."""
@@ -203,54 +183,39 @@ class _Evaluator:
         for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
             names = {pair[side] for pair in self.new}
             rows = np.array([name in names for name in points.view_names])[points.view_index]
-            fit = calibrate(
-                points.select(rows),
-                type=3,
-                intrinsics=camera,
-                seed=camera.seed,
-                outliers="keep",
-                target="given",
-            )
+            new, seed = points.select(rows), camera.seed
+            fit = calibrate(new, type=3, intrinsics=camera, seed=seed, outliers="keep", target="given")
             self.warnings += [f"fitting the poses of new views: {text}" for text in fit.warnings]
             if not fit.converged:
                 self.warnings.append(f"the poses of new views did not converge: {fit.stop_reason}")
             fits.append(fit)
         return fits[0], fits[1]
 
-    def _by_view(self, fitted: tuple[Calibration, Calibration] | None) -> SpaceError:
+    def _by_view(self) -> SpaceError:
         """Errors with the two poses of each view."""
-        new = set(self.new)
-        poses = []
+        first, rigs, new = [], [], set(self.new)
         for pair in self.views.both:
-            source = fitted if fitted is not None and pair in new else self.cameras
-            poses.append([source[side].views[pair[side]].pose for side in (0, 1)])
-        rigs = []
-        for first, second in poses:
-            R = second.R @ first.R.T
-            rigs.append(Pose.exact(R, second.t - R @ first.t))
-        return self._error([first for first, _ in poses], rigs, np.ones(len(poses), dtype=bool))
+            source = self.fitted if self.fitted is not None and pair in new else self.cameras
+            left, right = (source[side].views[pair[side]].pose for side in (0, 1))
+            R = right.R @ left.R.T
+            first.append(left)
+            rigs.append(Pose.exact(R, right.t - R @ left.t))
+        return self._error(first, rigs, np.ones(len(first), dtype=bool))
 
-    def _poses_on(self, rig: Rig, fitted: tuple[Calibration, Calibration] | None) -> list[Pose]:
+    def _poses_on(self, rig: Rig) -> list[Pose]:
         """The pose of each view in the left camera that fits both cameras best."""
         poses = {name: view.pose for name, view in rig.left.views.items()}
-        if fitted is not None:
-            poses.update(poses_on_rig(rig.pose, fitted, ViewPairs(tuple(self.new), (), ())))
+        if self.fitted is not None:
+            poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
         return [poses[a] for a, _ in self.views.both]
 
     def _used(self, rig: Rig) -> NDArray[np.bool_]:
         """(V,) which views do not contradict the rig."""
         return np.array([pair not in rig.left_out for pair in self.views.both])
 
-    def _through_rig(self, rig: Rig, poses: list[Pose]) -> SpaceError | None:
-        """Errors through one rig; None if all views contradict it."""
-        used = self._used(rig)
-        return self._error(poses, [rig.pose], used) if used.any() else None
-
-    def _judged(
-        self, rig: Rig, poses: list[Pose], fitted: tuple[Calibration, Calibration] | None
-    ) -> Verdict | None:
+    def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""
-        verdict = self.judgement() if callable(self.judgement) else self.judgement
+        verdict = self._judgement()
         if verdict is None or not len(rig.left.points):
             return verdict
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
@@ -259,10 +224,10 @@ class _Evaluator:
         given = GivenPoints(rmse_px, len(residuals), len(residuals) - seen.size)
         same = "rig, with both cameras as they were"
         findings = [given_error(verdict, rig.rmse_px, rig.left.points, given, same)]
-        sides = zip(("left", "right"), self.cameras, fitted or (None, None), strict=True)
-        for side, camera, fit in sides:
+        fits = self.fitted or (None, None)
+        for side, camera, fit in zip(("left", "right"), self.cameras, fits, strict=True):
             findings += [
-                (n, f"{side} camera: {text}", advice) for n, text, advice in given_camera(camera, fit)
+                (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(camera, fit)
             ]
         return with_findings(verdict, findings)
 

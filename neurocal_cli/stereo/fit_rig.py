@@ -11,18 +11,21 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.stereo.adjust import RigFit, adjust_rig
+from neurocal_cli.stereo.adjust import RigFit, RigProblem, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
-from neurocal_cli.stereo.contradiction import contradiction, is_significant
-from neurocal_cli.stereo.open_covariance import covariance_of_stretch
-from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
+from neurocal_cli.stereo.contradiction import contradiction
+from neurocal_cli.stereo.covariance import (
+    covariance_of_stretch,
+    not_smaller,
+    rig_covariance,
+    with_target_uncertainty,
+)
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
-from neurocal_cli.stereo.problem import RigProblem, free_parameters, rig_problem
+from neurocal_cli.stereo.problem import free_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import relative_poses
 from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import sound_pairs
-from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
 # Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
 # refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
@@ -73,11 +76,11 @@ def fit_rig(
     pair_points(left.points, right.points, views)
     sound = sound_pairs(left, right, views)
     if sound.left_out and outliers == "keep":
-        raise DegenerateGeometryError(sound.contradiction(len(views.both), outliers))
+        raise DegenerateGeometryError(sound.contradiction(outliers))
     problem = sound.problem
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
-        problem = rig_problem(left, right, ViewPairs(kept, (), ()))
+        problem = rig_problem(left, right, ViewPairs(kept))
     fit, warnings = _adjusted(problem, sound.rig, refine_cameras)
     least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:
@@ -92,7 +95,7 @@ def fit_rig(
     rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched[1])
     _refuse_one_place(rig)
     if sound.left_out:
-        warnings.insert(0, sound.contradiction(len(views.both)))
+        warnings.insert(0, sound.contradiction())
     return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
 
 
@@ -116,7 +119,12 @@ def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[R
             return fit, warnings
         for side in not_monotonic:
             moving[side] = False
-            warnings.append(_kept_warning(("left", "right")[side]))
+            warnings.append(
+                f"after the common bundle adjustment the distortion model of the {('left', 'right')[side]} "
+                "camera is not monotonic (maps two directions to one pixel) inside the image, where there "
+                "are no points; the result of its own views is kept; add views that show the board in the "
+                "image's corners"
+            )
 
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
@@ -125,23 +133,15 @@ def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None
-    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.frames.unit))
+    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.unit))
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
     found = contradiction(poses, used, seek_odd=False)
-    if not held and not is_significant(found.scatter**2 * found.degrees, found.degrees):
+    if not held and not found.is_significant:
         return None
     moved = fit.free[estimated]
     return rig_covariance(poses, used, found)[np.ix_(moved, moved)]
-
-
-def _kept_warning(name: str) -> str:
-    return (
-        f"after the common bundle adjustment the distortion model of the {name} camera is not monotonic "
-        "(maps two directions to one pixel) inside the image, where there are no points; the result of its "
-        "own views is kept; add views that show the board in the image's corners"
-    )
 
 
 def _refuse_one_place(rig: Rig) -> None:
@@ -149,8 +149,7 @@ def _refuse_one_place(rig: Rig) -> None:
         return
     raise CoincidentCamerasError(
         f"both cameras are at the same place: the baseline is {rig.baseline:.3g} +- "
-        f"{rig.std['baseline']:.2g} "
-        f"{rig.unit}; give the points (or calibrations) of two different cameras"
+        f"{rig.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two different cameras"
     )
 
 
@@ -166,24 +165,12 @@ def _swapped(rig: Rig) -> tuple[str, ...]:
 
 
 def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: ViewPairs) -> dict[str, Pose]:
-    """Poses of views in the left camera's frame that fit both cameras of a known rig best.
+    """Poses of views in the left camera's frame that fit both cameras of a known rig best, by its names.
 
-    Parameters
-    ----------
-    rig : Pose
-    cameras : two of Calibration
-        With the poses of the views in each camera alone.
-    views : ViewPairs
-
-    Returns
-    -------
-    poses : dict of Pose by the left camera's view name
+    The cameras have the poses of the views in each camera alone.
     """
     problem = rig_problem(*cameras, views)
     start = problem.start(rig)
     state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
-    frames = problem.frames
-    return {
-        name: Pose(state.view_R[k], state.view_t[k] * frames.scale[k] - state.view_R[k] @ frames.centre[k])
-        for k, name in enumerate(problem.names[0])
-    }
+    R, t = problem.world_poses(state, side=0)
+    return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}

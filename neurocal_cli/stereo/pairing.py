@@ -32,44 +32,26 @@ _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as
 
 @frozen_dataclass
 class ViewPairs:
-    """Names of paired and of single views.
+    """Names of paired and of single views."""
 
-    Attributes
-    ----------
-    both : tuple of (left name, right name)
-        In the order of the left camera.
-    left_only, right_only : tuple of str
-    """
-
-    both: tuple[tuple[str, str], ...]
-    left_only: tuple[str, ...]
-    right_only: tuple[str, ...]
+    both: tuple[tuple[str, str], ...]  # left and right, in the order of the left camera
+    left_only: tuple[str, ...] = ()
+    right_only: tuple[str, ...] = ()
 
 
 @frozen_dataclass(eq=False)
 class Pairs:
-    """Points of both cameras.
-
-    Attributes
-    ----------
-    left, right : (N,) int arrays
-        Rows of each camera's points.
-    view : (N,) int array
-        Number of the pair of views of each, sorted.
-    """
+    """Points of both cameras: rows of each camera's points (N,), and the pair of views of each."""
 
     left: NDArray[np.intp]
     right: NDArray[np.intp]
-    view: NDArray[np.intp]
+    view: NDArray[np.intp]  # (N,) number of the pair, sorted
 
 
 def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     """Pair the names of two cameras' views.
 
-    Raises
-    ------
-    InputError
-        No view, no pair, ambiguous names, or names that show that the cameras are swapped.
+    Errors are no view, no pair, ambiguous names, and names that show that the cameras are swapped.
     """
     for side, names in (("left", left), ("right", right)):
         if not names:
@@ -131,10 +113,7 @@ def _listed(names: Sequence[str]) -> str:
 def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs) -> Pairs:
     """Pair the points of paired views.
 
-    Raises
-    ------
-    InputError
-        Different units, no common point, ids of different places, or several points at one place.
+    Errors are different units, no common point, ids of different places, and several points at one place.
     """
     if left.unit != right.unit:
         raise InputError(

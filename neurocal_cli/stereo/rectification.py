@@ -22,43 +22,20 @@ _WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
 
 @frozen_dataclass(eq=False)
 class Rectification:
-    """Rectified cameras.
+    """Rectified cameras."""
 
-    Attributes
-    ----------
-    R1, R2 : (3, 3) arrays
-        From each camera's frame to its rectified one.
-    P1, P2 : (3, 4) arrays
-        Projections from the left rectified frame into both rectified images.
-    Q : (4, 4) array
-        (u, v, disparity, 1) in the left image to homogeneous points in the left rectified frame.
-    """
-
-    R1: Array
+    R1: Array  # (3, 3) from each camera's frame to its rectified one
     R2: Array
-    P1: Array
+    P1: Array  # (3, 4) projections from the left rectified frame into both rectified images
     P2: Array
-    Q: Array
+    Q: Array  # (4, 4) (u, v, disparity, 1) of the left image to homogeneous points in its rectified frame
 
 
 def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
-    """Rectify a rig.
+    """Rectify a rig; None where the image sizes are unknown or differ.
 
-    Parameters
-    ----------
-    rig : Rig
-    alpha : float, optional
-        Scale of the rectified images. 0: all their pixels are valid. 1: they contain all pixels of the
-        original images. Values in between interpolate; None does not scale.
-
-    Returns
-    -------
-    Rectification, or None where the image sizes are unknown or differ.
-
-    Raises
-    ------
-    UsageError
-        alpha is not between 0 and 1.
+    The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
+    pixels of the original images, and values in between interpolate. With None nothing is scaled.
     """
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")
@@ -70,13 +47,13 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
     axis = 0 if abs(t[0]) > abs(t[1]) else 1
     turn = _shortest_turn(t, np.eye(3)[axis] * (1.0 if t[axis] > 0 else -1.0))
     rotations = turn @ half, turn @ half.T
-    cameras = rig.left, rig.right
+    cameras = [(rig.left, rotations[0]), (rig.right, rotations[1])]
     along = float((rotations[1] @ rig.t)[axis])
-    f = 0.5 * float(sum(plane_like(camera.camera).A[1 - axis, 1 - axis] for camera in cameras))
-    centres = [_centre(camera, R, f, size) for camera, R in zip(cameras, rotations, strict=True)]
+    f = 0.5 * float(sum(plane_like(camera.camera).A[1 - axis, 1 - axis] for camera, _ in cameras))
+    centres = [_centre(camera, R, f, size) for camera, R in cameras]
     centre = 0.5 * (centres[0] + centres[1])  # one for both: disparity 0 at infinity
     if alpha is not None:
-        f *= _scale(list(zip(cameras, rotations, strict=True)), f, centre, size, alpha)
+        f *= _scale(cameras, f, centre, size, alpha)
     P1 = np.array([[f, 0.0, centre[0], 0.0], [0.0, f, centre[1], 0.0], [0.0, 0.0, 1.0, 0.0]])
     P2 = P1.copy()
     P2[axis, 3] = f * along
@@ -93,9 +70,9 @@ def _shortest_turn(a: Array, b: Array) -> Array:
 
 
 def _rectified(camera: Calibration, R: Array, pixels: Array) -> Array:
-    """Normalised rectified points of pixels, (N, 2); nan where the distortion does not reach a pixel.
+    """Normalised rectified points of pixels, (N, 2).
 
-    And where its ray is behind the rectified image plane.
+    nan where the distortion does not reach a pixel, and where its ray is behind the rectified image plane.
     """
     rays = camera.camera.unproject(pixels) @ R.T
     with np.errstate(invalid="ignore", divide="ignore"):

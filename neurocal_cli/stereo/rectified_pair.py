@@ -1,10 +1,12 @@
-"""The two rectified cameras of a rig, points converted to them, and the error of corresponding rows."""
+"""The two rectified cameras of a rig: points converted to them, the error of their rows, and pictures."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
@@ -19,28 +21,19 @@ from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
 _ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
+_LINES = 16  # over the images
+_COLOURS = ((255, 80, 60), (60, 200, 255), (120, 255, 120), (255, 220, 60))
 
 
 @frozen_dataclass(eq=False)
 class RectifiedPair:
-    """The rectified cameras of a rig.
-
-    Attributes
-    ----------
-    matrices : Rectification
-    originals, cameras : two of Camera
-        As they are, and without distortion in the frames of R1 and R2.
-    rotations : two of (3, 3) array
-        From each camera's frame to that of its rectified one.
-    axis : int
-        0: the cameras stand beside each other, and rows correspond; 1: above each other, and columns do.
-    """
+    """The rectified cameras of a rig."""
 
     matrices: Rectification
     originals: tuple[Camera, Camera]
-    cameras: tuple[Camera, Camera]
-    rotations: tuple[Array, Array]
-    axis: int
+    cameras: tuple[Camera, Camera]  # without distortion, in the frames of R1 and R2
+    rotations: tuple[Array, Array]  # R1 and R2, (3, 3) each
+    axis: int  # 0: the cameras stand beside each other, and rows correspond; 1: above each other, and columns
 
 
 @frozen_dataclass
@@ -54,19 +47,7 @@ class RowError:
 
 
 def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
-    """Rectify the cameras of a rig.
-
-    Parameters
-    ----------
-    rig : Rig
-    alpha : float, optional
-        See `rectification.rectify`.
-
-    Raises
-    ------
-    InputError
-        Images of unknown or of different sizes.
-    """
+    """Rectify the cameras of a rig, whose images must have one known size; see `rectification.rectify`."""
     matrices = rectify(rig, alpha)
     if matrices is None:
         raise InputError(
@@ -85,12 +66,8 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
 def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
     """Convert points of one camera, 0 left or 1 right, to its rectified camera.
 
-    Points of a wide lens behind the rectified image plane are left out.
-
-    Raises
-    ------
-    InputError
-        Another image size; a pixel that the distortion does not reach.
+    Points of a wide lens behind the rectified image plane are left out. Another image size and a pixel that
+    the distortion does not reach are errors.
     """
     size = pair.cameras[side].image_size
     if points.image_size not in (None, size):
@@ -106,16 +83,8 @@ def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> C
 def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences) -> RowError:
     """Distance of the rows (columns, for cameras above each other) of the same points, rectified.
 
-    Parameters
-    ----------
-    pair : RectifiedPair
-    left, right : Correspondences
-        As `rectify_points` returns them. Mid-points that were measured only along the row are left out.
-
-    Raises
-    ------
-    InputError
-        No point is in both.
+    The points are those that `rectify_points` returns; some must be in both. Mid-points that were measured
+    only along the row are left out.
     """
     common = pair_points(left, right, pair_views(left.view_names, right.view_names))
     across = 1 - pair.axis
@@ -141,3 +110,27 @@ def row_error_of_rig(rig: Rig, pair: RectifiedPair) -> RowError | None:
         own = np.isin(np.array(points.view_names)[points.view_index], names)
         moved.append(rectify_points(pair, side, points.select(own)))
     return row_error(pair, moved[0], moved[1])
+
+
+def pair_picture(left: NDArray[Any], right: NDArray[Any], axis: int) -> NDArray[np.uint8]:
+    """Put two rectified images of one size together, with lines along which corresponding points lie.
+
+    The images are (height, width) or (height, width, 3), uint8 or uint16. They are beside each other for the
+    axis 0 and above each other for 1. The picture is (height, width, 3): red, green, blue.
+    """
+    whole = np.concatenate([_colours(left), _colours(right)], axis=1 - axis)
+    across = whole.shape[axis]
+    width = max(1, across // 500)
+    for k in range(_LINES):
+        place = round((k + 0.5) * across / _LINES)
+        line = slice(place - width // 2, place - width // 2 + width)
+        whole[line if axis == 0 else (slice(None), line)] = _COLOURS[k % len(_COLOURS)]
+    return whole
+
+
+def _colours(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """8 bits of red, green and blue."""
+    pixels = image if image.dtype == np.uint8 else image >> 8
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
+    return np.array(pixels, dtype=np.uint8)

@@ -29,7 +29,7 @@ from neurocal_cli.geometry import Array, cross_matrix, rotation_vector
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.adjust import RigProblem
 
 _POSE = np.arange(POSE.start, POSE.stop)
 _MUCH_LARGER = 2.0  # ratio of a view's variance to that of all; 50 equations reach it once in 10 million
@@ -42,63 +42,31 @@ class RelativePoses:
 
     The F unknowns are the free parameters of the left camera, those of the right one, and the step of the
     rig: rotation [rad] and translation [`unit`].
-
-    Attributes
-    ----------
-    problem : RigProblem
-    names : tuple of (left name, right name)
-    cameras : Quadratics
-        Information of each frame's views about the cameras alone, V groups.
-    pairs : Quadratics
-        Term that each pair adds: the cost of the common fit beyond that of the cameras alone, P groups.
-    frame : (P,) int array
-        Frame of each pair.
-    own : two of (f,) int arrays
-        Columns of the left and of the right camera's parameters.
-    rig : (6,) int array
-        Columns of the rig's step.
-    focal : two of (0, 1 or 2) int arrays
-        Columns of alpha_u and alpha_v of each camera, if they are free.
-    offset : (P, 6) array
-        z.
-    design : (P, 6, F) array
-        Of z by the unknowns.
-    covariance : (P, 6, 6) array
-        C.
-    size : (P,) array
-        Of each target [world unit].
-    centre : (P, 3) array
-        Of each target, in the left camera's directions turned by the rig.
-    motion : (P, 2, 6) array
-        Steps of the relative pose if the right image showed the next, or the previous, pair's pose; nan at
-        the ends.
-    n_equations : (P,) array
-        Equations of both views of each pair.
-    spare : float
-        Equations of both cameras alone less their unknowns.
     """
 
     problem: RigProblem
-    names: tuple[tuple[str, str], ...]
-    cameras: Quadratics
-    pairs: Quadratics
-    frame: NDArray[np.intp]
-    own: tuple[NDArray[np.intp], NDArray[np.intp]]
-    rig: NDArray[np.intp]
-    focal: tuple[NDArray[np.intp], NDArray[np.intp]]
-    offset: Array
-    design: Array
-    covariance: Array
-    size: Array
-    centre: Array
+    names: tuple[tuple[str, str], ...]  # left and right name of each pair
+    cameras: Quadratics  # information of each frame's views about the cameras alone, V groups
+    pairs: Quadratics  # the cost of the common fit beyond that of the cameras alone, P groups
+    frame: NDArray[np.intp]  # (P,) of each pair
+    own: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of the left and the right camera's parameters
+    rig: NDArray[np.intp]  # (6,) columns of the rig's step
+    focal: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of alpha_u and alpha_v, if they are free
+    offset: Array  # (P, 6) z
+    design: Array  # (P, 6, F) of z by the unknowns
+    covariance: Array  # (P, 6, 6) C
+    size: Array  # (P,) of each target [world unit]
+    centre: Array  # (P, 3) of each target, in the left camera's directions turned by the rig
+    # (P, 2, 6) steps of the relative pose if the right image showed the next, or the previous, pair's pose;
+    # nan at the ends.
     motion: Array
-    n_equations: Array
-    spare: float
+    n_equations: Array  # (P,) of both views of each pair
+    spare: float  # equations of both cameras alone less their unknowns
 
     @property
     def unit(self) -> float:
         """Unit of the rig's translation [world unit]."""
-        return self.problem.frames.unit
+        return self.problem.unit
 
     def __len__(self) -> int:
         return len(self.names)
@@ -115,19 +83,10 @@ class RelativePoses:
 
 
 def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None:
-    """Relative poses of all pairs of a problem.
+    """Relative poses of all pairs of a problem; None if a view does not determine its pose.
 
-    Parameters
-    ----------
-    problem : RigProblem
-        The cameras need not be at their own minimum; one step leads there.
-    reference : Pose
-        A rig near those of most pairs.
-
-    Returns
-    -------
-    RelativePoses or None
-        None if a view does not determine its pose.
+    The cameras need not be at their own minimum; one step leads there. `reference` is a rig near those of
+    most pairs.
     """
     sides = [_Alone(problem, side) for side in (0, 1)]
     if not all(side.determined for side in sides):
@@ -136,12 +95,13 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     place = {pair: k for k, pair in enumerate(problem.pairs)}
     order = np.array([place[pair] for pair in names], dtype=np.intp)
     first, second = problem.paired[order], problem.paired_right[order]
-    frames, (left, right) = problem.frames, problem.cameras
-    scale = frames.scale[first] / frames.unit
+    left, right = problem.cameras
+    size = problem.scale[first]
+    scale = size / problem.unit
     R = right.R[second] @ np.swapaxes(left.R[first], 1, 2)
     centre = (R @ left.t[first][..., None])[..., 0]
     t = scale[:, None] * (right.t[second] - centre)
-    offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / frames.unit], axis=1)
+    offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / problem.unit], axis=1)
     # A step of the right view's pose is by_rig times one of the rig plus by_pose times one of the left view.
     by_rig, by_pose = np.zeros((len(order), 6, 6)), np.zeros((len(order), 6, 6))
     by_rig[:, :3, :3] = np.eye(3)
@@ -166,11 +126,11 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     weighted = np.swapaxes(design, 1, 2) @ weight
     cost = np.einsum("pi,pij,pj->p", offset, weight, offset)
     pairs = Quadratics(weighted @ design, (weighted @ offset[..., None])[..., 0], cost)
-    counts = [_equations(problem, side) for side in (0, 1)]
+    counts = [observed.equations_by_view for observed in problem.observations]
     return RelativePoses(
         problem, tuple(names), _both(problem, sides, places, len(columns)), pairs, first, places, rig,
         (places[0][sides[0].focal], places[1][sides[1].focal]), offset, design, covariance,
-        frames.scale[first], centre * scale[:, None],
+        size, centre * scale[:, None],
         _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
         counts[0][first] + counts[1][second],
         sum(side.spare for side in sides),
@@ -191,7 +151,7 @@ class _Alone:
         variance = least / self.spare
         self.follow, self.step = solved[..., :-1], solved[..., -1]
         own = np.linalg.pinv(normal[:, _POSE[:, None], _POSE], hermitian=True)
-        larger = cost / (variance * np.maximum(_equations(problem, side) - len(_POSE), 1.0))
+        larger = cost / (variance * np.maximum(observed.equations_by_view - len(_POSE), 1.0))
         # A view with a much larger error, for example of a board that bends, is more uncertain accordingly.
         times = np.where(larger > _MUCH_LARGER, larger, 1.0)[:, None, None]
         self.covariance = np.asarray(times * variance * own, dtype=float)
@@ -204,7 +164,7 @@ def _both(
     problem: RigProblem, sides: Sequence[_Alone], places: Sequence[NDArray[np.intp]], width: int
 ) -> Quadratics:
     """Information of the views of both cameras about the cameras, by frame."""
-    n = len(problem.frames.scale)
+    n = len(problem.scale)
     S, g, cost = np.zeros((n, width, width)), np.zeros((n, width)), np.zeros(n)
     for side, place in enumerate(places):
         view, own = problem.observations[side].view, sides[side].quadratics
@@ -216,13 +176,6 @@ def _both(
 
 def _transformed(J: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
-
-
-def _equations(problem: RigProblem, side: int) -> Array:
-    """Equations of each view of one camera."""
-    observed = problem.observations[side]
-    counts = observed.batches.counts
-    return np.asarray(counts * (observed.n_equations / counts.sum()))
 
 
 def _motion(R: Array, t: Array, scale: Array, of_right: Array) -> Array:

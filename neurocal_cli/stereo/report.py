@@ -24,11 +24,9 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[st
     """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit
     ways, heads = [evaluation.by_view], ["poses of each view"]
-    if evaluation.rig is not None and math.isclose(
-        evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4
-    ):
-        ways, heads = [evaluation.rig], ["one rig"]  # both are equal for a rig or a single view
-    elif evaluation.rig is not None:
+    if evaluation.rig is not None:
+        if math.isclose(evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4):
+            ways, heads = [], []  # both are equal for a rig or a single view
         ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
     overall = [[f"[{unit}]", *heads]]
     for label, name in (
@@ -46,9 +44,8 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[st
     overall.append(["points", *(str(way.n_points) for way in ways)])
     for side, model in zip(("left", "right"), evaluation.models, strict=True):
         overall.append([f"{side} distortion model", model, *([""] * (len(ways) - 1))])
-    last = ways[-1]
     depths = [[f"depth [{unit}]", "points", f"rms [{unit}]", "rms / depth"]]
-    for part in last.depths:
+    for part in ways[-1].depths:
         span = f"{_figure(part.nearest)} - {_figure(part.farthest)}"
         depths.append([span, str(part.n_points), _figure(part.rmse), _share(part.relative)])
     views = [["view", "points", *(f"{head} [{unit}]" for head in heads)]]
@@ -108,8 +105,8 @@ def _share(value: float) -> str:
 
 def rig_report(rig: Rig) -> str:
     """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
-    blocks = [[_headline(rig)], align(camera_rows(rig)), align(rig_rows(rig)), _view_lines(rig)]
-    blocks.append(_fit_lines(rig))
+    tables = align(camera_rows(rig)), align(rig_rows(rig)), _view_lines(rig)
+    blocks = [[_headline(rig)], *tables, _fit_lines(rig)]
     if rig.verdict is not None:
         blocks.append(verdict_lines(rig.verdict))
     return "\n\n".join("\n".join(block) for block in blocks if block)
@@ -117,7 +114,6 @@ def rig_report(rig: Rig) -> str:
 
 def rig_json(rig: Rig) -> dict[str, Any]:
     """The summary of a rig as JSON values; None for numbers that do not exist."""
-    values = zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True)
     return {
         "left": calibration_json(rig.left),
         "right": calibration_json(rig.right),
@@ -126,7 +122,8 @@ def rig_json(rig: Rig) -> dict[str, Any]:
         "t": rig.t.tolist(),
         "baseline": rig.baseline,
         "parameters": {
-            name: {"value": value, "std": number_or_none(rig.std[name])} for name, value in values
+            name: {"value": value, "std": number_or_none(rig.std[name])}
+            for name, value in _pose_values(rig).items()
         },
         "baseline_std": number_or_none(rig.std["baseline"]),
         "rmse_px": number_or_none(rig.rmse_px),
@@ -161,64 +158,53 @@ def camera_rows(rig: Rig) -> list[list[str]]:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
     rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
-    models = [coefficient_names(camera.distortion_model) for camera in (rig.left, rig.right)]
-    longest = max(models, key=len)
-    for name in (
-        *INTRINSIC_NAMES,
-        *longest,
-        *(n for names in models for n in names if n not in longest),
-    ):
-        unit = {"theta": " [rad]"}.get(name, " [px]" if name in INTRINSIC_NAMES else "")
-        row = [name + unit]
-        for camera, names in zip((rig.left, rig.right), models, strict=True):
-            if name in INTRINSIC_NAMES:
-                row += _estimate(float(getattr(camera.intrinsics, name)), name, camera)
-            elif name in names:
-                row += _estimate(float(camera.distortion[names.index(name)]), name, camera)
-            else:
-                row += ["", ""]
-        rows.append(row)
+    cells = [_estimates(camera) for camera in (rig.left, rig.right)]
+    for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
+        unit = " [rad]" if name == "theta" else " [px]" if name in INTRINSIC_NAMES else ""
+        rows.append([name + unit, *cells[0].get(name, ("", "")), *cells[1].get(name, ("", ""))])
     return rows
 
 
-def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
-    return (
-        [f"{value:.7g}", "fixed"]
-        if name in camera.fixed
-        else [*rounded(value, camera.std.get(name, math.nan))]
-    )
+def _estimates(camera: Calibration) -> dict[str, tuple[str, str]]:
+    """Value and standard deviation of each parameter."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(camera.distortion_model))
+    values = [*camera.intrinsics.values().tolist(), *camera.distortion.tolist()]
+    found = {}
+    for name, value in zip(names, values, strict=True):
+        known = name in camera.fixed
+        found[name] = (f"{value:.7g}", "fixed") if known else rounded(value, camera.std.get(name, math.nan))
+    return found
 
 
 def rig_rows(rig: Rig) -> list[list[str]]:
     """Rows of the pose of the right camera and the baseline, with their standard deviations."""
     rows = [["X_right = R X_left + t", "value", "std"]]
-    for name, value in zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True):
+    for name, value in _pose_values(rig).items():
         unit = "rad" if name.startswith("R") else printable(rig.unit)
         rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
     rows.append([f"baseline [{printable(rig.unit)}]", *rounded(rig.baseline, rig.std["baseline"])])
     return rows
 
 
+def _pose_values(rig: Rig) -> dict[str, float]:
+    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
+
+
 def _view_lines(rig: Rig) -> list[str]:
     """Errors of both cameras in each pair of views, or in the worst ones if there are many."""
     if len(rig.pairs) == 1:
         return []
-    rows = []
-    for a, b in rig.pairs:
-        left, right = rig.left.views[a], rig.right.views[b]
-        cells = [printable(a if a == b else f"{a} / {b}")]
-        for view in (left, right):
-            cells += [str(view.n_points), _figure(view.rmse_px)]
-        rows.append((max(left.rmse_px, right.rmse_px), cells))
-    hidden = len(rows) - _MOST_VIEWS
-    if hidden > 0:
-        rows = sorted(rows, key=lambda row: -row[0])[:_MOST_VIEWS]
-    lines = align(
-        [["view", "left points", "rms [px]", "right points", "rms [px]"], *(row for _, row in rows)]
-    )
-    return lines + [f"the {_MOST_VIEWS} pairs with the largest error, of {len(rig.pairs)} pairs"] * (
-        hidden > 0
-    )
+    shown = [((a, b), (rig.left.views[a], rig.right.views[b])) for a, b in rig.pairs]
+    if len(rig.pairs) > _MOST_VIEWS:
+        shown = sorted(shown, key=lambda row: -max(view.rmse_px for view in row[1]))[:_MOST_VIEWS]
+    rows = [["view", "left points", "rms [px]", "right points", "rms [px]"]]
+    for (a, b), views in shown:
+        cells = [cell for view in views for cell in (str(view.n_points), _figure(view.rmse_px))]
+        rows.append([printable(a if a == b else f"{a} / {b}"), *cells])
+    lines = align(rows)
+    if len(rig.pairs) > _MOST_VIEWS:
+        lines.append(f"the {_MOST_VIEWS} pairs with the largest error, of {len(rig.pairs)} pairs")
+    return lines
 
 
 def _fit_lines(rig: Rig) -> list[str]:
@@ -230,8 +216,10 @@ def _fit_lines(rig: Rig) -> list[str]:
                 f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
                 f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
             )
-    lines.append(f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
-                 f"{plural(rig.iterations, 'iteration')}")  # fmt: skip
+    lines.append(
+        f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+        f"{plural(rig.iterations, 'iteration')}"
+    )
     return [*lines, *_beside_alone(rig), rig.stop_reason]
 
 

@@ -15,7 +15,6 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     pose_std,
     with_scale,
 )
-from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, residuals
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
@@ -27,10 +26,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
-from neurocal_cli.stereo.adjust import RigFit
-from neurocal_cli.stereo.open_covariance import covariance_of_choice
-from neurocal_cli.stereo.pair_covariance import not_smaller
-from neurocal_cli.stereo.reprojection import Observations, rig_jacobian
+from neurocal_cli.stereo.adjust import Observations, RigFit
+from neurocal_cli.stereo.covariance import covariance_of_choice, not_smaller
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
 
@@ -45,43 +42,27 @@ def assemble_rig(
 ) -> Rig:
     """Convert an adjusted rig to the user's units.
 
-    Parameters
-    ----------
-    fit : RigFit
-    left_out : dict of str by (left name, right name)
-    least : (f, f) array, optional
-        Lower bound of the covariance of the free shared parameters, normalised.
-    stretched : (f, f) array, optional
-        Covariance to add because the print may be stretched.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the parameters.
+    `least` (f, f) is a lower bound of the covariance of the free shared parameters, normalised. `stretched`
+    is the covariance to add to it because the print may be stretched. Points that do not determine the
+    parameters are an error.
     """
     return _RigAssembly(fit, least, stretched).rig(left_out)
 
 
 def non_monotonic_sides(fit: RigFit) -> list[int]:
     """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
-    problem, state = fit.problem, fit.state
-    found = []
-    for side, own in enumerate(state.columns.cameras):
-        camera, observed, given = state.cameras[side], problem.observations[side], problem.calibrations[side]
-        estimated = fit.free[own]
-        if not estimated.any():
-            continue
-        A = _intrinsics(given, camera, observed, estimated[:5]).A if estimated[:5].any() else given.K
-        if where_not_monotonic(camera.distortion, A, given.points) is not None:
-            found.append(side)
-    return found
+    return [
+        side
+        for side, (camera, given) in enumerate(zip(fit.state.cameras, fit.problem.calibrations, strict=True))
+        if fit.free[fit.state.columns.cameras[side]].any()
+        and where_not_monotonic(camera.distortion, _intrinsics(fit, side).A, given.points) is not None
+    ]
 
 
 class _RigAssembly:
     def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
-        self.fit, self.problem, self.calibrations = fit, fit.problem, fit.problem.calibrations
-        self.state, self.columns = fit.state, fit.state.columns
-        self.scale_std = scale_of(self.calibrations[0].points).std
+        self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
+        self.scale_std = scale_of(self.problem.calibrations[0].points).std
         self.shared = np.flatnonzero(fit.free)
         inverse = schur_covariance(fit.normal, self.shared, self.columns.pose)
         if not inverse.smallest > _SINGULAR:
@@ -90,65 +71,57 @@ class _RigAssembly:
                 "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
-        self.covariance = replace(
-            inverse,
-            shared=fit.variance * inverse.shared,
-            own=fit.variance * inverse.own,
-            cross=fit.variance * inverse.cross,
-        )
+        blocks = {name: fit.variance * getattr(inverse, name) for name in ("shared", "own", "cross")}
+        covariance = replace(inverse, **blocks)
         if least is not None:
-            self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
+            covariance = _widened(covariance, not_smaller(covariance.shared, least))
         for more in (covariance_of_choice(fit), stretched):
             if more is not None:
-                self.covariance = _widened(self.covariance, self.covariance.shared + more)
+                covariance = _widened(covariance, covariance.shared + more)
+        self.covariance = covariance
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         """The rig in pixels and world units, with the pairs left out and why."""
-        state, frames = self.state, self.problem.frames
-        errors = [
-            _squared_errors(observed, state.camera_with_poses(side, frames, observed))
-            for side, observed in enumerate(self.problem.observations)
+        problem, state = self.problem, self.state
+        squares = [
+            _squared_errors(observed, problem.camera(state, side))
+            for side, observed in enumerate(problem.observations)
         ]
         sums = [
-            observed.batches.sum_by_view(e.sum(axis=1))
-            for observed, e in zip(self.problem.observations, errors, strict=True)
+            observed.batches.sum_by_view(part.sum(axis=1))
+            for observed, part in zip(problem.observations, squares, strict=True)
         ]
-        reason = self._stop_reason()
-        left, right = (
-            self._calibration(side, sums[side], float(errors[side].max()), reason) for side in (0, 1)
-        )
-        pose = Pose(state.R, state.t * frames.unit)
-        block, std = self._rig_covariance(pose)
-        n_points = sum(observed.n_points for observed in self.problem.observations)
-        pairs = self.problem.pairs
+        left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
+        pose = Pose(state.R, state.t * problem.unit)
+        covariance, std = self._rig_covariance(pose)
+        n_points = sum(observed.n_points for observed in problem.observations)
         return Rig(
             left,
             right,
             pose,
             std,
-            block,
-            tuple(pairs[k] for k in np.argsort(self.problem.paired)),
+            covariance,
+            tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
             dict(left_out),
-            rmse_px=float(np.sqrt(sum(s.sum() for s in sums) / n_points)),
-            max_px=float(np.sqrt(max(e.max() for e in errors))),
-            converged=reason == StopReason.CONVERGED.value,
-            stop_reason=reason,
+            rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
+            max_px=float(np.sqrt(max(part.max() for part in squares))),
+            converged=left.converged,
+            stop_reason=left.stop_reason,
             iterations=self.fit.iterations,
         )
 
     def _stop_reason(self) -> str:
-        for calibration in self.calibrations:
+        for calibration in self.problem.calibrations:
             if not calibration.converged:
                 return calibration.stop_reason
         return (StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS).value
 
     def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
         """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
-        J = np.zeros((7, 6))
+        J, unit, baseline = np.zeros((7, 6)), self.problem.unit, np.linalg.norm(pose.t)
         J[:3, :3] = euler_jacobian(pose.R)
-        J[3:6, 3:] = np.eye(3) * self.problem.frames.unit
-        baseline = np.linalg.norm(pose.t)
-        J[6, 3:] = self.problem.frames.unit * (pose.t / baseline if baseline > 0 else 0.0)
+        J[3:6, 3:] = np.eye(3) * unit
+        J[6, 3:] = unit * (pose.t / baseline if baseline > 0 else 0.0)
         block = J @ self._shared_block(self.columns.rig) @ J.T
         followed = np.array([0.0, 0.0, 0.0, *pose.t, baseline])  # the scale of the target
         block += self.scale_std**2 * np.outer(followed, followed)
@@ -157,36 +130,30 @@ class _RigAssembly:
 
     def _shared_block(self, columns: NDArray[np.intp]) -> Array:
         """Covariance of some of the shared parameters, 0 for given ones."""
-        place = {int(column): k for k, column in enumerate(self.shared)}
-        known = [k for k, column in enumerate(columns.tolist()) if column in place]
+        free = np.flatnonzero(self.fit.free[columns])
+        rows = np.searchsorted(self.shared, columns[free])
         block = np.zeros((len(columns), len(columns)))
-        rows = [place[int(columns[k])] for k in known]
-        block[np.ix_(known, known)] = self.covariance.shared[np.ix_(rows, rows)]
+        block[np.ix_(free, free)] = self.covariance.shared[np.ix_(rows, rows)]
         return block
 
-    def _calibration(self, side: int, squares: Array, largest: float, reason: str) -> Calibration:
-        """One camera after the common bundle adjustment."""
-        given, observed = self.calibrations[side], self.problem.observations[side]
-        camera = self.state.cameras[side]
-        columns = self.columns.cameras[side]
-        estimated = self.fit.free[columns]
-        intrinsics = given.intrinsics
-        if estimated[:5].any():
-            intrinsics = _intrinsics(given, camera, observed, estimated[:5])
+    def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
+        """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
+        given, observed = self.problem.calibrations[side], self.problem.observations[side]
+        intrinsics, batches, reason = _intrinsics(self.fit, side), observed.batches, self._stop_reason()
         changes: dict[str, Any] = {}
-        if estimated.any():
-            changes = self._intrinsic_changes(given, intrinsics, camera, observed, columns)
-        rms = np.sqrt(squares / observed.batches.counts)
-        R, t = self._world_poses(side)
+        if self.fit.free[self.columns.cameras[side]].any():
+            changes = self._intrinsic_changes(side, intrinsics)
+        rms = np.sqrt(sums / batches.counts)
+        R, t = self.problem.world_poses(self.state, side)
         stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
         R.setflags(write=False)
         t.setflags(write=False)
         views = {
             name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
-                             int(observed.batches.counts[k]), float(rms[k]))
+                             int(batches.counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip
-        rmse = float(np.sqrt(squares.sum() / observed.n_points))
+        rmse = float(np.sqrt(sums.sum() / observed.n_points))
         return replace(
             given,
             views=views,
@@ -199,16 +166,14 @@ class _RigAssembly:
             **changes,
         )
 
-    def _intrinsic_changes(
-        self,
-        given: Calibration,
-        intrinsics: Intrinsics,
-        camera: CameraState,
-        observed: Observations,
-        columns: NDArray[np.intp],
-    ) -> dict[str, Any]:
+    def _intrinsic_changes(self, side: int, intrinsics: Intrinsics) -> dict[str, Any]:
+        given, camera = self.problem.calibrations[side], self.state.cameras[side]
         block, std = parameter_covariance(
-            intrinsics, camera.model, self._shared_block(columns), observed.pixel_scale, given.fixed
+            intrinsics,
+            camera.model,
+            self._shared_block(self.columns.cameras[side]),
+            self.problem.observations[side].pixel_scale,
+            given.fixed,
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
@@ -227,28 +192,16 @@ class _RigAssembly:
             "warnings": (*now, *(text for text in given.warnings if text not in before)),
         }
 
-    def _world_poses(self, side: int) -> tuple[Array, Array]:
-        """Poses of the views in their camera, in world units."""
-        frames, observed = self.problem.frames, self.problem.observations[side]
-        state = self.state.camera_with_poses(side, frames, observed)
-        scale, centre = frames.scale[observed.view][:, None], frames.centre[observed.view]
-        return state.R, state.t * scale - (state.R @ centre[..., None])[..., 0]
-
     def _pose_stds(self, side: int, R: Array) -> Array:
         """Standard deviations of the angles and translations of the views, (V_c, 6)."""
-        frames, observed, columns = self.problem.frames, self.problem.observations[side], self.columns
-        T = rig_jacobian(frames, observed, self.state, side)[:, POSE]
-        by_rig, by_pose = T[:, :, columns.rig], T[:, :, columns.pose]
-        own = self.covariance.own[observed.view]
-        places = np.flatnonzero(np.isin(self.shared, columns.rig))
-        cross = np.zeros((len(own), 6, 6))
-        if len(places) == 6:
-            cross = self.covariance.cross[observed.view][:, places]
-        mixed = by_rig @ cross @ np.swapaxes(by_pose, 1, 2)
-        covariance = by_pose @ own @ np.swapaxes(by_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
-        covariance += by_rig @ self._shared_block(columns.rig) @ np.swapaxes(by_rig, 1, 2)
-        centre = (R @ frames.centre[observed.view][..., None])[..., 0]
-        return pose_std(R, centre, frames.scale[observed.view], covariance)
+        view, T = self.problem.observations[side].view, self.problem.jacobian(self.state, side)[:, POSE]
+        by_rig, by_pose = T[:, :, self.columns.rig], T[:, :, self.columns.pose]
+        mixed = by_rig @ self.covariance.cross[view, -6:] @ np.swapaxes(by_pose, 1, 2)
+        covariance = by_pose @ self.covariance.own[view] @ np.swapaxes(by_pose, 1, 2)
+        covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
+        covariance += by_rig @ self._shared_block(self.columns.rig) @ np.swapaxes(by_rig, 1, 2)
+        centre = (R @ self.problem.centre[view][..., None])[..., 0]
+        return pose_std(R, centre, self.problem.scale[view], covariance)
 
 
 def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
@@ -260,12 +213,13 @@ def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
     return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
 
 
-def _intrinsics(
-    given: Calibration, camera: CameraState, observed: Observations, estimated: NDArray[np.bool_]
-) -> Intrinsics:
-    """Intrinsic parameters [px]; given entries of A keep their exact values."""
-    entries = camera.entries[0] * observed.pixel_scale
-    entries[3:] += observed.pixel_centre
+def _intrinsics(fit: RigFit, side: int) -> Intrinsics:
+    """Intrinsic parameters of one camera [px]; given entries of A keep their exact values."""
+    given = fit.problem.calibrations[side]
+    estimated = fit.free[fit.state.columns.cameras[side]][:5]
+    if not estimated.any():
+        return given.intrinsics
+    entries = fit.problem.observations[side].in_pixels(fit.state.cameras[side].entries[0])
     A = intrinsic_matrix(np.where(estimated, entries, given.K[ENTRIES]))
     if not estimated[1] and not given.intrinsics.skewed:
         return Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
@@ -298,8 +252,6 @@ def _network(
 
 def _squared_errors(observed: Observations, camera: CameraState) -> Array:
     """Squared pixel errors, (T, n) [px^2]; 0 for padding."""
-    batches: PointBatches = observed.batches
-    squares = (residuals(batches, camera) ** 2).sum(axis=1) * observed.pixel_scale**2
-    if batches.whitening is not None:
-        squares = np.where(batches.whitening[:, 0] > 0, squares, 0.0)
-    return np.asarray(squares)
+    squares = (residuals(observed.batches, camera) ** 2).sum(axis=1) * observed.pixel_scale**2
+    whitening = observed.batches.whitening
+    return np.asarray(squares if whitening is None else np.where(whitening[:, 0] > 0, squares, 0.0))

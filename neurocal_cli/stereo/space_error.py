@@ -21,64 +21,32 @@ _POINTS_PER_DEPTH = 20
 
 @frozen_dataclass
 class DepthError:
-    """Errors of the points in an interval of depths.
+    """Errors of the points in an interval of depths."""
 
-    Attributes
-    ----------
-    nearest, farthest : float [world unit]
-    n_points : int
-    rmse : float [world unit]
-    relative : float
-        Rms of the error over the depth.
-    """
-
-    nearest: float
+    nearest: float  # [world unit]
     farthest: float
     n_points: int
-    rmse: float
-    relative: float
+    rmse: float  # [world unit]
+    relative: float  # rms of the error over the depth
 
 
 @frozen_dataclass(eq=False)
 class SpaceError:
-    """Errors of triangulated points, in the left camera's frame.
+    """Errors of triangulated points, in the left camera's frame [world unit]."""
 
-    Attributes
-    ----------
-    n_points, n_behind : int
-        Points in the averages; points that are triangulated behind a camera are in none.
-    rmse : float [world unit]
-        ``sqrt(mean(dX^2 + dY^2 + dZ^2))``.
-    rmse_x, rmse_y, rmse_z : float [world unit]
-        Of each axis; their squares add up to the square of `rmse`.
-    max : float [world unit]
-        Longest error.
-    nsce : float
-        Normalised stereo calibration error: 1 is the rounding to whole pixels.
-    epipolar_px : float [px]
-        Rms of the smallest shift of both pixels that makes their rays intersect.
-    relative : float
-        Rms of the error over the depth.
-    views : dict of (n_points, rmse) by the left camera's view name
-    depths : tuple of DepthError
-        The nearest first, with about the same number of points.
-    errors : (N, 3) array
-        Triangulated minus true; nan for points behind a camera.
-    """
-
-    n_points: int
-    n_behind: int
-    rmse: float
-    rmse_x: float
+    n_points: int  # in the averages
+    n_behind: int  # triangulated behind a camera, and in no average
+    rmse: float  # sqrt(mean(dX^2 + dY^2 + dZ^2))
+    rmse_x: float  # of each axis; their squares add up to the square of `rmse`
     rmse_y: float
     rmse_z: float
-    max: float
-    nsce: float
-    epipolar_px: float
-    relative: float
-    views: Mapping[str, tuple[int, float]]
-    depths: tuple[DepthError, ...]
-    errors: Array
+    max: float  # longest error
+    nsce: float  # normalised stereo calibration error: 1 is the rounding to whole pixels
+    epipolar_px: float  # rms of the smallest shift of both pixels that makes their rays intersect [px]
+    relative: float  # rms of the error over the depth
+    views: Mapping[str, tuple[int, float]]  # number of points and rmse by the left camera's view
+    depths: tuple[DepthError, ...]  # the nearest first, with about the same number of points
+    errors: Array  # (N, 3) triangulated minus true; nan for points behind a camera
 
 
 def space_error(
@@ -90,23 +58,10 @@ def space_error(
     alpha_u: float,
     alpha_v: float,
 ) -> SpaceError:
-    """Compare triangulated points with their true positions.
+    """Compare triangulated points with their true positions (N, 3), both in the left camera's frame.
 
-    Parameters
-    ----------
-    triangulated, true : (N, 3) arrays
-        In the left camera's frame; rows of `triangulated` that are nan count as behind.
-    epipolar : (N,) array [px]
-    view : (N,) int array
-        Indices into `names`.
-    names : list of str
-    alpha_u, alpha_v : float [px]
-        Of the left camera, for NSCE.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        All points are behind.
+    Rows of `triangulated` that are nan count as behind; an error if all are. `epipolar` (N,) is in pixels,
+    `view` (N,) are indices into `names`, and the scale factors [px] are those of the left camera, for NSCE.
     """
     errors = triangulated - true
     fine = np.isfinite(errors).all(axis=1)

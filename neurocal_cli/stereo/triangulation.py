@@ -35,25 +35,17 @@ _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 class Triangulated:
     """Points in the left camera's frame.
 
-    Attributes
-    ----------
-    points : (N, 3) array [unit of t]
-        X, Y, Z; infinite or nan where the rays are parallel or the distortion does not reach a pixel.
-    covariance : (N, 6) array or None
-        XX, XY, XZ, YY, YZ, ZZ for pixels of covariance 1 px^2 (or of the given shape); times sigma^2 it is
-        the points'. None unless the method is optimal.
-    epipolar : (N,) array [px]
-        Length of the vector of four from both pixels to the images of the point. For the optimal method it
-        is the smallest shift that makes the rays intersect. It has one degree of freedom, so its rms is the
-        standard deviation of the pixels.
-    behind : (N,) bool array
-        Points that are not in front of both cameras, or not finite.
+    The covariance is that for pixels of covariance 1 px^2 (or of the given shape); times sigma^2 it is the
+    points'. The epipolar error is the length of the vector of four from both pixels to the images of the
+    point. For the optimal method it is the smallest shift that makes the rays intersect. It has one degree of
+    freedom, so its rms is the standard deviation of the pixels.
     """
 
+    # (N, 3) X, Y, Z [unit of t]; infinite or nan where rays are parallel or the distortion does not reach
     points: Array
-    covariance: Array | None
-    epipolar: Array
-    behind: NDArray[np.bool_]
+    covariance: Array | None  # (N, 6) XX, XY, XZ, YY, YZ, ZZ; None unless the method is optimal
+    epipolar: Array  # (N,) [px]
+    behind: NDArray[np.bool_]  # (N,) not in front of both cameras, or not finite
 
     def off(self, limit: float) -> NDArray[np.bool_]:
         """(N,) which epipolar errors exceed a limit [px]."""

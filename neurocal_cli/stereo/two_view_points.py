@@ -26,13 +26,8 @@ RISE, ROUNDING = 1 + 1e-9, 1e-18  # a rise of the squared error by less, as a fa
 class PointBatch:
     """Some thousand points, all arrays (n,).
 
-    Parameters
-    ----------
-    cameras : two of Camera
-    rig : (3, 4, n) or (3, 4, 1) array
-        [R | t] of each point, or of all.
-    left, right : (2, n) arrays [px]
-    whitening : two of (3, n) array or None
+    The rig (3, 4, n) or (3, 4, 1) is [R | t] of each point, or of all. The pixels are (2, n), and the entries
+    of their whitening (3, n).
     """
 
     def __init__(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, cross_matrix
 from neurocal_cli.stereo.two_view_points import (
     MAX_STEPS,
     RISE,
@@ -117,7 +117,7 @@ class WidePointBatch:
         n = len(self.left)
         identity = np.broadcast_to(np.eye(3, 4), (n, 3, 4))
         rig = np.concatenate([self.R, self.t[:, :, None]], axis=2)
-        rows = [_cross(ray) @ P for ray, P in ((self.left, identity), (self.right, rig))]
+        rows = [cross_matrix(ray) @ P for ray, P in ((self.left, identity), (self.right, rig))]
         return nearest_solution(np.concatenate(rows, axis=1))
 
     def midpoint(self) -> Array:
@@ -156,13 +156,6 @@ def _upper(factors: Array) -> Array:
     out = np.zeros((factors.shape[1], 2, 2))
     out[:, 0, 0], out[:, 0, 1], out[:, 1, 1] = factors
     return out
-
-
-def _cross(rays: Array) -> Array:
-    """(n, 3, 3) matrices of the products with rays."""
-    x, y, z = rays.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def _solved(J: Array, r: Array) -> Array:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -34,11 +35,7 @@ Baseline = Callable[[Array], tuple[Array, Constants]]
 def baselines_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Baseline]:
     """All baselines that the settings determine, by name; those fitted jointly end in ``_joint``.
 
-    Parameters
-    ----------
-    lens : ZoomLens
-    scale : str, optional
-        Of alpha_u; default that of the networks.
+    The scale of alpha_u is by default that of the networks.
     """
     scale = scale or lens.members[0].nets.scale
     x = lens.scaled(lens.settings)
@@ -81,30 +78,21 @@ def _polynomial(table: Tables, variance: float, scale: str, x: Array, powers: Ar
     spread = variance * np.einsum("sij,sjk,sik->si", by_local, covariance, by_local)
     Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
-    coefficients = np.column_stack(
-        [
-            np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0]
-            for y, w in zip(outputs.T, weight.T, strict=True)
-        ]
-    )
-    return lambda to: (outputs_to_local(scale, monomials(to, powers) @ coefficients)[0], table.constants)
+    fits = [
+        np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0]
+        for y, w in zip(outputs.T, weight.T, strict=True)
+    ]
+    found = _Polynomials(scale, powers, np.column_stack(fits))
+    return lambda to: (found.local(to), table.constants)
 
 
 @frozen_dataclass(eq=False)
 class _Polynomials:
-    """A polynomial of the controls for each output: a `quadratic_error.LocalModel`.
+    """A polynomial of the controls for each output: a `quadratic_error.LocalModel`."""
 
-    Attributes
-    ----------
-    scale : str
-        Of alpha_u.
-    powers : (K, D) array
-    coefficients : (K, L) array
-    """
-
-    scale: str
-    powers: Array
-    coefficients: Array
+    scale: str  # of alpha_u
+    powers: Array  # (K, D)
+    coefficients: Array  # (K, L)
 
     @property
     def weights(self) -> Array:
@@ -140,7 +128,7 @@ def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Ba
     constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
     error = QuadraticError(x, table.local, table.normal, lens.variance)
     found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
-    moved = table.constants.moved(shared) if len(shared) else table.constants
+    moved = table.constants.moved(shared)
     return lambda to: (found.local(to), moved)
 
 
@@ -149,8 +137,7 @@ def grid_axes(x: Array) -> list[Array] | None:
     axes = [np.unique(column) for column in x.T]
     if np.prod([len(axis) for axis in axes]) != len(x) or min(len(axis) for axis in axes) < 2:
         return None
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, x.shape[1])
-    return axes if np.array_equal(grid, x) else None
+    return axes if np.array_equal(list(product(*axes)), x) else None
 
 
 def spline_matrix(axes: list[Array], x: Array, degree: int) -> Array:
@@ -189,8 +176,7 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
 def powers_up_to(nodes: Array, degree: int) -> Array:
     """Powers of the controls (K, D) up to a total degree that the values of the settings (S, D) determine."""
     most = [len(np.unique(column)) - 1 for column in nodes.T]
-    ranges = np.meshgrid(*[np.arange(min(limit, degree) + 1) for limit in most], indexing="ij")
-    powers = np.stack(ranges, axis=-1).reshape(-1, nodes.shape[1])
+    powers = np.array(list(product(*(range(min(limit, degree) + 1) for limit in most))))
     return np.asarray(powers[powers.sum(axis=1) <= degree])
 
 

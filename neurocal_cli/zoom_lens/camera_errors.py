@@ -37,18 +37,8 @@ def too_few(cameras: int, controls: int) -> bool:
 
 
 def error_variances(members: Sequence[LensNets], x: Array, outputs: Array) -> Array:
-    """Variances of the errors of the networks' targets, (S, L).
+    """Variances (S, L) of the errors of the networks' targets `outputs` (S, L) at scaled controls x (S, D).
 
-    Parameters
-    ----------
-    members : sequence of LensNets
-    x : (S, D) array
-        Scaled controls.
-    outputs : (S, L) array
-        The targets, from `local_to_outputs`.
-
-    Notes
-    -----
     The errors of alpha_u are taken to be equal shares of it. u0 and v0 are taken to have equal errors, so
     that two parameters tell their size.
     """

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import field
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,28 +43,16 @@ _GRID = 13  # values of each control at which networks are compared
 class Budget:
     """Numbers of networks to train and to keep.
 
-    Parameters
-    ----------
-    topologies : tuple of (int, int), optional
-        Default: those that suit the number of settings.
-    starts : int
-        Random starts of each topology.
-    best : int
-        Networks of the highest evidence that may be in the committee.
-    members : int
-        Size of the committee.
-    schedule : Schedule
-
     Raises
     ------
     UsageError
         Topologies that are not pairs of whole numbers.
     """
 
-    topologies: tuple[tuple[int, int], ...] | None = None
-    starts: int = 12
-    best: int = 20
-    members: int = 12
+    topologies: tuple[tuple[int, int], ...] | None = None  # None: those that suit the number of settings
+    starts: int = 12  # random starts of each topology
+    best: int = 20  # networks of the highest evidence that may be in the committee
+    members: int = 12  # size of the committee
     schedule: Schedule = field(default_factory=Schedule)
 
     def __post_init__(self) -> None:
@@ -88,29 +77,12 @@ def fit_committee(
     budget: Budget,
     report: Callable[[float], None],
 ) -> tuple[LensNets, ...]:
-    """Fit networks to tables of local parameters, one parameter at a time.
+    """Fit networks to tables of local parameters (S, L) at scaled controls (S, D), one parameter at a time.
 
-    Parameters
-    ----------
-    x : (S, D) array
-        Scaled controls.
-    names : sequence of str
-        Of the L local parameters; alpha_u, alpha_v, u0, v0 first.
-    local : (S, L) array
-        The tables.
-    H : (S, L + Q, L + Q) array or None
-        Normal matrices at the tables, for the variances of the targets; None where they are unknown.
-    variance : float [px^2]
-        Of the noise.
-    rng : numpy.random.Generator
-    budget : Budget
-    report : callable
-        Called with the share that is done.
-
-    Returns
-    -------
-    members : tuple of LensNets
-        The first consists of the networks that agree best with the others.
+    Of the names, alpha_u, alpha_v, u0, v0 come first. H (S, L + Q, L + Q) are normal matrices at the tables,
+    which with the variance of the noise [px^2] give those of the targets; None where they are unknown.
+    `report` is called with the share that is done. The first of the members consists of the networks that
+    agree best with the others.
     """
     probe = _probe(x.shape[1])
     L = len(names)
@@ -145,8 +117,7 @@ def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
 
 def _probe(D: int) -> Array:
     """A grid over the whole range of the controls."""
-    axes = np.meshgrid(*[np.linspace(-1, 1, _GRID)] * D, indexing="ij")
-    return np.column_stack([axis.ravel() for axis in axes])
+    return np.array(list(product(np.linspace(-1, 1, _GRID), repeat=D)))
 
 
 def _given(

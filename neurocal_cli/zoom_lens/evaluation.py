@@ -24,16 +24,9 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 @frozen_dataclass
 class SettingError:
-    """Reprojection error at one setting.
+    """Reprojection error at one setting."""
 
-    Attributes
-    ----------
-    values : dict of float by control
-    n_points : int
-    rmse_px, max_px : float [px]
-    """
-
-    values: Mapping[str, float]
+    values: Mapping[str, float]  # by control
     n_points: int
     rmse_px: float
     max_px: float
@@ -41,25 +34,13 @@ class SettingError:
 
 @frozen_dataclass
 class LensEvaluation:
-    """Reprojection error of a lens at the settings of some points.
-
-    Attributes
-    ----------
-    n_points : int
-    rmse_px, max_px : float [px]
-        Over all points.
-    settings : tuple of SettingError
-        In ascending order.
-    baselines : dict of float by name [px]
-        Rms error of the baseline models of the same calibration data; nan where one gives no valid camera.
-    warnings : tuple of str
-    """
+    """Reprojection error of a lens at the settings of some points."""
 
     n_points: int
-    rmse_px: float
+    rmse_px: float  # over all points
     max_px: float
-    settings: tuple[SettingError, ...]
-    baselines: Mapping[str, float]
+    settings: tuple[SettingError, ...]  # in ascending order
+    baselines: Mapping[str, float]  # rms of baseline models of the same data; nan where one gives no camera
     warnings: tuple[str, ...] = ()
 
 

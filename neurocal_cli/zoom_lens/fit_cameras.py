@@ -26,33 +26,17 @@ _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the er
 
 @frozen_dataclass(eq=False)
 class LensCameras:
-    """Cameras that are known at some settings, with unknown errors.
-
-    Attributes
-    ----------
-    controls : tuple of str
-    settings : (S, D) array
-    names : tuple of str
-        alpha_u, alpha_v, u0, v0, perhaps t_z, and the distortion coefficients.
-    local : (S, L) array
-    image_size : (width, height), optional
-    unit : str
-    source : str
-    model : str
-        Distortion model.
-    theta : float [rad]
-        Of all cameras.
-    """
+    """Cameras that are known at some settings, with unknown errors."""
 
     controls: tuple[str, ...]
-    settings: Array
-    names: tuple[str, ...]
-    local: Array
+    settings: Array  # (S, D)
+    names: tuple[str, ...]  # alpha_u, alpha_v, u0, v0, perhaps t_z, and the distortion coefficients
+    local: Array  # (S, L)
     image_size: tuple[int, int] | None = None
     unit: str = "mm"
     source: str = "cameras"
-    model: str = "none"
-    theta: float = np.pi / 2
+    model: str = "none"  # of the distortion
+    theta: float = np.pi / 2  # of all cameras [rad]
 
     @classmethod
     def of(
@@ -66,10 +50,7 @@ class LensCameras:
     ) -> LensCameras:
         """Read columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
 
-        Raises
-        ------
-        InputError
-            A missing column, impossible values, or one setting only.
+        A missing column, impossible values, and one setting only are errors.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
         coefficients = coefficient_names(model)

@@ -13,23 +13,18 @@ from neurocal_cli.errors import DegenerateGeometryError, check_choice, check_see
 from neurocal_cli.initialisation.options import Progress
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.cross_validation import contradiction, left_out_errors, most_suspect
 from neurocal_cli.zoom_lens.initialisation import (
     CalibratedSettings,
     FitOptions,
     calibrate_settings,
     check_settings,
     choose_model,
-    may_reject,
-    without,
 )
 from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, take_turns, train_joint
-from neurocal_cli.zoom_lens.result import assemble, provisional
+from neurocal_cli.zoom_lens.result import assemble, contradiction, left_out_errors, most_suspect, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
-from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
-from neurocal_cli.zoom_lens.target import lens_target, on_target
-from neurocal_cli.zoom_lens.target_coupling import target_coupling
-from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
+from neurocal_cli.zoom_lens.target import lens_target, on_target, target_coupling
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
@@ -126,23 +121,17 @@ def _train(start: CalibratedSettings, options: FitOptions) -> tuple[CalibratedSe
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
         joints = _trained(start, options)
-        if not options.reject or not may_reject(start.rejected, start.lens):
+        if not options.reject or not start.may_reject:
             return start, joints
         suspect = most_suspect(*left_out_errors(start, joints[0]))
         if suspect is None:
             return start, joints
-        keep = np.arange(start.lens.n_settings) != suspect
-        lens, data, static = without(start.lens, start.static, keep, start.data.model, options)
-        tables = common_tables(data, static.local, first_constants(static, lens, options.still))
-        rest = CalibratedSettings(lens, data, static, tables, start.rejected)
+        setting, rest = start.lens.settings[suspect], start.without(suspect)
         trial = _trained(rest, replace(options, budget=replace(options.budget, starts=6)))
-        reason = contradiction(
-            provisional(rest, trial, options), start.lens.settings[suspect], start.tables, suspect
-        )
+        reason = contradiction(provisional(rest, trial, options), setting, start.tables, suspect)
         if reason is None:
             return start, joints
-        rejected = RejectedSetting(tuple(start.lens.settings[suspect].tolist()), reason)
-        start = replace(rest, rejected=(*start.rejected, rejected))
+        start = rest.with_rejected(setting, reason)
 
 
 def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:

@@ -5,11 +5,9 @@ The distortion model is the simplest whose cross-validation error no richer one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.errors import DegenerateGeometryError, InputError
@@ -59,7 +57,15 @@ class CalibratedSettings:
     data: PixelData
     static: StaticFit
     tables: Tables
-    rejected: tuple[RejectedSetting, ...]
+    rejected: tuple[RejectedSetting, ...] = ()
+
+    @classmethod
+    def of(
+        cls, lens: LensPoints, data: PixelData, static: StaticFit, progress: Progress | None = None
+    ) -> CalibratedSettings:
+        """Calibrations of each setting with common constants."""
+        constants = first_constants(static, lens, data.still)
+        return cls(lens, data, static, common_tables(data, static.local, constants, progress))
 
     @property
     def controls(self) -> Array:
@@ -74,6 +80,32 @@ class CalibratedSettings:
         unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
         return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
+    @property
+    def may_reject(self) -> bool:
+        """Whether fewer than a fifth of the settings are rejected; one always may be."""
+        return len(self.rejected) < max(1, self.lens.n_settings // 5)
+
+    def without(self, setting: int, progress: Progress | None = None) -> CalibratedSettings:
+        """The result without a setting. Only the common constants are found again."""
+        keep = np.arange(self.lens.n_settings) != setting
+        rest, views = self.lens.select(keep), keep[self.lens.view_setting]
+        check_settings(rest.n_settings, len(rest.controls), self.lens.points.source)
+        static = replace(
+            self.static,
+            local=self.static.local[keep],
+            theta=self.static.theta[keep],
+            R=self.static.R[views],
+            t=self.static.t[views],
+            good=self.static.good[keep],
+        )
+        data = PixelData.of(rest, self.data.still, self.data.model, self.data.free_theta)
+        return replace(CalibratedSettings.of(rest, data, static, progress), rejected=self.rejected)
+
+    def with_rejected(self, setting: Array, reason: str) -> CalibratedSettings:
+        """The result, which is without a setting (C,), with the reason."""
+        rejected = RejectedSetting(tuple(setting.tolist()), reason)
+        return replace(self, rejected=(*self.rejected, rejected))
+
 
 def free_pose_variance(start: CalibratedSettings) -> float:
     """Variance of the noise if each view of a still camera had a pose of its own [px^2].
@@ -84,19 +116,13 @@ def free_pose_variance(start: CalibratedSettings) -> float:
         return np.nan
     t_z = start.data.names.index("t_z")
     static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
-    data = replace(start.data, still=False)
-    tables = common_tables(data, static.local, first_constants(static, start.lens, False))
-    free = replace(start, data=data, static=static, tables=tables)
-    return free.variance if tables.normal.sensible and np.isfinite(free.variance) else np.nan
+    free = CalibratedSettings.of(start.lens, replace(start.data, still=False), static)
+    sensible = free.tables.normal.sensible and np.isfinite(free.variance)
+    return free.variance if sensible else np.nan
 
 
 def check_settings(count: int, controls: int, source: str) -> None:
-    """Refuse too few settings.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse too few settings (`InputError`)."""
     least = controls + 2
     if count < least:
         raise InputError(
@@ -107,46 +133,21 @@ def check_settings(count: int, controls: int, source: str) -> None:
 
 def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
     """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
-    rejected: list[RejectedSetting] = []
     data = PixelData.of(lens, options.still, model, options.free_theta)
     static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
+    start = CalibratedSettings.of(lens, data, static, options.report)
     while True:
-        constants = first_constants(static, lens, options.still)
-        tables = common_tables(data, static.local, constants, options.report)
-        if not tables.normal.sensible or not np.isfinite(tables.normal.cost).all():
+        normal = start.tables.normal
+        if not normal.sensible or not np.isfinite(normal.cost).all():
             raise DegenerateGeometryError(
                 f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
                 "moved, give several views of the board at each setting, and --camera moving"
             )
-        bad = _bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if options.reject else None
-        if bad is None or not may_reject(rejected, lens):
-            return CalibratedSettings(lens, data, static, tables, tuple(rejected))
-        setting, reason = bad
-        rejected.append(RejectedSetting(tuple(lens.settings[setting].tolist()), reason))
-        keep = np.arange(lens.n_settings) != setting
-        lens, data, static = without(lens, static, keep, model, options)
-
-
-def may_reject(rejected: Sequence[RejectedSetting], lens: LensPoints) -> bool:
-    """Whether fewer than a fifth of the settings are rejected; one always may be."""
-    return len(rejected) < max(1, lens.n_settings // 5)
-
-
-def without(
-    lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: FitOptions
-) -> tuple[LensPoints, PixelData, StaticFit]:
-    """The data of the settings to keep (S,). Nothing is calibrated again."""
-    rest, views = lens.select(keep), keep[lens.view_setting]
-    check_settings(rest.n_settings, len(rest.controls), lens.points.source)
-    part = replace(
-        static,
-        local=static.local[keep],
-        theta=static.theta[keep],
-        R=static.R[views],
-        t=static.t[views],
-        good=static.good[keep],
-    )
-    return rest, PixelData.of(rest, options.still, model, options.free_theta), part
+        bad = _bad_pixels(np.sqrt(normal.cost / start.data.counts)) if options.reject else None
+        if bad is None or not start.may_reject:
+            return start
+        setting, reason = start.lens.settings[bad[0]], bad[1]
+        start = start.without(bad[0], options.report).with_rejected(setting, reason)
 
 
 def _bad_pixels(rms: Array) -> tuple[int, str] | None:
@@ -160,8 +161,8 @@ def _bad_pixels(rms: Array) -> tuple[int, str] | None:
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
     best: CalibratedSettings | None = None
-    best_px: float | None = None  # computed when a richer model is compared
     failure: DegenerateGeometryError | None = None
+    best_px: float | None = None  # computed when a richer model is compared
     for model in POLYNOMIAL_MODELS:
         try:
             start = calibrate_settings(lens, model, options)

@@ -53,26 +53,13 @@ _EPOCHS = 150  # most turns on one set of normal matrices
 
 @frozen_dataclass(eq=False)
 class Joint:
-    """Networks and constants after training.
-
-    Attributes
-    ----------
-    nets : LensNets
-    constants : Constants
-    cost : float
-        Sum of squared residuals over sigma^2, plus the priors' part: 2 E.
-    covariance : (P + Q, P + Q) array
-        Of all weights and the constants.
-    evidence : float
-        Logarithm of the probability of the data, up to a constant.
-    converged : bool
-    """
+    """Networks and constants after training."""
 
     nets: LensNets
     constants: Constants
-    cost: float
-    covariance: Array
-    evidence: float
+    cost: float  # sum of squared residuals over sigma^2, plus the priors' part: 2 E
+    covariance: Array  # (P + Q, P + Q) of all weights and the constants
+    evidence: float  # logarithm of the probability of the data, up to a constant
     converged: bool
 
 
@@ -81,13 +68,8 @@ def train_joint(
 ) -> Joint:
     """Minimise E, starting from networks that were fitted one at a time.
 
-    Parameters
-    ----------
-    learner : JointLearner
-    descend : callable
-        Lowers 2 E on the present normal matrices and returns it: `JointLearner.descend`, or `take_turns`.
-    report : callable
-        Called with the share that is done.
+    `descend` lowers 2 E on the present normal matrices and returns it: `JointLearner.descend`, or
+    `take_turns`. `report` is called with the share that is done.
     """
     converged = False
     for round_ in range(_ROUNDS):
@@ -106,17 +88,8 @@ def train_joint(
 class JointLearner:
     """Networks and constants in training, with the normal matrices of the settings.
 
-    Parameters
-    ----------
-    data : PixelData
-    x : (S, D) array
-        Scaled controls of the settings.
-    nets : LensNets
-    constants : Constants
-    variance : float [px^2]
-        Of the noise of one coordinate.
-    scatter : (L,) array
-        Variance of each local parameter from setting to setting.
+    `x` (S, D) are the scaled controls, `variance` [px^2] is that of the noise of one coordinate, and
+    `scatter` (L,) that of each local parameter from setting to setting.
     """
 
     def __init__(
@@ -127,10 +100,10 @@ class JointLearner:
 
     def linearise(self) -> float:
         """Recompute the normal matrices at the present networks; 2 E."""
-        self.reference = self.nets.local(self.x)
-        normal, self.constants = self.data.linearise(self.reference, self.constants)
-        self.normal = with_scatter(normal, self.scatter, self.variance)
-        self.error = QuadraticError(self.x, self.reference, self.normal, self.variance)
+        reference = self.nets.local(self.x)
+        normal, self.constants = self.data.linearise(reference, self.constants)
+        normal = with_scatter(normal, self.scatter, self.variance)
+        self.error = QuadraticError(self.x, reference, normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
         return self.error.cost(self.nets, self.shared)
 
@@ -145,18 +118,12 @@ class JointLearner:
         self.nets, self.constants = nets, self.constants.moved(shared)
 
     def update_priors(self) -> None:
-        """Update the priors by MacKay's formula, half the way on a logarithmic scale."""
-        N, _ = self.error.system(self.nets, self.shared)
-        leverage = np.diagonal(inverse(N))
-        nets, start = [], 0
-        for net in self.nets.nets:
-            P, kinds = net.topology.n_weights, net.topology.membership
-            here = leverage[start : start + P]
-            effective = np.maximum(kinds.sum(axis=1) - net.precision * (kinds @ here), 1e-3)
-            squares = np.maximum(kinds @ net.weights**2, 1e-12)
-            target = updated_precision(effective, squares, self.x)
-            nets.append(replace(net, precision=np.sqrt(net.precision * target)))
-            start += P
+        """Update the priors of all networks."""
+        leverage = np.diagonal(inverse(self.error.system(self.nets, self.shared)[0]))
+        nets = [
+            replace(net, precision=updated_precision(net.topology, net.precision, own, net.weights, self.x))
+            for net, own in zip(self.nets.nets, self.nets.split(leverage[: -len(self.shared)]), strict=True)
+        ]
         self.nets = replace(self.nets, nets=tuple(nets))
 
     def result(self, converged: bool) -> Joint:
@@ -189,7 +156,7 @@ def take_turns(learner: JointLearner) -> float:
 
 def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> tuple[LensNets, Array]:
     """One step of the calibrating network at every setting and one iteration of each other network."""
-    normal, local = learner.normal, nets.local(learner.x)
+    normal, local = learner.error.normal, nets.local(learner.x)
     L = local.shape[1]
     pull = normal.g - learner.error.offset(local, shared)[1]
     _, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))

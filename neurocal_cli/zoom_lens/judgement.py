@@ -35,22 +35,12 @@ _MORE_CAMERAS = "check the numbers of each camera, and add cameras where the par
 
 
 def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
-    """Judge a lens.
-
-    Parameters
-    ----------
-    lens : ZoomLens
-    elsewhere_px : float [px]
-        Rms reprojection error at other points, if there are any.
-    """
+    """Judge a lens, also by the rms reprojection error at other points [px] if there are any."""
+    measures = {"alpha_share": _alpha_share(lens)}
     if lens.known:
         findings = (*_of_known_cameras(lens), *_uncertain(lens), *_large_error(lens, elsewhere_px))
-        return verdict_of(findings, {"alpha_share": _alpha_share(lens)})
-    measures = {
-        "held_out_px": lens.left_out_px,
-        "precision_px": lens.noise_floor_px,
-        "alpha_share": _alpha_share(lens),
-    }
+        return verdict_of(findings, measures)
+    measures = {"held_out_px": lens.left_out_px, "precision_px": lens.noise_floor_px, **measures}
     return verdict_of((*_findings(lens), _elsewhere(lens, elsewhere_px)), measures)
 
 
@@ -81,8 +71,8 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
             "training did not converge, so the settings may contradict each other",
             "check that the lens returns to the same position; give more settings or a simpler --distortion",
         )
-    floor = lens.noise_floor_px
-    rejected = lens.rejected
+    floor, rejected = lens.noise_floor_px, lens.rejected
+    times = lens.rmse_px / max(floor, 1e-9)
     if rejected:
         total = len(lens.settings) + len(rejected)
         first = f"{describe(lens.controls, np.array(rejected[0].setting))}: {rejected[0].reason}"
@@ -105,15 +95,14 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
         "a pose for each: the camera or the target moved between the settings",
         "give --camera moving, or keep both where they are",
     )
-    contradiction = _CONTRADICTION.grade(lens.rmse_px / max(floor, 1e-9))
     yield (
-        contradiction,
-        f"the error is {lens.rmse_px / max(floor, 1e-9):.2f} times the noise floor, which is {floor:.3g} px "
+        _CONTRADICTION.grade(times),
+        f"the error is {times:.2f} times the noise floor, which is {floor:.3g} px "
         "(the error of a separate camera for each setting)",
         "check that the lens returns to the same position, that camera and target stay where they are (or "
         "give --camera moving), and that the settings have their true names",
     )
-    if not contradiction:
+    if not _CONTRADICTION.grade(times):
         yield (
             _BETWEEN.grade(lens.left_out_px / max(floor, 1e-9)),
             f"the error at settings left out is {lens.left_out_px:.3g} px, but the noise floor "
@@ -131,9 +120,8 @@ def _of_known_cameras(lens: ZoomLens) -> Iterator[Finding]:
     if odd is not None:
         yield 1, f"the camera at {describe(lens.controls, lens.settings[odd])} contradicts the others", check
     if lens.image_size is not None:
-        outside = (np.abs(local[:, 2:4] - np.array(lens.image_size) / 2) > np.array(lens.image_size) / 2).any(
-            1
-        )
+        half = np.array(lens.image_size) / 2
+        outside = (np.abs(local[:, 2:4] - half) > half).any(axis=1)
         if outside.any():
             where = describe(lens.controls, lens.settings[int(outside.argmax())])
             yield 2, f"the image centre at {where} lies outside the image", f"{check}; check image_size"

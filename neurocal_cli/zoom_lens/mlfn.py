@@ -36,21 +36,11 @@ _LARGEST_TILT = 0.99
 
 @frozen_dataclass
 class Topology:
-    """Numbers of units of a network.
+    """Numbers of units of a network."""
 
-    Parameters
-    ----------
-    controls : int
-        Inputs, D.
-    own : int
-        Tanh units of the first hidden layer for each control, beside its rational unit.
-    hidden : int
-        Units of the second hidden layer, H.
-    """
-
-    controls: int
-    own: int
-    hidden: int
+    controls: int  # inputs, D
+    own: int  # tanh units of the first hidden layer for each control, beside its rational unit
+    hidden: int  # units of the second hidden layer, H
 
     @property
     def width(self) -> int:
@@ -118,19 +108,7 @@ class Topology:
 
 
 def respond(topology: Topology, weights: Array, x: Array) -> Array:
-    """Outputs of a stack of networks.
-
-    Parameters
-    ----------
-    topology : Topology
-    weights : (B, P) array
-    x : (n, D) array
-        Controls, scaled to about [-1, 1].
-
-    Returns
-    -------
-    y : (B, n) array
-    """
+    """Outputs (B, n) of a stack of networks (B, P) at controls (n, D), scaled to about [-1, 1]."""
     return _layers(topology, weights, x)[0]
 
 

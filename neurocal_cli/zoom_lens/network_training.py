@@ -33,46 +33,22 @@ _OPTIONS = DescentOptions(
 
 @frozen_dataclass
 class Schedule:
-    """Numbers of iterations.
-
-    Parameters
-    ----------
-    iterations : int
-    warm : int
-        Iterations before the first update of the priors.
-    settle : int
-        Iterations before the first update of the scatter.
-    period : int
-        Iterations from one update of the priors to the next.
-    """
+    """Numbers of iterations."""
 
     iterations: int = 300
-    warm: int = 40
-    settle: int = 160
-    period: int = 4
+    warm: int = 40  # before the first update of the priors
+    settle: int = 160  # before the first update of the scatter
+    period: int = 4  # from one update of the priors to the next
 
 
 @frozen_dataclass(eq=False)
 class TrainedNets:
-    """A stack of trained networks.
+    """A stack of trained networks of one topology."""
 
-    Attributes
-    ----------
-    topology : Topology
-    weights : (B, P) array
-    precision : (B, G) array
-        Of the prior of each kind of weights.
-    scatter : (B,) array
-        tau^2, in squared units of the targets.
-    evidence : (B,) array
-        Logarithm of the probability of the targets, up to a constant common to all topologies.
-    """
-
-    topology: Topology
-    weights: Array
-    precision: Array
-    scatter: Array
-    evidence: Array
+    weights: Array  # (B, P)
+    precision: Array  # (B, G) of the prior of each kind of weights
+    scatter: Array  # (B,) tau^2, in squared units of the targets
+    evidence: Array  # (B,) log of the probability of the targets, up to a constant of all topologies
 
 
 def sparse_controls(x: Array) -> NDArray[np.bool_]:
@@ -80,21 +56,26 @@ def sparse_controls(x: Array) -> NDArray[np.bool_]:
     return np.array([len(np.unique(column)) < _ENOUGH_VALUES for column in x.T])
 
 
-def updated_precision(effective: Array, squares: Array, x: Array) -> Array:
-    """Precision of each prior (..., G) by MacKay's formula, within limits.
+def updated_precision(
+    topology: Topology, precision: Array, leverage: Array, weights: Array, x: Array
+) -> Array:
+    """Precision of each prior (..., G) by MacKay's formula, half the way to it on a logarithmic scale.
 
-    Data do not shrink weights along directions that they do not determine. The standard deviation of a prior
-    is therefore at most 6. It is at most 1 for weights from a control of three values, where a unit could
-    turn between two of them without any effect on the data, and for the weights a of the rational units, as
-    tanh(a) saturates. It is exactly 1 for a where a control has three values, as these leave the tilt open.
+    `leverage` (..., P) is the diagonal of A^-1. Data do not shrink weights along directions that they do not
+    determine. The standard deviation of a prior is therefore at most 6. It is at most 1 for weights from a
+    control of three values, where a unit could turn between two of them without any effect on the data, and
+    for the weights a of the rational units, as tanh(a) saturates. It is exactly 1 for a where a control has
+    three values, as these leave the tilt open.
     """
-    D, sparse = x.shape[1], sparse_controls(x)
-    least, most = np.full(effective.shape[-1], _LEAST), np.full(effective.shape[-1], _MOST)
+    kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
+    least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
     least[2 : 2 + D][sparse] = _LEAST_SPARSE
     least[6 + D] = _LEAST_TILT
     if sparse.any():
         most[6 + D] = _LEAST_TILT
-    return np.clip(effective / squares, least, most)
+    effective = np.maximum(kinds.sum(axis=1) - precision * (leverage @ kinds.T), 1e-3)
+    squares = np.maximum((weights * weights) @ kinds.T, 1e-12)
+    return np.sqrt(precision * np.clip(effective / squares, least, most))
 
 
 def prior_precision(topology: Topology, precision: Array) -> Array:
@@ -111,20 +92,10 @@ def train(
     weights: Array,
     schedule: Schedule | None = None,
 ) -> TrainedNets:
-    """Train a stack of networks, all at once.
+    """Train a stack of networks, all at once, from initial weights (B, P).
 
-    Parameters
-    ----------
-    topology : Topology
-    x : (n, D) array
-        Controls, scaled to about [-1, 1].
-    targets : (n,) array
-        Centred and scaled to a spread of about 1.
-    variance : (n,) array
-        Of the targets; 0 where unknown, so that the scatter is the noise.
-    weights : (B, P) array
-        Initial weights.
-    schedule : Schedule, optional
+    The controls x (n, D) are scaled to about [-1, 1], the targets (n,) centred and scaled to a spread of
+    about 1. Their variances (n,) are 0 where unknown, so that the scatter is the noise.
     """
     learner = _NetworkStack(topology, x, targets, variance, weights)
     schedule = schedule or Schedule()
@@ -146,10 +117,7 @@ class _NetworkStack:
 
     def __init__(self, topology: Topology, x: Array, targets: Array, variance: Array, weights: Array) -> None:
         self.topology, self.x, self.targets, self.variance = topology, x, targets, variance
-        self.w = weights
-        self.kinds = topology.membership
-        self.sizes = self.kinds.sum(axis=1)
-        self.diagonal = range(topology.n_weights)
+        self.w, self.diagonal = weights, range(topology.n_weights)
         self.a = np.full((len(weights), topology.n_groups), 0.3)
         # For targets without a variance, a thousandth of their spread until the noise is estimated.
         self.tau2 = np.full(len(weights), 0.0 if variance.any() else 1e-6)
@@ -191,17 +159,14 @@ class _NetworkStack:
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
         """Accept the trial for networks that improved."""
         w, y, J, cost = trial
-        self.w = np.where(better[:, None], w, self.w)
-        self.y = np.where(better[:, None], y, self.y)
+        self.w, self.y = np.where(better[:, None], w, self.w), np.where(better[:, None], y, self.y)
         self.J = np.where(better[:, None, None], J, self.J)
         self.cost = np.where(better, cost, self.cost)
 
     def update_priors(self, allow_scatter: bool) -> None:
         """Update the priors, half the way on a logarithmic scale, and the scatter."""
         leverage = np.diagonal(np.linalg.inv(self._normal()), axis1=1, axis2=2)
-        effective = np.maximum(self.sizes - self.a * (leverage @ self.kinds.T), 1e-3)
-        squares = np.maximum((self.w * self.w) @ self.kinds.T, 1e-12)
-        self.a = np.sqrt(self.a * updated_precision(effective, squares, self.x))
+        self.a = updated_precision(self.topology, self.a, leverage, self.w, self.x)
         if allow_scatter:
             gamma = self.topology.n_weights - (self.prior * leverage).sum(axis=1)
             self._update_scatter(np.maximum(len(self.x) - gamma, 0.05 * len(self.x)))
@@ -209,9 +174,8 @@ class _NetworkStack:
 
     def _update_scatter(self, freedom: Array) -> None:
         """Update tau^2 so that the squared errors have their expected size; 0 if they are smaller."""
-        squares = (self.y - self.targets) ** 2
         total = self.variance + self.tau2[:, None]
-        ratio = (squares / total).sum(axis=1) / freedom
+        ratio = ((self.y - self.targets) ** 2 / total).sum(axis=1) / freedom
         known = self.variance.any()
         least = 1e-4 * float(np.median(self.variance)) if known else 1e-8
         seed = np.where(self.tau2 > 0, self.tau2, np.median(self.variance) * np.maximum(ratio - 1, 0))
@@ -226,6 +190,5 @@ class _NetworkStack:
         noise = np.log(self.variance + self.tau2[:, None]).sum(axis=1)
         # Symmetric permutations of the weights are not counted, as idle units have none.
         evidence = -0.5 * self.cost - 0.5 * volume + log_prior - 0.5 * noise
-        return TrainedNets(
-            self.topology, self.w, self.a, self.tau2, np.where(np.isfinite(evidence), evidence, -np.inf)
-        )
+        evidence = np.where(np.isfinite(evidence), evidence, -np.inf)
+        return TrainedNets(self.w, self.a, self.tau2, evidence)

@@ -7,7 +7,6 @@ the setting. u0, v0, t_z and the distortion coefficients are used as they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,26 +40,14 @@ def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
 
 @frozen_dataclass(eq=False)
 class ParameterNet:
-    """One network with the scaling of its output.
-
-    Attributes
-    ----------
-    topology : Topology
-    weights : (P,) array
-    precision : (G,) array
-        Of the weights' priors.
-    centre, spread : float
-        Output = centre + spread y.
-    scatter : float
-        Variance of the output from setting to setting that the network does not explain.
-    """
+    """One network with the scaling of its output: centre + spread y."""
 
     topology: Topology
-    weights: Array
-    precision: Array
+    weights: Array  # (P,)
+    precision: Array  # (G,) of the weights' priors
     centre: float
     spread: float
-    scatter: float = 0.0
+    scatter: float = 0.0  # variance of the output from setting to setting that the network does not explain
 
     def output(self, x: Array) -> Array:
         """(n,) outputs at scaled controls (n, D)."""
@@ -79,16 +66,9 @@ class ParameterNet:
 
 @frozen_dataclass(eq=False)
 class LensNets:
-    """One network for each local parameter: alpha_u, alpha_v, u0, v0, and then t_z and distortion.
+    """One network for each local parameter: alpha_u, alpha_v, u0, v0, and then t_z and distortion."""
 
-    Attributes
-    ----------
-    scale : str
-        Of alpha_u's network, one of `SCALES`.
-    nets : tuple of ParameterNet
-    """
-
-    scale: str
+    scale: str  # of alpha_u's network, one of `SCALES`
     nets: tuple[ParameterNet, ...]
 
     @property
@@ -103,13 +83,15 @@ class LensNets:
 
     def moved(self, step: Array) -> LensNets:
         """After a step (P,) of all weights."""
-        parts = split(self.nets, step)
-        return replace(
-            self,
-            nets=tuple(
-                replace(net, weights=net.weights + part) for net, part in zip(self.nets, parts, strict=True)
-            ),
-        )
+        moved = [
+            replace(net, weights=net.weights + part)
+            for net, part in zip(self.nets, self.split(step), strict=True)
+        ]
+        return replace(self, nets=tuple(moved))
+
+    def split(self, weights: Array) -> list[Array]:
+        """Split a vector of the length of all weights (P,) into the parts of each network."""
+        return np.split(weights, np.cumsum([net.topology.n_weights for net in self.nets])[:-1])
 
     def local(self, x: Array) -> Array:
         """(n, L) local parameters at scaled controls (n, D)."""
@@ -151,9 +133,3 @@ def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
     outputs[:, 1] = np.log(local[:, 1] / local[:, 0])
     by_local[:, 1, 0], by_local[:, 1, 1] = -1 / local[:, 0], 1 / local[:, 1]
     return outputs, by_local
-
-
-def split(nets: Sequence[ParameterNet], weights: Array) -> list[Array]:
-    """Split the vector (P,) of all weights into those of each network."""
-    ends = np.cumsum([net.topology.n_weights for net in nets])
-    return np.split(weights, ends[:-1])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.plots.figure import picture, style
+from neurocal_cli.plots.figure import ACCENT, INK, picture, style
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
 from neurocal_cli.zoom_lens.static_calibration import local_covariance
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -21,72 +21,56 @@ if TYPE_CHECKING:
 _FINE = 121  # points of a curve
 _MOST_CURVES = 6  # values of the second control; more are not legible
 _COLUMNS = 3
-_INK, _ACCENT = "#1f4e79", "#c0392b"
 _PANEL = (4.4, 3.3)  # inches
 
 
 def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
     """Draw each parameter over the settings, with data, prediction and a band of two standard deviations.
 
-    Parameters
-    ----------
-    lens : ZoomLens
-    kind : {"png", "pdf", "svg"}
-
-    Returns
-    -------
-    picture : bytes
-        The same for the same lens, byte for byte.
+    The picture (png, pdf or svg) is the same for the same lens, byte for byte.
 
     Raises
     ------
     NeurocalError
         matplotlib is not installed.
     """
-    panels = len(lens.names) + (not lens.known)
 
-    def draw(figure: Figure) -> None:
-        axes = _panels(figure, panels)
+    def draw(figure: Figure, panels: list[Axes]) -> None:
         for j, name in enumerate(lens.names):
-            _draw_parameter(axes[j], lens, j, name)
+            _draw_parameter(panels[j], lens, j, name)
+        title = f"{len(lens.settings)} settings, bands of two standard deviations"
         if not lens.known:
-            values = lens.rmse
-            _draw_errors(
-                figure, axes[len(lens.names)], lens.controls, lens.settings, values, "Error at the settings"
-            )
-        figure.suptitle(
-            f"{len(lens.settings)} settings, bands of two standard deviations"
-            + ("" if lens.known else f", rms {lens.rmse_px:.4g} px")
-        )
+            _draw_errors(figure, panels[-1], lens.controls, lens.settings, lens.rmse, "Error at the settings")
+            title += f", rms {lens.rmse_px:.4g} px"
+        figure.suptitle(title)
 
-    return _picture(draw, panels, kind)
+    return _picture(draw, len(lens.names) + (not lens.known), kind)
 
 
 def draw_evaluation(evaluation: LensEvaluation, controls: tuple[str, ...], kind: str = "png") -> bytes:
     """Draw the error over the settings, and the errors of the lens and of the baselines."""
 
-    def draw(figure: Figure) -> None:
-        axes = _panels(figure, 2)
+    def draw(figure: Figure, panels: list[Axes]) -> None:
         settings = np.array([[s.values[name] for name in controls] for s in evaluation.settings])
         values = np.array([s.rmse_px for s in evaluation.settings])
-        _draw_errors(figure, axes[0], controls, settings, values, "Error of the networks")
-        _draw_baselines(axes[1], evaluation)
+        _draw_errors(figure, panels[0], controls, settings, values, "Error of the networks")
+        _draw_baselines(panels[1], evaluation)
 
     return _picture(draw, 2, kind)
 
 
-def _picture(draw: Callable[[Figure], None], panels: int, kind: str) -> bytes:
-    """A figure with room for some panels."""
-    columns = min(_COLUMNS, panels)
-    return picture(draw, (_PANEL[0] * columns, _PANEL[1] * -(-panels // columns) + 0.4), 0.1, kind)
-
-
-def _panels(figure: Figure, count: int) -> Sequence[Axes]:
+def _picture(draw: Callable[[Figure, list[Axes]], None], count: int, kind: str) -> bytes:
+    """A figure of some panels, three in a row."""
     columns = min(_COLUMNS, count)
-    axes = figure.subplots(-(-count // columns), columns, squeeze=False).ravel()
-    for unused in axes[count:]:
-        unused.set_axis_off()
-    return list(axes[:count])
+    rows = -(-count // columns)
+
+    def draw_panels(figure: Figure) -> None:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for unused in panels[count:]:
+            unused.set_axis_off()
+        draw(figure, list(panels[:count]))
+
+    return picture(draw_panels, (_PANEL[0] * columns, _PANEL[1] * rows + 0.4), 0.1, kind)
 
 
 def _slices(lens: ZoomLens) -> list[tuple[float | None, NDArray[np.intp]]]:
@@ -105,27 +89,19 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
     from matplotlib import colormaps
 
     slices = _slices(lens)
-    L = len(lens.names)
-    C = local_covariance(lens.tables.normal, L, lens.variance)
+    C = local_covariance(lens.tables.normal, len(lens.names), lens.variance)
     error = 2 * np.sqrt(np.maximum(C[:, j, j], 0.0))
     along = np.linspace(lens.low[0], lens.high[0], _FINE)
     for k, (value, members) in enumerate(slices):
-        color = colormaps["viridis"](0.85 * k / max(len(slices) - 1, 1)) if value is not None else _INK
+        color = colormaps["viridis"](0.85 * k / max(len(slices) - 1, 1)) if value is not None else INK
         settings = along[:, None] if value is None else np.column_stack([along, np.full(_FINE, value)])
         prediction = lens.predict(settings)
         middle, half = prediction.local[:, j], 2 * prediction.std[:, j]
         label = None if value is None else f"{lens.controls[1]} {value:.4g}"
         axes.fill_between(along, middle - half, middle + half, color=color, alpha=0.25, linewidth=0)
         axes.plot(along, middle, color=color, linewidth=1.2, label=label)
-        axes.errorbar(
-            lens.settings[members, 0],
-            lens.tables.local[members, j],
-            error[members],
-            fmt="o",
-            markersize=2.8,
-            elinewidth=0.7,
-            color=color,
-        )
+        places, found = lens.settings[members, 0], lens.tables.local[members, j]
+        axes.errorbar(places, found, error[members], fmt="o", markersize=2.8, elinewidth=0.7, color=color)
     unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else lens.unit if name == "t_z" else ""
     style(axes, name)
     axes.set(xlabel=lens.controls[0], ylabel=unit.replace("$", r"\$"))
@@ -139,19 +115,11 @@ def _draw_errors(
     """Error over one control as bars, over two as coloured squares."""
     style(axes, f"{title}, rms [px]")
     if len(controls) == 1:
-        axes.plot(settings[:, 0], values, "o-", color=_INK, markersize=3, linewidth=0.8)
+        axes.plot(settings[:, 0], values, "o-", color=INK, markersize=3, linewidth=0.8)
         axes.set(xlabel=controls[0], ylabel="rms [px]", ylim=(0, 1.15 * float(np.nanmax(values))))
         return
-    drawn = axes.scatter(
-        settings[:, 0],
-        settings[:, 1],
-        c=values,
-        s=90,
-        marker="s",
-        cmap="viridis",
-        edgecolors="0.4",
-        linewidths=0.4,
-    )
+    x, y = settings.T
+    drawn = axes.scatter(x, y, c=values, s=90, marker="s", cmap="viridis", edgecolors="0.4", linewidths=0.4)
     axes.set(xlabel=controls[0], ylabel=controls[1])
     axes.margins(0.1)
     figure.colorbar(drawn, ax=axes, shrink=0.9)
@@ -162,7 +130,7 @@ def _draw_baselines(axes: Axes, evaluation: LensEvaluation) -> None:
     errors = {"networks": evaluation.rmse_px, **evaluation.baselines}
     known = {name: value for name, value in errors.items() if np.isfinite(value) and value > 0}
     order = sorted(known, key=lambda name: -known[name])
-    colors = [_ACCENT if name == "networks" else _INK for name in order]
+    colors = [ACCENT if name == "networks" else INK for name in order]
     axes.barh([name.replace("_", " ") for name in order], [known[name] for name in order], color=colors)
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 

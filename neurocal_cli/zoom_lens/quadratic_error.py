@@ -30,45 +30,29 @@ class LocalModel(Protocol):
     @property
     def weights(self) -> Array:
         """(P,) what is estimated."""
-        ...
 
     @property
     def prior(self) -> Array:
         """(P,) precisions of the weights' priors about 0."""
-        ...
 
     def moved(self: Model, step: Array) -> Model:
         """After a step (P,) of the weights."""
-        ...
 
     def local(self, x: Array) -> Array:
         """(n, L) local parameters at scaled controls (n, D)."""
-        ...
 
     def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Local parameters and their derivatives by the weights (n, L, P)."""
-        ...
 
 
 @frozen_dataclass(eq=False)
 class QuadraticError:
-    """2 E of a model.
+    """2 E of a model."""
 
-    Attributes
-    ----------
-    x : (S, D) array
-        Scaled controls of the settings.
-    reference : (S, L) array
-        Local parameters at which the normal matrices were computed.
-    normal : Normal
-    variance : float [px^2]
-        Of the noise of one coordinate.
-    """
-
-    x: Array
-    reference: Array
+    x: Array  # (S, D) scaled controls of the settings
+    reference: Array  # (S, L) local parameters at which the normal matrices were computed
     normal: Normal
-    variance: float
+    variance: float  # of the noise of one coordinate [px^2]
 
     def offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
         """Differences from the reference (S, L + Q), and H times these."""

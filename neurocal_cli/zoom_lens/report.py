@@ -24,7 +24,6 @@ _TRAININGS = {
     "alternating": "trained alternately",
     "one at a time": "trained one at a time",
 }
-_UNITS = {"alpha_u": "px", "alpha_v": "px", "u0": "px", "v0": "px"}
 
 
 def lens_report(lens: ZoomLens) -> str:
@@ -34,23 +33,22 @@ def lens_report(lens: ZoomLens) -> str:
     head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
     if lens.model != "none":
         head += f", distortion model {lens.model}"
-    blocks = [head, "\n".join(align(_network_rows(lens)))]
-    tail = []
-    if lens.known:
-        tail.append(f"errors of the cameras, estimated: {_camera_errors(lens)}")
-    else:
-        tail.append(
-            f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
-            f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
-        )
+    errors = (
+        f"errors of the cameras, estimated: {_camera_errors(lens)}"
+        if lens.known
+        else f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
+        f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
+    )
     scale = _SCALES[lens.members[0].nets.scale]
     training = _TRAININGS.get(lens.training, lens.training)
-    tail += target_lines(lens.target, lens.unit)
-    tail.append(f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}")
-    tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
-    blocks.append("\n".join(tail))
-    blocks.append("\n".join(verdict_lines(judge_lens(lens))))
-    return "\n\n".join(blocks)
+    tail = [
+        errors,
+        *target_lines(lens.target, lens.unit),
+        f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}",
+        "converged" if lens.converged else "not converged: training stopped before the error settled",
+    ]
+    blocks = [[head], align(_network_rows(lens)), tail, verdict_lines(judge_lens(lens))]
+    return "\n\n".join("\n".join(block) for block in blocks)
 
 
 def lens_json(lens: ZoomLens) -> dict[str, Any]:
@@ -86,16 +84,20 @@ def _network_rows(lens: ZoomLens) -> list[list[str]]:
     prediction = lens.predict(lens.settings)
     rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
     for j, name in enumerate(lens.names):
-        topologies = sorted(
-            {(m.nets.nets[j].topology.own, m.nets.nets[j].topology.hidden) for m in lens.members}
-        )
-        units = " ".join(f"{own}+{hidden}" for own, hidden in topologies)
+        topologies = {member.nets.nets[j].topology for member in lens.members}
+        units = " ".join(f"{own}+{hidden}" for own, hidden in sorted((t.own, t.hidden) for t in topologies))
         std = float(np.median(prediction.std[:, j]))
-        low, high = (float(f(prediction.local[:, j])) for f in (np.min, np.max))
-        unit = _UNITS.get(name, lens.unit if name == "t_z" else "")
-        label = f"{name} [{unit}]" if unit else name
-        rows.append([label, units, rounded(low, std)[0], rounded(high, std)[0], rounded(low, std)[1]])
+        values = prediction.local[:, j]
+        low, high = rounded(float(values.min()), std), rounded(float(values.max()), std)
+        label = _labelled(name, lens.unit if name == "t_z" else "")
+        rows.append([label, units, low[0], high[0], low[1]])
     return rows
+
+
+def _labelled(name: str, unit: str) -> str:
+    """A parameter with its unit: pixels for four of them, or the given one."""
+    unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else unit
+    return f"{name} [{unit}]" if unit else name
 
 
 def camera_report(calibration: Calibration) -> str:
@@ -104,8 +106,7 @@ def camera_report(calibration: Calibration) -> str:
     values = [*calibration.intrinsics.values(), *calibration.distortion]
     rows = [["parameter", "value", "std"]]
     for name, value in zip(names, values, strict=True):
-        unit = "px" if name in _UNITS else "rad" if name == "theta" else ""
-        label = f"{name} [{unit}]" if unit else name
+        label = _labelled(name, "rad" if name == "theta" else "")
         if name in calibration.fixed:
             rows.append([label, f"{value:.7g}", "given"])
         else:
@@ -137,11 +138,10 @@ def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
     """A row for each baseline: fitted one parameter at a time, and jointly."""
     rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
     baselines = evaluation.baselines
-    for name in [name for name in baselines if not name.endswith("_joint")]:
-        joint = baselines.get(f"{name}_joint")
-        rows.append(
-            [name.replace("_", " "), _pixels(baselines[name]), "" if joint is None else _pixels(joint)]
-        )
+    for name, alone in baselines.items():
+        if not name.endswith("_joint"):
+            joint = baselines.get(f"{name}_joint")
+            rows.append([name.replace("_", " "), _pixels(alone), "" if joint is None else _pixels(joint)])
     return rows
 
 

@@ -1,4 +1,9 @@
-"""Assembly of a `ZoomLens` from trained networks, with its errors and warnings."""
+"""Assembly of a `ZoomLens` from trained networks, with its errors, also in cross-validation, and warnings.
+
+Near the minimum the networks are linear in their weights. With K = J A^-1 J^T H and the error e_s of setting
+s, the error of its prediction from all others is (I - K_ss)^-1 e_s (the PRESS formula), without training
+again. A setting that is suspect by this error is left out of a lens that is trained anew, which decides.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,11 @@ import numpy as np
 
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.cross_validation import left_out_errors
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, free_pose_variance
 from neurocal_cli.zoom_lens.joint_training import Joint
-from neurocal_cli.zoom_lens.setting_normals import Constants
+from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
+from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, far_value, middles
 from neurocal_cli.zoom_lens.static_calibration import first_constants, fit_local
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
@@ -19,13 +25,23 @@ from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
 # stay within 1.04 of the noise floor even between settings (slow tests in tests/test_zoom_lens.py).
 _POOR_FIT = 1.5
+# The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
+# out in tests/test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
+# changes sharply is rejected.
+_SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
+_SIGMAS = 8.0  # standard deviations from the prediction of all other settings, rms over the parameters
+_LEAST_ERROR = 5.0  # times the noise, in the image
 
 
 def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens without its errors and warnings."""
     still = start.data.still
-    scatter = np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0)
     averaged = fit_local(start.data, start.tables.local, first_constants(start.static, start.lens, still))
+
+    def of_lens(constants: Constants) -> Constants:
+        # The poses of the views of a moving camera are not part of the lens.
+        return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
+
     return ZoomLens(
         controls=start.lens.controls,
         settings=start.lens.settings,
@@ -33,11 +49,11 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         model=start.data.model,
         still=still,
         known=False,
-        members=tuple(Member(joint.nets, _without_views(joint.constants, still)) for joint in joints),
-        tables=replace(start.tables, constants=_without_views(start.tables.constants, still)),
-        static=replace(averaged, constants=_without_views(averaged.constants, still)),
+        members=tuple(Member(joint.nets, of_lens(joint.constants)) for joint in joints),
+        tables=replace(start.tables, constants=of_lens(start.tables.constants)),
+        static=replace(averaged, constants=of_lens(averaged.constants)),
         variance=start.variance,
-        scatter=scatter,
+        scatter=np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0),
         free_theta=options.free_theta,
         counts=start.data.counts,
         rmse=np.full(start.lens.n_settings, np.nan),
@@ -51,18 +67,10 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
     )
 
 
-def _without_views(constants: Constants, still: bool) -> Constants:
-    """Remove the poses of the views of a moving camera, which are not part of the lens."""
-    return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
-
-
 def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens with its errors and warnings.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The networks follow no camera at one of the settings or between them.
+    Networks that follow no camera at one of the settings or between them are an error.
     """
     lens = provisional(start, joints, options)
     x = start.controls
@@ -96,13 +104,7 @@ def _refuse_contradiction(lens: ZoomLens, each: Array) -> None:
 
 
 def refuse_gaps(lens: ZoomLens, source: str) -> None:
-    """Refuse networks that give no camera between their own settings.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        It names a setting that is far from the others.
-    """
+    """Refuse networks that give no camera between their own settings; name one far from the others."""
     try:
         lens.predict(middles(lens.settings))
     except InputError as error:
@@ -133,3 +135,56 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> t
             "give more settings"
         )
     return tuple(warnings)
+
+
+def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Array]:
+    """Errors at settings (S,), each predicted from all others.
+
+    The first are rms reprojection errors [px]. The second are squared errors of the local parameters over
+    their expectation, a mean over them; about 1.
+    """
+    tables, variance = start.tables, start.variance
+    scatter = joint.nets.local_scatter(tables.local)
+    local, J = joint.nets.local_with_jacobian(start.controls)
+    _, L, P = J.shape
+    normal = tables.normal
+    H = normal.H[:, :L, :L]
+    spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
+    # The constants of the networks differ from those of the tables; the effect is small.
+    error = local - tables.local
+    K = spread @ with_scatter(normal, scatter, variance).H[:, :L, :L] / variance
+    remain = np.eye(L) - K
+    out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
+    spread_out = np.linalg.solve(remain, spread)
+    own = variance * inverse(H) + np.diag(scatter)
+    expected = np.asarray(spread_out + own)
+    normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
+    squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
+    counts = np.maximum(normal.H[:, 2, 2], 1.0)  # the derivative by u0 is 1, so this is the number of points
+    return np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(normalised, 0.0)
+
+
+def most_suspect(pixels: Array, normalised: Array) -> int | None:
+    """The setting that the others predict worst, if far worse than the rest; of (S,) `left_out_errors`."""
+    worst = int((normalised * pixels).argmax())
+    return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
+
+
+def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | None:
+    """Reason to reject setting s, given a lens that was fitted without it; None to keep it.
+
+    The tables were fitted with the setting, whose controls are `setting` (D,).
+    """
+    try:
+        prediction = lens.predict(setting[None])
+    except InputError:  # no valid camera there, because another setting is wrong
+        return None
+    L = len(lens.names)
+    H = tables.normal.H[s, :L, :L]
+    error = prediction.local[0] - tables.local[s]
+    own = lens.variance * np.linalg.pinv(H, hermitian=True)
+    sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
+    pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
+    if sigmas < _SIGMAS or pixels < _LEAST_ERROR * lens.noise_floor_px:
+        return None
+    return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

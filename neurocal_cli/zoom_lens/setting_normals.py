@@ -31,20 +31,11 @@ _POSE_STEPS = 12  # most steps of the poses, which start at those of the last no
 
 @frozen_dataclass(eq=False)
 class Constants:
-    """Parameters that all settings share.
+    """Parameters that all settings share: theta, and the pose of a still camera or of each view."""
 
-    Attributes
-    ----------
-    theta : float [rad]
-    R : (3, 3) array or (V, 3, 3) array
-        Of the still camera, or of each view.
-    t : (2,) array or (V, 3) array
-        t_x and t_y, or the translation of each view.
-    """
-
-    theta: float
-    R: Array
-    t: Array
+    theta: float  # [rad]
+    R: Array  # (3, 3), or (V, 3, 3) for a moving camera
+    t: Array  # (2,) t_x and t_y, or (V, 3)
 
     def moved(self, step: Array) -> Constants:
         """After a step of the shared parameters: theta alone, or theta, omega, t_x, t_y."""
@@ -56,24 +47,12 @@ class Constants:
 
 @frozen_dataclass(eq=False)
 class Normal:
-    """Second-order model of the reprojection error of each setting.
+    """Second-order model of the reprojection error of each setting."""
 
-    Attributes
-    ----------
-    H : (S, L + Q, L + Q) array
-        Over the local parameters, then the shared ones.
-    g : (S, L + Q) array
-        J^T r with r = observed - predicted.
-    cost : (S,) array [px^2]
-        Sum of squared residuals.
-    sensible : bool
-        Whether all points are in front of the camera and the distortion is monotonic there.
-    """
-
-    H: Array
-    g: Array
-    cost: Array
-    sensible: bool
+    H: Array  # (S, L + Q, L + Q) over the local parameters, then the shared ones
+    g: Array  # (S, L + Q) J^T r with r = observed - predicted
+    cost: Array  # (S,) sum of squared residuals [px^2]
+    sensible: bool  # whether all points are in front of the camera, where the distortion is monotonic
 
     @property
     def blocks(self) -> Array:
@@ -85,44 +64,23 @@ class Normal:
 
 @frozen_dataclass(eq=False)
 class Tables:
-    """Local parameters at each setting and the constants that go with them.
+    """Local parameters at each setting and the constants that go with them."""
 
-    Attributes
-    ----------
-    local : (S, L) array
-    constants : Constants
-    normal : Normal
-        Linearised there. For known cameras: of the squared errors over the networks' scatter.
-    converged : bool
-    """
-
-    local: Array
+    local: Array  # (S, L)
     constants: Constants
-    normal: Normal
+    normal: Normal  # linearised there; for known cameras: of the squared errors over the networks' scatter
     converged: bool = True
 
 
 @frozen_dataclass(eq=False)
 class PixelData:
-    """Points of all settings, ready for `linearise`.
-
-    Attributes
-    ----------
-    views : Views
-    setting : (V,) int array
-    n_settings : int
-    still : bool
-        Whether neither the camera nor the target moves.
-    model : str
-        Distortion model.
-    free_theta : bool
-    """
+    """Points of all settings, ready for `linearise`."""
 
     views: Views
-    setting: NDArray[np.int64]
+    setting: NDArray[np.int64]  # (V,)
     n_settings: int
-    still: bool
-    model: str = "none"
+    still: bool  # whether neither the camera nor the target moves
+    model: str = "none"  # of the distortion
     free_theta: bool = True
 
     @classmethod
@@ -151,11 +109,7 @@ class PixelData:
     def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
         """Linearise the reprojection error at local parameters (S, L) and constants.
 
-        Returns
-        -------
-        normal : Normal
-        constants : Constants
-            The same, with the best poses where each view has its own.
+        The constants come back with the best poses where each view has its own.
         """
         state = self.state_of(local, constants)
         if not self.still:
@@ -218,7 +172,7 @@ class PixelData:
         C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
         C[:, 8:10, 9 + K : 11 + K] = np.eye(2) / scale
         C[:, -1, -1] = 1.0
-        return self._in_pixels(np.swapaxes(C, 1, 2) @ N @ C)
+        return np.swapaxes(C, 1, 2) @ N @ C * self.views.pixel_scale**2
 
     def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
         """Normal matrices over local parameters, theta and the residual, with the poses eliminated."""
@@ -229,7 +183,4 @@ class PixelData:
         C = np.zeros((V, 6 + K, 6 + K))
         C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta
         C[:, -1, -1] = 1.0
-        return self._in_pixels(np.swapaxes(C, 1, 2) @ U @ C)
-
-    def _in_pixels(self, normal: Array) -> Array:
-        return normal * self.views.pixel_scale**2
+        return np.swapaxes(C, 1, 2) @ U @ C * self.views.pixel_scale**2

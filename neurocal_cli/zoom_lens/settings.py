@@ -17,34 +17,16 @@ CONTROLS = ("zoom", "focus")
 
 @frozen_dataclass(eq=False)
 class LensPoints:
-    """Known points and their images, with the setting of each.
-
-    Attributes
-    ----------
-    points : Correspondences
-        Each view is one image and has one setting.
-    controls : tuple of str
-        zoom, focus or both.
-    settings : (S, D) array
-        The distinct settings in ascending order, in the user's units.
-    view_setting : (V,) int array
-        Number of the setting of each view.
-    """
+    """Known points and their images, with the setting of each. Each view is one image with one setting."""
 
     points: Correspondences
-    controls: tuple[str, ...]
-    settings: Array
-    view_setting: NDArray[np.int64]
+    controls: tuple[str, ...]  # zoom, focus or both
+    settings: Array  # (S, D) the distinct settings in ascending order, in the user's units
+    view_setting: NDArray[np.int64]  # (V,) number of the setting of each view
 
     @classmethod
     def grouped(cls, points: Correspondences, columns: Mapping[str, Array]) -> LensPoints:
-        """Group points by setting.
-
-        Parameters
-        ----------
-        points : Correspondences
-        columns : dict of (N,) arrays by control
-            The setting of each row.
+        """Group points by setting; `columns` (N,) by control have the setting of each row.
 
         Raises
         ------
@@ -94,19 +76,13 @@ class LensPoints:
         return dict(zip(self.controls, self.settings[self.point_setting].T, strict=True))
 
     def varying(self) -> LensPoints:
-        """Remove controls that never change.
-
-        Raises
-        ------
-        InputError
-            There is only one setting.
-        """
+        """Remove controls that never change; an error if there is only one setting."""
         moves = np.ptp(self.settings, axis=0) > 0
         if not moves.any():
             raise InputError(
                 f"{self.points.source}: all points are at one setting, "
-                f"{describe(self.controls, self.settings[0])}; "
-                "give points at several settings, or use `neurocal calibrate`"
+                f"{describe(self.controls, self.settings[0])}; give points at several settings, or use "
+                "`neurocal calibrate`"
             )
         controls = tuple(name for name, moving in zip(self.controls, moves, strict=True) if moving)
         return LensPoints(self.points, controls, self.settings[:, moves], self.view_setting)

@@ -31,36 +31,18 @@ _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 
 @frozen_dataclass(eq=False)
 class StaticFit:
-    """Independent calibrations.
+    """Independent calibrations."""
 
-    Attributes
-    ----------
-    local : (S, L) array
-    theta : (S,) array
-    R, t : (V, 3, 3), (V, 3) arrays
-        Pose of each view.
-    good : (S,) bool array
-        Where the calibration succeeded. Elsewhere the values are those of the nearest good setting.
-    reasons : dict of str by setting
-        Of the failures.
-    """
-
-    local: Array
-    theta: Array
-    R: Array
+    local: Array  # (S, L)
+    theta: Array  # (S,)
+    R: Array  # (V, 3, 3) and (V, 3): pose of each view
     t: Array
-    good: NDArray[np.bool_]
-    reasons: dict[int, str]
+    good: NDArray[np.bool_]  # (S,) calibrated; the values elsewhere are those of the nearest good setting
+    reasons: dict[int, str]  # of the failures, by setting
 
 
 def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
-    """Calibrate each setting alone, from random weights.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        Fewer than 3 settings, or fewer than half, can be calibrated.
-    """
+    """Calibrate each setting alone, from random weights; at least 3 and half of them must succeed."""
     S, V = lens.n_settings, lens.points.n_views
     local = np.zeros((S, len(data.names)))
     theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))
@@ -82,7 +64,12 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
         if cal.distortion_model == data.model:
             local[s, 4 + data.still :] = cal.distortion
         theta[s], good[s] = K.theta, np.isfinite(cal.rmse_px)
-    _refuse_failures(lens, good, reasons)
+    if good.sum() < max(3, (S + 1) // 2):
+        first = next(iter(reasons))
+        raise DegenerateGeometryError(
+            f"{int((~good).sum())} of {S} settings cannot be calibrated, the first at "
+            f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
+        )
     nearest = _nearest_good(lens, good)
     for v, s in enumerate(lens.view_setting):
         if not good[s]:
@@ -103,16 +90,6 @@ def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Ca
         if model == "none":
             raise
         return calibrated("none")
-
-
-def _refuse_failures(lens: LensPoints, good: NDArray[np.bool_], reasons: dict[int, str]) -> None:
-    if good.sum() >= max(3, (len(good) + 1) // 2):
-        return
-    first = next(iter(reasons))
-    raise DegenerateGeometryError(
-        f"{int((~good).sum())} of {len(good)} settings cannot be calibrated, the first at "
-        f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
-    )
 
 
 def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -144,13 +121,13 @@ def common_tables(
 
 def fit_local(data: PixelData, local: Array, constants: Constants) -> Tables:
     """Minimise the reprojection error over the local parameters alone."""
-    return _minimum(data, local, constants, 0, None)
+    return _minimum(data, local, constants, 0)
 
 
 def _minimum(
-    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None
+    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None = None
 ) -> Tables:
-    """Minimise over the local parameters and some constants; the local ones are eliminated."""
+    """Minimise over the local parameters, which are eliminated, and some constants."""
     tried = count()
 
     def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:

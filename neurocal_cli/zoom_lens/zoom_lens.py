@@ -15,7 +15,8 @@ from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
-from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
+
+_LEAST_INFORMATION = 0.02  # least share of a direction of the target's offsets that remains
 
 
 @frozen_dataclass(eq=False)
@@ -36,18 +37,11 @@ class RejectedSetting:
 
 @frozen_dataclass(eq=False)
 class Prediction:
-    """Predicted parameters at some settings.
+    """Predicted parameters at some settings."""
 
-    Attributes
-    ----------
-    local : (n, L) array
-    constants : Constants
-    covariance : (n, L + Q, L + Q) array
-        Of the local parameters and of theta; of omega, t_x, t_y as well for a still camera.
-    """
-
-    local: Array
+    local: Array  # (n, L)
     constants: Constants
+    # (n, L + Q, L + Q) of the local parameters and of theta; of omega, t_x, t_y as well for a still camera
     covariance: Array
 
     @property
@@ -99,7 +93,7 @@ class ZoomLens:
     target : Target or None
         The target estimated from several settings together, to which the lens was fitted.
     target_coupling : (S, L + Q, r) array or None
-        Effect of the target's uncertainty on each setting; see `zoom_lens.target_coupling`.
+        Effect of the target's uncertainty on each setting; see `zoom_lens.target`.
     free_pose_px : float [px]
         Of a still camera: the noise floor if each view had a pose of its own; nan where unknown.
     """
@@ -171,19 +165,10 @@ class ZoomLens:
     def setting_of(
         self, values: dict[str, float | None], extrapolate: bool = False
     ) -> tuple[Array, list[str]]:
-        """Check a setting and put it in the order of the controls.
+        """Check a setting, put it in the order of the controls (D,), and return it with warnings.
 
-        Parameters
-        ----------
-        values : dict
-            Value of each control; None for one that is not given.
-        extrapolate : bool
-            Whether a setting outside the calibrated range gives a warning and not an error.
-
-        Returns
-        -------
-        setting : (D,) array
-        warnings : list of str
+        The value of a control that is not given is None. A setting outside the calibrated range is an error,
+        or a warning with `extrapolate`.
 
         Raises
         ------
@@ -216,12 +201,7 @@ class ZoomLens:
         return setting, [f"{text}: the networks extrapolate there" for text in outside]
 
     def _numbers(self, settings: Array, dimensions: int) -> Array:
-        """One setting or several as an array of one or two dimensions.
-
-        Raises
-        ------
-        InputError
-        """
+        """One setting or several as an array of one or two dimensions."""
         try:
             found = np.asarray(settings, dtype=float)
         except (TypeError, ValueError):
@@ -292,3 +272,16 @@ def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants,
     )
     mean = Constants(float(theta.mean()), R, t.mean(axis=0))
     return mean, np.column_stack([theta - theta.mean(), omega, t - mean.t])
+
+
+def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance: float) -> Array:
+    """Covariance of weights and constants (P + Q, P + Q), including the uncertainty of the target.
+
+    J (S, L, P) are the derivatives of the local parameters; `target` says what the coupling (S, L + Q, r) is.
+    """
+    L = J.shape[1]
+    K = np.concatenate([np.einsum("slp,slr->pr", J, coupling[:, :L]), coupling[:, L:].sum(axis=0)]) / variance
+    follow = covariance @ K
+    values, vectors = np.linalg.eigh(np.eye(K.shape[1]) - K.T @ follow)
+    follow = follow @ (vectors / np.sqrt(np.maximum(values, _LEAST_INFORMATION)))
+    return covariance + follow @ follow.T

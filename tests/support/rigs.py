@@ -10,8 +10,7 @@ from neurocal_cli import Camera, Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.reprojection import residuals
 from neurocal_cli.camera.distortion import Distortion, distort
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.problem import RigProblem
-from neurocal_cli.stereo.reprojection import RigState
+from neurocal_cli.stereo.adjust import RigProblem, RigState
 
 KINDS = ("parallel", "verging", "wide", "narrow", "unequal")
 
@@ -136,7 +135,7 @@ def all_residuals(problem: RigProblem, state: RigState) -> Array:
     """Whitened residuals, computed through no more than the cameras' own projections."""
     out = []
     for side, seen in enumerate(problem.observations):
-        camera = state.camera_with_poses(side, problem.frames, seen)
+        camera = problem.camera(state, side)
         error = residuals(seen.batches, camera)
         if seen.batches.whitening is not None:
             error = error * (seen.batches.whitening[:, :1] > 0)
