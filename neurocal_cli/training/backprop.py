@@ -133,9 +133,8 @@ def _presenter(method: str) -> tuple[_Present, _Bound | None]:
     """Functions that present the patterns and bound the rates; only this imports numba."""
     if method != "blocks":
         from neurocal_cli.training import backprop_kernel as kernel
-        from neurocal_cli.training.compile import COMPILING
 
-        if COMPILING or method == "patterns":
+        if kernel.COMPILING or method == "patterns":
             return kernel.present, None
     from neurocal_cli.training import backprop_blocks as blocks
 
