@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.crossing_edges import AlongEdges, positions_along_edges
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
-from neurocal_cli.detection.fitting.edge_profile import response
+from neurocal_cli.detection.fitting.edge_profile import response, sharp_profile
 from neurocal_cli.detection.fitting.grid_fit import (
     GridEdges,
     GridFit,
@@ -28,7 +28,6 @@ from neurocal_cli.detection.fitting.grid_fit import (
     fit_grid_vertices,
     fit_rim,
 )
-from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median

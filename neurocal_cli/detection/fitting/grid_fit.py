@@ -26,12 +26,20 @@ from neurocal_cli.detection.fitting.common_parameters import (
     level_prior,
     profile_shape,
 )
-from neurocal_cli.detection.fitting.edge_fit import OFFSET, edge_model, light_at, moments
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_fit import (
+    OFFSET,
+    REACH,
+    SHARP,
+    edge_model,
+    edge_pixels,
+    light_at,
+    moments,
+    usual_stride,
+)
+from neurocal_cli.detection.fitting.edge_profile import half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
-from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels

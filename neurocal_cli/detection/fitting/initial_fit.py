@@ -17,16 +17,15 @@ from neurocal_cli.detection.fitting.batched_newton import (
     fit_batch,
 )
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
-from neurocal_cli.detection.fitting.edge_fit import edge_model
-from neurocal_cli.detection.fitting.edge_pixels import (
+from neurocal_cli.detection.fitting.edge_fit import (
     REACH,
     SHARP,
+    edge_model,
     edge_pixels,
     usual_stride,
 )
-from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis, half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_typical
-from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median

@@ -22,9 +22,8 @@ from neurocal_cli.detection.fitting.batched_newton import (
     Single,
     rows_for,
 )
-from neurocal_cli.detection.fitting.edge_pixels import ALONE, REACH
-from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response
-from neurocal_cli.detection.fitting.pixel_box import sharp_profile
+from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
+from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response, sharp_profile
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
