@@ -16,18 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.accept import edges_visible, has_block, is_smooth
+from neurocal_cli.detection.finding.checks import edges_visible, has_block, is_smooth
 from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grow import grow, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
-from neurocal_cli.detection.finding.links import Links, find_links
-from neurocal_cli.detection.finding.merge import merge_lattices
-from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
-from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
-from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally
-from neurocal_cli.detection.finding.stretch import stretch
+from neurocal_cli.detection.finding.links import Links, find_links, find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.overlaps import (
+    any_overlap,
+    drop_duplicates,
+    merge_lattices,
+    trim_overlaps,
+)
+from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally, stretch
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array

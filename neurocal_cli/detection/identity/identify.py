@@ -30,8 +30,7 @@ from neurocal_cli.detection.identity.messages import (
     ambiguous,
     wrong_size,
 )
-from neurocal_cli.detection.identity.placement import Placement, placements
-from neurocal_cli.detection.identity.trim import trimmed
+from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
