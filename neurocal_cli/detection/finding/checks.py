@@ -28,21 +28,12 @@ _LEAST_EDGE = 0.3  # least step across an edge, relative to the contrast
 
 @frozen_dataclass(eq=False)
 class VertexCheck:
-    """Result of the samples around points.
+    """Result of the samples around N points."""
 
-    Attributes
-    ----------
-    contrast : (N,) array [DN]
-        Mean of the bright minus mean of the dark squares; negative if the colours are swapped.
-    evenness : (N,) array
-        Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
-    is_vertex : (N,) bool array
-        Whether there are two bright and two dark squares, and an edge between each two neighbours.
-    """
-
+    # [DN] mean of the bright minus mean of the dark squares; negative if the colours are swapped
     contrast: Array
-    evenness: Array
-    is_vertex: NDArray[np.bool_]
+    evenness: Array  # darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex
+    is_vertex: NDArray[np.bool_]  # two bright and two dark squares, and an edge between each two neighbours
 
 
 def _offsets() -> Array:
@@ -62,16 +53,9 @@ _STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-
 
 
 def check_vertices(level: Level, points: Array, predicted: PredictedVertices, dark: Array) -> VertexCheck:
-    """Sample the squares and edges around points.
+    """Sample the squares and edges around points (N, 2) [px], where the grid has the predicted steps.
 
-    Parameters
-    ----------
-    level : Level
-    points : (N, 2) array [px]
-    predicted : PredictedVertices
-        The steps of the grid at the points.
-    dark : (N,) array of +-1
-        +1 if the square towards growing c and r is dark.
+    `dark` (N,) is +1 if the square towards growing c and r is dark, else -1.
     """
     places = predicted.around(_OFFSETS, points)
     value = interpolate(level.smooth, places)

@@ -49,22 +49,14 @@ Size = tuple[int, int]
 
 
 def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list[Grid]:
-    """Find every chessboard in an image.
+    """Find every chessboard in a grey image (height, width) of 8 or 16 bits, or of real numbers of any range.
 
-    Parameters
-    ----------
-    image : (height, width) array
-        Grey, of 8 or 16 bits or real numbers of any range.
-    sizes : collection of (int, int), optional
-        Columns and rows, in either order, of the only board wanted. Once it is found whole, boards far behind
-        it, with squares less than a third as large, are not searched.
+    `sizes` are the columns and rows, in either order, of the only board wanted. Once it is found whole,
+    boards far behind it, with squares less than a third as large, are not searched.
 
-    Returns
-    -------
-    grids : list of Grid
-        The largest in the image first. Vertices are accurate to a few tenths of a pixel. Planes that meet at
-        a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones occur in clutter
-        and no third vertex tests their lines.
+    Returns the largest grid in the image first. Vertices are accurate to a few tenths of a pixel. Planes that
+    meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones occur in
+    clutter and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)

@@ -29,20 +29,11 @@ _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 
 @frozen_dataclass(eq=False)
 class Links:
-    """Saddles and their neighbours along their edges.
-
-    Attributes
-    ----------
-    saddles : Saddles
-    to : (N, 4) int array
-        The neighbour at each port; -1 if there is none.
-    port : (N, 4) int array
-        The neighbour's port at the other end of the edge.
-    """
+    """Saddles and their neighbours along their edges."""
 
     saddles: Saddles
-    to: Index
-    port: Index
+    to: Index  # (N, 4) the neighbour at each port; -1 if there is none
+    port: Index  # (N, 4) the neighbour's port at the other end of the edge
 
     @cached_property
     def lists(self) -> tuple[list[list[int]], list[list[int]]]:
@@ -53,16 +44,8 @@ class Links:
 def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links | None:
     """Find saddles, and link pairs that are each other's nearest suitable neighbour at their ports.
 
-    Parameters
-    ----------
-    level : Level
-    covered : (height, width) uint8 array, optional
-        Non-zero pixels are not searched.
-
-    Returns
-    -------
-    links : Links or None
-        None if there are fewer saddles than vertices of the smallest board.
+    Pixels where `covered` is not 0 are not searched. None if there are fewer saddles than vertices of the
+    smallest board.
     """
     saddles = find_saddles(level, covered)
     count = len(saddles)
@@ -142,10 +125,7 @@ _SECOND = 0.4  # ... or greatest second difference times this weight
 def find_seeds_3x3(links: Links) -> Index:
     """Find blocks of four closed squares around a vertex, the most regular first.
 
-    Returns
-    -------
-    members : (S, 3, 3) int array
-        Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle saddle and r along port 1.
+    Returns saddles (S, 3, 3); ``[.., r, c]`` with c along port 0 of the middle saddle and r along port 1.
     """
     centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
@@ -168,14 +148,9 @@ def whole_blocks(links: Links) -> Index:
 
 
 def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
-    """Find blocks of two closed squares side by side.
+    """Find blocks of two closed squares side by side, the most regular first.
 
-    Returns
-    -------
-    members : (S, 2, 3) int array
-        Saddles of each block, the most regular first.
-    dark : (S,) int array
-        As in `Lattice`.
+    Returns saddles (S, 2, 3), and whether each block is dark (S,) as in `Lattice`.
     """
     closed = _closed(links)
     middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))

@@ -33,20 +33,11 @@ _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 @frozen_dataclass(eq=False)
 class PredictedVertices:
-    """Predicted vertices.
+    """N predicted vertices."""
 
-    Attributes
-    ----------
-    points : (N, 2) array [px]
-    steps : (N, 2, 2) array [px]
-        From the point to the next vertex along its row, and along its column.
-    spread : (N,) array
-        Standard deviation of the point for unit standard deviation of the vertices.
-    """
-
-    points: Array
-    steps: Array
-    spread: Array
+    points: Array  # (N, 2) [px]
+    steps: Array  # (N, 2, 2) [px] to the next vertex along the point's row, and along its column
+    spread: Array  # (N,) standard deviation of the point for unit standard deviation of the vertices
 
     def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
         """Select some predictions."""
@@ -97,14 +88,7 @@ def _window(width: int) -> NDArray[np.intp]:
 
 
 def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
-    """Predict vertices, known or unknown, from their neighbours.
-
-    Parameters
-    ----------
-    pixels : (rows, cols, 2) array [px]
-        NaN where unknown.
-    row, col : (N,) int arrays
-    """
+    """Predict vertices at rows and columns (N,), known or not, of an array (rows, cols, 2) [px]."""
     rows, cols = pixels.shape[:2]
     padded = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
     inner = padded[:, _REACH:-_REACH, _REACH:-_REACH]

@@ -46,22 +46,12 @@ _SIGMA = 0.15  # squares; smoothing of derivatives, in steps of 0.25 px
 
 @frozen_dataclass(eq=False)
 class PlaneView:
-    """A view perpendicular to a plane, sampled from the image through the fitted lens.
-
-    Attributes
-    ----------
-    fit : WideFit
-    square : float [px]
-        Side of a square in the view.
-    first : (2,) array [squares]
-        Grid coordinates of the view's first pixel.
-    size : (width, height) [px]
-    """
+    """A view perpendicular to a plane, sampled from the image through the fitted lens."""
 
     fit: WideFit
-    square: float
-    first: Array
-    size: tuple[int, int]
+    square: float  # [px] side of a square in the view
+    first: Array  # (2,) [squares] grid coordinates of the view's first pixel
+    size: tuple[int, int]  # (width, height) [px]
 
     @classmethod
     def of(cls, fit: WideFit, places: Array) -> PlaneView:
@@ -111,21 +101,9 @@ def find_bent(
 ) -> list[Lattice]:
     """Search again around groups of linked saddles that exceed the lattices, and around unfinished lattices.
 
-    Parameters
-    ----------
-    level : Level
-    links : Links
-        Of the whole level, including known lattices.
-    known : list of Lattice
-    unfinished : list of Lattice
-        Known lattices that a wide lens may have kept from growing.
-    search : function of an image
-        Finds the lattices of an image.
-
-    Returns
-    -------
-    lattices : list of Lattice
-        Each has more vertices than the known ones at the same place.
+    The links are those of the whole level, including known lattices. Unfinished lattices are known ones that
+    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found has
+    more vertices than the known ones at the same place.
     """
     found: list[Lattice] = []
     groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]
@@ -230,18 +208,10 @@ _MOST_COVERED = 0.25  # greatest share of the image that the saddles may cover
 
 @frozen_dataclass(eq=False)
 class Stretched:
-    """A part of a level, stretched.
-
-    Attributes
-    ----------
-    level : Level
-        The part, with its own pixel coordinates.
-    forth : (2, 3) array
-        Affine map from pixels of the original to those of the part.
-    """
+    """A part of a level, stretched, with its own pixel coordinates."""
 
     level: Level
-    forth: Array
+    forth: Array  # (2, 3) affine map from pixels of the original to those of the part
 
     def back(self, points: Array) -> Array:
         """Map points (..., 2) of the part to the original [px]."""
@@ -249,17 +219,9 @@ class Stretched:
 
 
 def stretch(level: Level, saddles: Array) -> Stretched | None:
-    """Stretch the surroundings of saddles across the direction of most edges.
+    """Stretch the surroundings of saddles (N, 2) [px] across the direction of most edges.
 
-    Parameters
-    ----------
-    level : Level
-    saddles : (N, 2) array [px]
-
-    Returns
-    -------
-    part : Stretched or None
-        None if the saddles cover too much of the image, or the edges have no main direction.
+    None if the saddles cover too much of the image, or the edges have no main direction.
     """
     height, width = level.image.shape
     away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)

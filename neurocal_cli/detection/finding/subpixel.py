@@ -40,21 +40,10 @@ def _window(half: int, width: int) -> NDArray[np.intp]:
 
 
 def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
-    """Move points to the nearest saddle points.
+    """Move points (N, 2) [px] to the nearest saddle points by some rounds of Newton steps.
 
-    Parameters
-    ----------
-    image : (height, width) float32 array
-    start : (N, 2) array [px]
-    sigma : float [px]
-        Smoothing of the derivatives: about a sixth of the squares' width.
-    rounds : int
-        Newton steps.
-
-    Returns
-    -------
-    points : (N, 2) array [px]
-        NaN if there is no saddle point or the window leaves the image.
+    Derivatives are smoothed by `sigma` [px], about a sixth of the squares' width. A point becomes NaN if
+    there is no saddle point or the window leaves the image.
     """
     half, _ = _derivatives(sigma)
     height, width = image.shape

@@ -39,27 +39,13 @@ _NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 @frozen_dataclass(eq=False)
 class FitPixels:
-    """Pixels of fits, (E, N) float32 arrays.
+    """Pixels of fits, (E, N) float32 arrays."""
 
-    Attributes
-    ----------
-    value : array [DN]
-        Without the gradient of the mean level.
-    gain : array
-        Half contrast at the pixel, relative to that at the fit's middle.
-    Q : array
-        Effect of other lines on the light; see the models.
-    root : array [1/DN]
-        Inverse standard deviation of the noise; 0 for pixels that are not used.
-    beyond : (E,) array
-        Share of the pixels that lie outside the image.
-    """
-
-    value: Single
-    gain: Single
-    Q: Single
-    root: Single
-    beyond: Array
+    value: Single  # [DN] without the gradient of the mean level
+    gain: Single  # half contrast at the pixel, relative to that at the fit's middle
+    Q: Single  # effect of other lines on the light; see the models
+    root: Single  # [1/DN] inverse standard deviation of the noise; 0 for pixels that are not used
+    beyond: Array  # (E,) share of the pixels that lie outside the image
 
     def part(self: Pixels, which: Part) -> Pixels:
         """Select the pixels of some fits."""
@@ -77,16 +63,10 @@ Pixels = TypeVar("Pixels", bound=FitPixels)
 
 @frozen_dataclass(eq=False)
 class LevelPrior:
-    """Gaussian prior for mean level, half contrast and blur.
+    """Gaussian prior for mean level, half contrast and blur."""
 
-    Attributes
-    ----------
-    mean : (E, 3) array [DN, DN, px]
-    precision : (E, 3, 3) array
-    """
-
-    mean: Array
-    precision: Array
+    mean: Array  # (E, 3) [DN, DN, px]
+    precision: Array  # (E, 3, 3)
 
     def part(self, which: NDArray[np.intp]) -> LevelPrior:
         """Select the priors of some fits."""
@@ -95,21 +75,12 @@ class LevelPrior:
 
 @frozen_dataclass(eq=False)
 class ProfileShape:
-    """Shape of the edges' profiles; see `edge_profile`.
+    """Shape of the edges' profiles; see `edge_profile`."""
 
-    Attributes
-    ----------
-    tails : (E, 2) array
-        a_3 and a_5 of each edge.
-    nonlinearity : (RESPONSE_TERMS,) array
-        b_0, b_1, ... of the response, the same for all edges.
-    half : (E, 2) array or None [px]
-        Half widths of the pixel's box along the edges' normals (see `pixel_box`), if edges are so sharp that
-        they matter; (V, 2, 2) for both lines through vertices.
-    """
-
-    tails: Array
-    nonlinearity: Array
+    tails: Array  # (E, 2) a_3 and a_5 of each edge
+    nonlinearity: Array  # (RESPONSE_TERMS,) b_0, b_1, ... of the response, the same for all edges
+    # (E, 2) [px] `half_widths` of the pixel's box, if edges are so sharp that they matter; (V, 2, 2) for both
+    # lines through vertices
     half: Array | None = None
 
     def part(self, which: Part) -> ProfileShape:
@@ -126,20 +97,13 @@ class ProfileShape:
 
 @frozen_dataclass(eq=False)
 class Linearised:
-    """A model linearised at some values.
+    """A model linearised at some values."""
 
-    Attributes
-    ----------
-    rows : (E, R, N) array
-        The residual and the model's derivatives by the P values, in standard deviations of the pixel noise;
-        see `rows_for`.
-    z, x : (E, N) arrays
-        Distance from the edge in sigma, and light between the levels.
-    """
-
+    # (E, R, N) the residual and the derivatives by the P values, in standard deviations of the pixel noise;
+    # see `rows_for`
     rows: Single
-    z: Single
-    x: Single
+    z: Single  # (E, N) distance from the edge in sigma
+    x: Single  # (E, N) light between the levels
 
     @property
     def residual(self) -> Single:
@@ -172,35 +136,17 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
 
 @frozen_dataclass(eq=False)
 class BatchFit:
-    """Result of many fits.
+    """Result of many fits."""
 
-    Attributes
-    ----------
-    values : (E, P) array
-        Offsets and tilts first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
-    information : (E, P, P) array
-        Fisher information of the pixels, without the prior.
-    prior : LevelPrior
-    chi2 : (E,) array
-        Weighted sum of squared residuals.
-    model : function of pixels, values and shape
-    pixels : FitPixels
-    shape : ProfileShape
-    step : (E,) array
-        Length of the last step, in standard deviations.
-    linear : Linearised
-        The model at the values.
-    """
-
-    values: Array
-    information: Array
+    values: Array  # (E, P) offsets and tilts first; the last three are at `MEAN`, `CONTRAST`, `BLUR`
+    information: Array  # (E, P, P) Fisher information of the pixels, without the prior
     prior: LevelPrior
-    chi2: Array
+    chi2: Array  # (E,) weighted sum of squared residuals
     model: Callable[[Any, Array, ProfileShape], Linearised]
     pixels: FitPixels
     shape: ProfileShape
-    step: Array
-    linear: Linearised
+    step: Array  # (E,) length of the last step, in standard deviations
+    linear: Linearised  # the model at the values
 
     @cached_property
     def covariance(self) -> Array:
@@ -249,18 +195,9 @@ def fit_batch(
     steps: int,
     more: int = _MORE_STEPS,
 ) -> BatchFit:
-    """Run all fits together, and then continue those that have not converged.
+    """Run all fits together from values (E, P), and then continue those that have not converged.
 
-    Parameters
-    ----------
-    model : function of pixels, values and shape
-    pixels : FitPixels
-    start : (E, P) array
-        Initial values.
-    prior : LevelPrior
-    shape : ProfileShape
-    steps, more : int
-        Greatest numbers of steps of all fits together, and of those that have not converged.
+    `steps` and `more` are the greatest numbers of steps of all, and of those that continue.
     """
 
     def model_of(part: Part) -> Callable[[Array], Linearised]:

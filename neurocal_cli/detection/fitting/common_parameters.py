@@ -62,14 +62,7 @@ class PixelNoise:
 
     @classmethod
     def of(cls, fit: BatchFit, floor: float) -> PixelNoise:
-        """Estimate the noise from the residuals of fits.
-
-        Parameters
-        ----------
-        fit : BatchFit
-        floor : float [DN^2]
-            Least variance, that of rounding.
-        """
+        """Estimate the noise from the residuals of fits; `floor` [DN^2], that of rounding, is the least."""
         x, root = fit.linear.x, fit.pixels.root
         used = root > 0
         square = np.square(fit.linear.residual / np.maximum(root, _TINY))
@@ -96,15 +89,9 @@ class PixelNoise:
 
 
 def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
-    """Improve the shape of the profile by linear least squares on the residuals of all fits.
+    """Improve the shape of the profile by linear least squares on the residuals of the good fits.
 
     Shift, blur and levels are unknowns, too, because they have absorbed a part of the shape.
-
-    Parameters
-    ----------
-    fit : BatchFit
-    good : (E,) bool array
-        Edges to use.
     """
     # A part of the pixels is enough for a dozen unknowns.
     data, shape = fit.pixels, fit.shape
@@ -147,18 +134,10 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
 
 @frozen_dataclass(eq=False)
 class BoardBlur:
-    """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n.
+    """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n."""
 
-    Attributes
-    ----------
-    matrix : (2, 2) array [px^2]
-        S; a multiple of the identity if there is no motion blur and no astigmatism.
-    spread : float [px^2]
-        Variance of the blur of single edges around it, without the variance of the fits.
-    """
-
-    matrix: Array
-    spread: float
+    matrix: Array  # (2, 2) [px^2] S; a multiple of the identity if there is no motion blur and no astigmatism
+    spread: float  # [px^2] variance of the blur of single edges around it, without the variance of the fits
 
     @classmethod
     def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
@@ -186,21 +165,12 @@ class BoardBlur:
 
 @frozen_dataclass(eq=False)
 class FieldBlur:
-    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction.
-
-    Attributes
-    ----------
-    frame : Frame
-        Scales the pixels.
-    terms : (8,) array
-        Coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a.
-    relative : float
-        Variance of log sigma of single edges around it, without the variance of the fits.
-    """
+    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction."""
 
     frame: Frame
+    # (8,) coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a
     terms: Array
-    relative: float
+    relative: float  # variance of log sigma of single edges around it, without the variance of the fits
 
     @classmethod
     def of(cls, fit: BatchFit, lines: Lines, good: NDArray[np.bool_], frame: Frame) -> FieldBlur:
@@ -237,18 +207,10 @@ def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
 def level_prior(
     shading: Shading, place: Array, sigma: Array, blur_spread: Array | float, noise: float
 ) -> LevelPrior:
-    """Prior for the levels and the blur of single edges from those of the whole board.
+    """Prior for the levels and the blur of single edges at places (E, 2) [px] from those of the whole board.
 
-    Parameters
-    ----------
-    shading : Shading
-    place : (E, 2) array [px]
-    sigma : (E,) array [px]
-        Blur.
-    blur_spread : float or (E,) array [px^2]
-        Variance of the blur of single edges around it.
-    noise : float [DN^2]
-        Variance of a pixel.
+    `sigma` (E,) [px] is their blur, `blur_spread` [px^2] the variance of single edges around it, and `noise`
+    [DN^2] that of a pixel.
     """
     mean, contrast = shading.at(place)
     low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)

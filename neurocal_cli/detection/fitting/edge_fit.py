@@ -46,21 +46,11 @@ _COLUMNS = 40  # columns of pixels along an edge before the last fit
 
 @frozen_dataclass(eq=False)
 class EdgePixels(FitPixels):
-    """Pixels of edges for the fits, (E, N) float32 arrays.
+    """Pixels of edges for the fits, (E, N) float32 arrays."""
 
-    Attributes
-    ----------
-    lever : array
-        Tangential coordinate over half the edge's length.
-    d : array [px]
-        Distance from the edge's line.
-    R : array
-        See the module.
-    """
-
-    lever: Single
-    d: Single
-    R: Single
+    lever: Single  # tangential coordinate over half the edge's length
+    d: Single  # [px] distance from the edge's line
+    R: Single  # see the module
 
 
 def edge_pixels(
@@ -72,22 +62,11 @@ def edge_pixels(
     stride: int,
     crossed: NDArray[np.bool_] | None = None,
 ) -> EdgePixels:
-    """Gather the pixels around edges, all with weight 1.
+    """Gather the pixels around edges of blur `sigma` (E,) [px], all with weight 1.
 
-    Parameters
-    ----------
-    image : (H, W) array
-    lines : Lines
-    sigma : (E,) array [px]
-        Blur.
-    shading : Shading
-    reach : (E,) array [px]
-        Half width of the strips.
-    stride : int
-        Use only every n-th column; 1 for the last fit, when the crossing lines are well known.
-    crossed : (E, 2) bool array, optional
-        Whether another line crosses the edge at each end; by default at all. At other ends the board may end,
-        and a part of the edge is left out.
+    `reach` (E,) [px] is the half width of the strips. Only every `stride`-th column is used; 1 is for the
+    last fit, when the crossing lines are well known. `crossed` (E, 2) tells whether another line crosses the
+    edge at each end, by default at all. At other ends the board may end, and a part of the edge is left out.
     """
     crossed = np.ones((len(sigma), 2), dtype=np.bool_) if crossed is None else crossed
     trim = (_RIM * lines.length + _RIM_BLUR * sigma)[:, None] * ~crossed
@@ -132,22 +111,10 @@ _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
-    """Estimate offset, slope and blur of edges in closed form, for an edge anywhere in its strip.
+    """Estimate offset [px], slope and blur [px] (E,) of edges anywhere in strips of half widths (E,) [px].
 
-    With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and that of 1 - e^2 is
-    4 sigma / sqrt(pi) over the width. The estimate is inaccurate, but needs no initial value.
-
-    Parameters
-    ----------
-    strips : Strips
-    half_width : (E,) array [px]
-    mean, contrast : (E,) arrays [DN]
-
-    Returns
-    -------
-    offset : (E,) array [px]
-    slope : (E,) array
-    sigma : (E,) array [px]
+    With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and the mean of 1 - e^2 is 4
+    sigma / sqrt(pi) over the width. The estimate is inaccurate, but needs no initial value.
     """
     inside = strips.inside.astype(np.float32)
     one = np.float32(1.0)

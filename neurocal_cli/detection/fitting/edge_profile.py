@@ -54,13 +54,7 @@ _PEAK = float(1 / np.sqrt(2 * np.pi))
 
 
 def erf_and_density(z: Real) -> tuple[Real, Real]:
-    """Error function ``erf(z / sqrt 2)`` and normal density ``exp(-z^2 / 2) / sqrt(2 pi)``.
-
-    Parameters
-    ----------
-    z : array
-        float32 or float64; the results have the same type.
-    """
+    """``erf(z / sqrt 2)`` and the normal density ``exp(-z^2 / 2) / sqrt(2 pi)``, in float32 or float64."""
     bell = z * z
     bell *= -0.5
     np.exp(bell, out=bell)
@@ -90,14 +84,7 @@ _SIGN_BITS = {4: (np.int32, np.int32(-(2**31))), 8: (np.int64, np.int64(-(2**63)
 
 
 def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
-    """E(z), its derivative, and the normal density.
-
-    Parameters
-    ----------
-    z : (E, N) array
-    tails : (E, 2) array
-        Coefficients a_3 and a_5.
-    """
+    """E(z), its derivative, and the normal density, with coefficients a_3 and a_5 (E, 2)."""
     value, density = erf_and_density(z)
     slope = 2 * density
     if tails.any():
@@ -170,16 +157,9 @@ def response_terms(x: Real, scale: Real, out: Real) -> None:
 
 
 def box_kurtosis(normal: Array, sigma: Array) -> Array:
-    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``.
+    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``, for normals (E, 2).
 
     It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
-
-    Parameters
-    ----------
-    normal : (E, 2) array
-        Unit normals.
-    sigma : (E,) array [px]
-        sigma_t.
     """
     return np.asarray((normal**4).sum(axis=-1) / (1440 * sigma**4))
 
@@ -196,21 +176,9 @@ def half_widths(normal: Array) -> Array:
 
 
 def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
-    """Edge spread function from -1 to +1, and its derivatives.
+    """Edge spread function at distances d (E, N) [px], and its derivatives by d and by sigma [1/px].
 
-    Parameters
-    ----------
-    d : (E, N) array [px]
-        Distance from the edge.
-    sigma : (E, 1) array [px]
-        ``sigma^2 = psf^2 + 1/12``.
-    half : (E, 2) array [px]
-
-    Returns
-    -------
-    value : (E, N) array
-    slope, widening : (E, N) arrays [1/px]
-        Derivatives by d and by sigma.
+    `sigma` is (E, 1) [px], ``sigma^2 = psf^2 + 1/12``, and `half` (E, 2) [px] as of `half_widths`.
     """
     kind = d.dtype
     a, b = (half[:, k, None].astype(kind) for k in (0, 1))
@@ -242,16 +210,8 @@ def sharp_profile(
     """E(z), its derivative by z, the extra derivative by log sigma, and the normal density.
 
     If the profile only scaled with sigma, the derivative of E(d / sigma) by log sigma would be -z times that
-    by z. The pixel's box does not grow with the blur, which adds the third result.
-
-    Parameters
-    ----------
-    z : (E, N) array
-    sigma : (E, 1) array [px]
-    tails : (E, 2) array
-        As in `profile`.
-    half : (E, 2) array or None [px]
-        None for `profile` itself.
+    by z. The pixel's box does not grow with the blur, which adds the third result. Without half widths of the
+    box, it is `profile`.
     """
     if half is None:
         value, slope, density = profile(z, tails)

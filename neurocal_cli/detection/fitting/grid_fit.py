@@ -79,25 +79,13 @@ _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile
 
 @frozen_dataclass(eq=False)
 class GridEdges:
-    """The edges between neighbouring vertices of a grid, those along c first.
+    """E edges of a grid, those along c first."""
 
-    Attributes
-    ----------
-    index : (E, 2) int array
-        First vertex, (c, r).
-    vertical : (E,) bool array
-    centre : (E, 2) array [squares]
-    light : (E,) array
-        +1 if the light side is that of growing r (growing c for vertical edges), else -1.
-    known : (E, 2) bool array
-        Whether the vertices at both ends are known.
-    """
-
-    index: NDArray[np.int64]
+    index: NDArray[np.int64]  # (E, 2) first vertex, (c, r)
     vertical: NDArray[np.bool_]
-    centre: Array
-    light: Array
-    known: NDArray[np.bool_]
+    centre: Array  # (E, 2) [squares]
+    light: Array  # (E,) +1 if the light side is that of growing r (growing c for vertical edges), else -1
+    known: NDArray[np.bool_]  # (E, 2) whether the vertices at both ends are known
 
     @classmethod
     def of(cls, grid: Grid) -> GridEdges:
@@ -139,24 +127,13 @@ class GridEdges:
 
 @frozen_dataclass(eq=False)
 class GridImage:
-    """An image and a grid in it, prepared for the fits.
-
-    Attributes
-    ----------
-    image : (H, W) array [DN]
-    grid : Grid
-    edges : GridEdges
-    anchors : Observations
-        The found vertices.
-    floor : float [DN^2]
-        Least variance of the pixels, that of rounding.
-    """
+    """An image [DN] and a grid in it, prepared for the fits."""
 
     image: Image
     grid: Grid
     edges: GridEdges
-    anchors: Observations
-    floor: float
+    anchors: Observations  # the found vertices
+    floor: float  # [DN^2] least variance of the pixels, that of rounding
 
     @classmethod
     def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
@@ -191,25 +168,14 @@ class GridImage:
 
 @frozen_dataclass(eq=False)
 class GridFit:
-    """Fitted edges and their common parameters.
-
-    Attributes
-    ----------
-    lines : Lines
-    fit : BatchFit
-    map : MapFit
-    shading : Shading
-    noise : PixelNoise
-    good : (E,) bool array
-        Edges that passed the quality tests.
-    """
+    """Fitted edges and their common parameters."""
 
     lines: Lines
     fit: BatchFit
     map: MapFit
     shading: Shading
     noise: PixelNoise
-    good: NDArray[np.bool_]
+    good: NDArray[np.bool_]  # (E,) edges that passed the quality tests
 
     @property
     def offset_variance(self) -> Array:

@@ -45,19 +45,9 @@ _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to co
 def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
 ) -> BatchFit:
-    """Fit edges with independent levels.
+    """Fit edges with independent levels, from initial distances (E,) from their lines and blur [px].
 
-    Parameters
-    ----------
-    image : (H, W) array
-    lines : Lines
-    offset : (E,) array [px]
-        Initial distances of the edges from their lines.
-    sigma : float [px]
-        Initial blur.
-    shading : Shading
-    noise : float [DN^2]
-        Variance of a pixel.
+    `noise` [DN^2] is the variance of a pixel.
     """
     known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
