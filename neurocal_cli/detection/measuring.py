@@ -46,25 +46,12 @@ def measure(
     points: Points = "midpoints",
     gamma: float | None = None,
 ) -> Measured:
-    """Measure the mid-points of edges, or the vertices.
+    """Measure the mid-points of edges, or the vertices, of a grid with vertices known to half a pixel.
 
-    Parameters
-    ----------
-    image : (H, W) array of uint8, uint16 or float
-        Grey.
-    grid : Grid
-        Vertices known to about half a pixel.
-    points : {"midpoints", "edges", "vertices"}
-        Mid-points of the edges between known vertices; these and the mid-points of the edges to the rim; or
-        vertices.
-    gamma : float, optional
-        Pixels are ``light^(1 / gamma)``; they are linearised first. Without it, the effect of the response on
-        the edges is estimated.
-
-    Returns
-    -------
-    measured : Measured
-        Without the points whose fits were rejected.
+    The grey image (H, W) is uint8, uint16 or float. `points` are the mid-points of the edges between known
+    vertices ("midpoints"), these and the mid-points of the edges to the rim ("edges"), or the vertices. If a
+    camera's `gamma` is given, pixels are ``light^(1 / gamma)`` and are linearised first; without it, the
+    effect of the response on the edges is estimated. Points whose fits are rejected are left out.
     """
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)

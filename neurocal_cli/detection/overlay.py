@@ -37,21 +37,11 @@ _GRIDS: tuple[Colour, ...] = ((255, 170, 0), (0, 220, 255), (120, 255, 120), (25
 
 
 def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
-    """Draw the points of a detection.
+    """Draw the points of a detection over a grey image; (height, width, 3) in the order red, green, blue.
 
     Crosses are the measured points, coloured by kind. Red lines are the residuals from a smooth map of the
     plane (`plane_residuals`), enlarged by the factor in the title. A circle marks vertex (0, 0), from which
     the axes of the plane start; the outermost vertices carry their ids.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-    detection : Detection
-
-    Returns
-    -------
-    picture : (height, width, 3) uint8 array
-        Red, green, blue.
     """
     residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
@@ -70,14 +60,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
 
 
 def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str) -> Picture:
-    """Draw the grids found in an image in which the board was not detected, with the reason.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-    grids : sequence of Grid
-    problem : str
-    """
+    """Draw the grids found in an image in which the board was not detected, with the reason."""
     sizes = ", ".join("{} x {}".format(*grid.shape) for grid in grids) or "none"
     canvas = _Canvas(grey, [problem, f"grids found: {sizes}"])
     for k, grid in enumerate(grids):
@@ -188,21 +171,12 @@ _POINTS_A_TERM = 6  # least number of points per coefficient of the polynomial; 
 
 
 def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
-    """Residuals of the measured pixels from a plane and a polynomial fitted to them.
+    """Residuals (N, 2) [px] of points from a smooth map of their plane, to show the noise without a camera.
 
-    The plane is projected by a pinhole or an equidistant lens, whichever fits better. The polynomial models
-    the deviations of the real lens; its degree is five, or less for few points.
-
-    Parameters
-    ----------
-    measured : Measured
-    size : (width, height), optional [px]
-        Of the image; without it, only the pinhole is fitted.
-
-    Returns
-    -------
-    residuals : (N, 2) array [px]
-        Zero for fewer than five points, because a homography fits four exactly.
+    The plane is projected by a pinhole or an equidistant lens, whichever fits better; only by a pinhole if
+    the size of the image is not given. A polynomial models the deviations of the real lens; its degree is
+    five, or less for few points. Residuals are zero for fewer than five points, because a homography fits
+    four exactly.
     """
     grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
     if len(grid) < 5:

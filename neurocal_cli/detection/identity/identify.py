@@ -46,14 +46,7 @@ _KEPT = 200  # best arrangements that are extended by a further grid; limits the
 
 @frozen_dataclass(eq=False)
 class Located:
-    """A grid and its place on the board.
-
-    Attributes
-    ----------
-    grid : Grid
-    plane : Plane
-    placement : Placement
-    """
+    """A grid and its place on the board."""
 
     grid: Grid
     plane: Plane
@@ -62,36 +55,17 @@ class Located:
 
 @frozen_dataclass(eq=False)
 class Identified:
-    """The grids of an image that belong to the board.
-
-    Attributes
-    ----------
-    located : tuple of Located
-        In the order of the board's planes.
-    warnings : tuple of str
-        Their texts do not depend on the image.
-    """
+    """The grids of an image that belong to the board, in the order of its planes."""
 
     located: tuple[Located, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # their texts do not depend on the image
 
 
 def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> Identified:
-    """Locate the grids of one image on the board.
+    """Locate the grids of one grey image on the board.
 
-    Parameters
-    ----------
-    board : Board
-    grids : sequence of Grid
-        All grids found in the image, including those that do not belong to the board.
-    grey : (height, width) array
-        The image, in which the ends of the board are searched.
-
-    Raises
-    ------
-    NoBoardError
-        There is no board, a board of another size, or more than one possible arrangement. The message says
-        which.
+    The grids are all that were found, including those that do not belong to the board. Raises NoBoardError if
+    there is no board, a board of another size, or more than one possible arrangement; the message says which.
     """
     if not grids:
         if all(min(plane.cols, plane.rows) < 3 for plane in board.planes):

@@ -30,15 +30,7 @@ _FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a c
 def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     """Remove outer lines with few vertices from a grid that is too large for every plane.
 
-    Parameters
-    ----------
-    grid : Grid
-    planes : sequence of Plane
-
-    Returns
-    -------
-    grid : Grid
-        The given one if it fits, or if removing such lines does not make it fit.
+    The grid stays as it is if it fits, or if removing such lines does not make it fit.
     """
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
@@ -74,19 +66,10 @@ _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in _TURN
 
 @frozen_dataclass
 class Placement:
-    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``.
+    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``."""
 
-    Attributes
-    ----------
-    plane : int
-        Position among the board's planes.
-    matrix : 2 x 2 ints
-        A rotation by a multiple of 90 degrees, with or without a reflection.
-    offset : 2 ints
-    """
-
-    plane: int
-    matrix: Matrix
+    plane: int  # position among the board's planes
+    matrix: Matrix  # a rotation by a multiple of 90 degrees, with or without a reflection
     offset: tuple[int, int]
 
     def apply(self, grid: ArrayLike) -> Array:
@@ -94,13 +77,7 @@ class Placement:
         return np.asarray(grid) @ np.array(self.matrix).T + np.array(self.offset)
 
     def first_square_is_dark(self, dark: int) -> bool:
-        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark.
-
-        Parameters
-        ----------
-        dark : int
-            That of the grid; see `Grid`.
-        """
+        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark, by `Grid.dark`."""
         centre = (np.array([0.5, 0.5]) - np.array(self.offset)) @ np.array(self.matrix)  # matrix^-1
         return bool((np.floor(centre).sum() + dark) % 2 == 0)
 
@@ -120,18 +97,10 @@ def placements(
     *,
     mirrored: bool,
 ) -> Iterator[Placement]:
-    """Enumerate the placements of a grid on a plane that agree with the board's ends.
+    """Enumerate the placements of a grid on the plane of this index that agree with the board's ends.
 
-    Parameters
-    ----------
-    grid : Grid
-    plane : Plane
-    index : int
-        Of the plane on its board.
-    ends : dict of End
-        By the directions of the grid's sides; absent sides are unknown.
-    mirrored : bool
-        Whether the plane may be seen from behind.
+    The ends are given by the directions of the grid's sides; absent sides are unknown. The plane may be seen
+    from behind if `mirrored`.
     """
     last = plane.cols - 1, plane.rows - 1
     cols, rows = grid.shape
