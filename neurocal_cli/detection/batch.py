@@ -60,8 +60,7 @@ def default_jobs(images: int) -> int:
 
 
 def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
-    """Detect boards in image files; yields outcomes in the order of the paths, for any number of processes.
-    """
+    """Detect boards in image files with any number of processes, in the order of the paths."""
     jobs = min(jobs, len(paths))
     if jobs <= 1:
         retain_freed_memory()

@@ -39,12 +39,7 @@ def simulation_tables(
 ) -> tuple[list[tuple[str, Table]], list[str]]:
     """Tables of the studies of noise and starts, and lines below them.
 
-    Parameters
-    ----------
-    study : NoiseStudy
-    starts : StartStudy, optional
-    paper : bool
-        Whether the scene is that of the paper, so that its printed errors are shown, too.
+    For the scene of the `paper`, its printed errors are shown, too.
     """
     tables = [("error without noise (Table 1)", _exact(study, paper))]
     if study.trials:

@@ -14,47 +14,21 @@ _LEAST_COMPONENT = 1e-5
 
 
 class Cover(NamedTuple):
-    """Part of each cell that a layer covers.
+    """Part of each cell that a layer covers."""
 
-    Attributes
-    ----------
-    alpha : array
-        Covered share of the cell.
-    light : array
-        Reflectance, integrated over the covered share.
-    depth : array [world unit]
-        Along the camera's axis; infinite if nothing is covered.
-    edges : int array
-        Number of edges in the cell.
-    """
-
-    alpha: Array
-    light: Array
-    depth: Array
-    edges: NDArray[np.int8]
+    alpha: Array  # covered share of the cell
+    light: Array  # reflectance, integrated over the covered share
+    depth: Array  # [world unit] along the camera's axis; infinite if nothing is covered
+    edges: NDArray[np.int8]  # number of edges in the cell
 
 
 def half_plane(
     distance: Array, normal_u: Array, normal_v: Array, cell: float, slack: float = 0.0
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Share of square cells on the positive side of straight edges.
+    """Share of square cells on the positive side of straight edges, and whether the edge crosses the cell.
 
-    Parameters
-    ----------
-    distance : array [px]
-        From the edge to the cell's centre, positive on the positive side.
-    normal_u, normal_v : arrays
-        Unit normal of the edge; signs do not matter.
-    cell : float [px]
-        Side of the cells.
-    slack : float [px]
-        Cells with an edge this close count as touched, too.
-
-    Returns
-    -------
-    share : array, in [0, 1]
-    touched : bool array
-        Whether the edge runs through the cell.
+    `distance` [px] is from the edge to the cell's centre, positive on the positive side. The signs of the
+    unit normals do not matter. Cells with an edge as close as `slack` [px] count as touched, too.
     """
     support = (np.abs(normal_u) + np.abs(normal_v)) * (0.5 * cell)
     touched = np.abs(distance) < support + slack

@@ -28,12 +28,8 @@ _NEARBY = 2.0
 class BoardLayer:
     """A target in the frame of the camera.
 
-    Parameters
-    ----------
-    target : Target
-    inverse : (3, 3) array
-        Maps rays (x, y, z) to w (a, b, 1), with w = 1 / depth, and a and b in squares. Rays are slopes (z =
-        1) with depths along the axis, or unit directions with depths along these.
+    The (3, 3) inverse maps rays (x, y, z) to w (a, b, 1), with w = 1 / depth, and a and b in squares. Rays
+    are slopes (z = 1) with depths along the axis, or unit directions with depths along these.
     """
 
     target: Target
@@ -43,10 +39,7 @@ class BoardLayer:
     def of(cls, scene: Scene, target: Target) -> BoardLayer:
         """Make the layer of a target in a scene.
 
-        Raises
-        ------
-        DegenerateGeometryError
-            The camera's centre lies in the target's plane.
+        Raises DegenerateGeometryError if the camera's centre lies in the target's plane.
         """
         matrix = scene.plane_to_camera(target)
         square = target.plane.square
@@ -77,16 +70,7 @@ class BoardLayer:
         return au, av, bu, bv
 
     def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
-        """Cover of the cells around rays, which are flat arrays.
-
-        Parameters
-        ----------
-        rays : Rays of (N,) arrays
-        cell : float [px]
-            Side of the cells.
-        slack : float [px]
-            See `half_plane`.
-        """
+        """Cover of the cells of a side [px] around flat arrays of rays; for `slack` see `half_plane`."""
         a, b, w = self.grid(rays)
         n = len(a)
         alpha, light, depth = np.zeros(n), np.zeros(n), np.full(n, np.inf)
@@ -155,14 +139,7 @@ _PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the co
 
 @frozen_dataclass(eq=False)
 class Composition:
-    """The layers of a scene, prepared for rendering.
-
-    Parameters
-    ----------
-    camera : Camera
-    boards : tuple of BoardLayer
-    occluders : tuple of Occluder
-    """
+    """The layers of a scene, prepared for rendering."""
 
     camera: Camera
     boards: tuple[BoardLayer, ...]
@@ -177,15 +154,9 @@ class Composition:
     def light(
         self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
     ) -> tuple[Array, NDArray[np.int8]]:
-        """Mean reflectance of cells and the number of edges in each.
+        """Mean reflectance of cells (N,) and the number of edges in each; see `BoardLayer.cover`.
 
-        Parameters
-        ----------
-        rays : Rays of (N,) arrays
-        behind : (N,) array
-            Reflectance of the background.
-        cell, slack : float [px]
-            See `BoardLayer.cover`.
+        `behind` (N,) is the reflectance of the background.
         """
         covers = [occluder.cover(rays, cell, slack) for occluder in self.occluders]
         covers += [board.cover(rays, cell, slack) for board in self.boards]
@@ -207,40 +178,15 @@ class Composition:
         return light + open_share * behind, edges
 
     def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays]:
-        """Reflectance at the centres of pixels, and which pixels have edges.
-
-        Parameters
-        ----------
-        u, v : (N,) arrays [px]
-        behind : (N,) array
-
-        Returns
-        -------
-        light : (N,) array
-            Correct for pixels without edges.
-        edged : (N,) bool array
-        rays : Rays
-        """
+        """Reflectance at the centres of pixels (N,) if they have no edges, and which pixels have edges."""
         rays = self.camera.rays(u, v)
         light, edges = self.light(rays, behind, 1.0, _PIXEL_SLACK)
         return light, edges > 0, rays
 
     def cells(self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, parts: int) -> Array:
-        """Mean reflectance of the cells of pixels with edges.
+        """Mean reflectance of parts x parts cells of pixels (N,) with edges; ``[pixel, v, u]``.
 
-        Parameters
-        ----------
-        u, v : (N,) arrays [px]
-            Centres of the pixels.
-        start : (x, y), (N,) arrays
-            Their rays.
-        behind : (N,) array
-        parts : int
-            Cells along a pixel's side.
-
-        Returns
-        -------
-        light : (N, parts, parts) array, ``[pixel, v, u]``
+        `start` are the slopes (x, y) of the rays of their centres.
         """
         n = len(u)
         light, edges, rays = self._cut(u, v, start, behind, 1.0, parts)

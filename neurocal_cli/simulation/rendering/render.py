@@ -23,19 +23,10 @@ _CHUNK = 65536  # cells processed at a time
 
 
 def image_light(scene: Scene, parts: int | None = None) -> Array:
-    """Render the light at each pixel.
+    """Render the light (height, width) at each pixel; 1 is the sensor's full scale at gain 1.
 
-    Parameters
-    ----------
-    scene : Scene
-    parts : int, optional
-        Cells along the side of a pixel with edges; the error falls with their square. By default it is below
-        0.0005 of the contrast (0.0001 px for an edge).
-
-    Returns
-    -------
-    light : (height, width) array
-        Linear; 1 is the sensor's full scale at gain 1.
+    Pixels with edges have `parts` cells along a side; the error falls with their square. By default it is
+    below 0.0005 of the contrast (0.0001 px for an edge).
     """
     width, height = scene.size
     blur = Blur(scene.psf, parts or enough_parts(scene))
@@ -147,27 +138,14 @@ _SRGB_LINEAR = 0.0031308
 
 @frozen_dataclass(eq=False)
 class Rendered:
-    """A rendered picture.
+    """A rendered picture."""
 
-    Attributes
-    ----------
-    image : (height, width) uint8 or uint16 array [DN]
-    truth : Truth
-    """
-
-    image: Image
+    image: Image  # [DN]
     truth: Truth
 
 
 def render(scene: Scene, rng: np.random.Generator) -> Rendered:
-    """Render a picture of a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-    rng : numpy Generator
-        For the noise; everything else is in the scene.
-    """
+    """Render a picture of a scene; only the noise comes from the generator."""
     return Rendered(digitised(scene.sensor, image_light(scene), rng), ground_truth(scene))
 
 
@@ -177,14 +155,7 @@ def signal(sensor: Sensor, light: Array) -> Array:
 
 
 def response(sensor: Sensor, linear: Array) -> Array:
-    """Response curve, from [0, 1] to [0, 1]; light beyond full scale is clipped.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    linear : array
-        Linear signal.
-    """
+    """Response curve of a linear signal, from [0, 1] to [0, 1]; light beyond full scale is clipped."""
     x = np.clip(linear, 0.0, 1.0)
     if sensor.response == "srgb":
         return np.where(x <= _SRGB_LINEAR, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
@@ -192,19 +163,7 @@ def response(sensor: Sensor, linear: Array) -> Array:
 
 
 def digitised(sensor: Sensor, light: Array, rng: np.random.Generator) -> Image:
-    """Convert light to pixel values with noise.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    light : (H, W) array
-    rng : numpy Generator
-        For the noise.
-
-    Returns
-    -------
-    image : (H, W) uint8 or uint16 array
-    """
+    """Convert light (H, W) to pixel values with noise."""
     linear = signal(sensor, light)
     if sensor.full_well is not None:
         linear = rng.poisson(np.clip(linear, 0, None) * sensor.full_well) / sensor.full_well
