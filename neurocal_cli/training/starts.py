@@ -17,45 +17,23 @@ from neurocal_cli.training import Task, Trained, Trainer
 
 @frozen_dataclass
 class Agreement:
-    """Tolerances within which two losses are the same.
+    """Tolerances within which two losses are the same."""
 
-    Parameters
-    ----------
-    relative : float
-        Difference in rms error, as a share of it.
-    absolute : float
-        The same in normalised pixels, the accuracy of the trainer.
-    """
-
-    relative: float = 1e-4
-    absolute: float = 1e-10
+    relative: float = 1e-4  # difference in rms error, as a share of it
+    absolute: float = 1e-10  # the same in normalised pixels, the accuracy of the trainer
 
 
 @frozen_dataclass(eq=False)
 class Learnt:
-    """The best network of each view.
+    """The best network of each of K views."""
 
-    Attributes
-    ----------
-    W : (K, 3, 3) array
-    V : (K, 3, I) array
-    rms : (K,) array
-        Network error in normalised pixels.
-    starts, agreed : (K,) int arrays
-        Number of starts, and number of those that ended at the best loss.
-    iterations : int
-        Of all the starts together.
-    curve : (J,) array
-        Rms error of the best start of the first view along its training.
-    """
-
-    W: Array
-    V: Array
-    rms: Array
-    starts: NDArray[np.int64]
-    agreed: NDArray[np.int64]
-    iterations: int
-    curve: Array
+    W: Array  # (K, 3, 3)
+    V: Array  # (K, 3, I)
+    rms: Array  # (K,) network error in normalised pixels
+    starts: NDArray[np.int64]  # (K,)
+    agreed: NDArray[np.int64]  # (K,) number of starts that ended at the best loss
+    iterations: int  # of all the starts together
+    curve: Array  # rms error of the best start of the first view along its training
 
     @property
     def product(self) -> Array:
@@ -73,21 +51,9 @@ def learn(
     W: Array | None = None,
     V: Array | None = None,
 ) -> Learnt:
-    """Train each network from random weights until two starts agree, with `limit` starts at most.
+    """Train each network from random weights until two starts agree, with `limit` >= 2 starts at most.
 
-    Parameters
-    ----------
-    patterns : Patterns
-        Of K networks.
-    trainer : Trainer
-    rng : numpy.random.Generator
-    limit : int
-        Most starts for each network, at least 2.
-    agreement : Agreement, optional
-    W : (3, 3) array, optional
-        Output weights that are given; nan where they are not.
-    V : (1, 3, I) array, optional
-        Hidden weights that are given.
+    W (3, 3) are output weights that are given, nan where they are not, and V (1, 3, I) hidden weights.
     """
     search = _BestStarts(patterns, trainer, rng, agreement or Agreement(), W, V)
     open_views = np.arange(len(patterns.weights))

@@ -14,54 +14,26 @@ from neurocal_cli.network import Patterns
 
 @frozen_dataclass(eq=False)
 class Task:
-    """A stack of networks to train on E_2D from given initial weights.
-
-    Parameters
-    ----------
-    patterns : Patterns
-        Of G networks.
-    W : (G, 3, 3) array
-        Initial output weights.
-    V : (G, 3, I) array
-        Initial hidden weights.
-    free_W, free_V : bool arrays (3, 3) and (3, I)
-        Which weights are free; the others keep their initial values.
-    """
+    """A stack of G networks to train on E_2D from given initial weights."""
 
     patterns: Patterns
-    W: Array
-    V: Array
-    free_W: NDArray[np.bool_]
-    free_V: NDArray[np.bool_]
+    W: Array  # (G, 3, 3) initial output weights
+    V: Array  # (G, 3, I) initial hidden weights
+    free_W: NDArray[np.bool_]  # (3, 3) which weights are free; the others keep their initial values
+    free_V: NDArray[np.bool_]  # (3, I) the same
 
 
 @frozen_dataclass(eq=False)
 class Trained:
-    """Networks after training.
+    """G networks after training."""
 
-    Attributes
-    ----------
-    W : (G, 3, 3) array
-    V : (G, 3, I) array
-    gamma : (G, N) array
-        Factor of each pattern.
-    loss : (G,) array
-        E_2D.
-    iterations : (G,) int array
-        Iterations (epochs of back-propagation) of each network.
-    settled : (G,) bool array
-        Whether training converged before its limit of iterations.
-    curve : (K, G) array
-        Loss of each network along its training.
-    """
-
-    W: Array
-    V: Array
-    gamma: Array
-    loss: Array
-    iterations: NDArray[np.int64]
-    settled: NDArray[np.bool_]
-    curve: Array
+    W: Array  # (G, 3, 3)
+    V: Array  # (G, 3, I)
+    gamma: Array  # (G, N) factor of each pattern
+    loss: Array  # (G,) E_2D
+    iterations: NDArray[np.int64]  # (G,) iterations (epochs of back-propagation) of each network
+    settled: NDArray[np.bool_]  # (G,) whether training converged before its limit of iterations
+    curve: Array  # (K, G) loss of each network along its training
 
     @property
     def product(self) -> Array:
