@@ -41,10 +41,7 @@ _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides,
 
 
 def measure(
-    image: NDArray[np.generic],
-    grid: Grid,
-    points: Points = "midpoints",
-    gamma: float | None = None,
+    image: NDArray[np.generic], grid: Grid, points: Points = "midpoints", gamma: float | None = None
 ) -> Measured:
     """Measure the mid-points of edges, or the vertices, of a grid with vertices known to half a pixel.
 

@@ -68,9 +68,7 @@ class BackpropOptions:
 
 
 def train_backprop(
-    task: Task,
-    options: BackpropOptions | None = None,
-    progress: Callable[[float], None] | None = None,
+    task: Task, options: BackpropOptions | None = None, progress: Callable[[float], None] | None = None
 ) -> Trained:
     """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
 

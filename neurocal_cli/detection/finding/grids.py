@@ -91,11 +91,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
 
 
 def _find_bent(
-    level: Level,
-    links: Links | None,
-    masked: int,
-    known: list[Lattice],
-    wanted: frozenset[Size],
+    level: Level, links: Links | None, masked: int, known: list[Lattice], wanted: frozenset[Size]
 ) -> tuple[list[Lattice], list[Lattice]]:
     """Known lattices that are no pieces of bent ones, and the bent ones.
 

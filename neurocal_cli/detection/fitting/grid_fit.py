@@ -12,13 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import (
-    CONTRAST,
-    MEAN,
-    BatchFit,
-    ProfileShape,
-    fit_batch,
-)
+from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
@@ -43,13 +37,7 @@ from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map
 from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import (
-    FIRST,
-    SECOND,
-    vertex_lines,
-    vertex_model,
-    vertex_pixels,
-)
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, vertex_lines, vertex_model, vertex_pixels
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median

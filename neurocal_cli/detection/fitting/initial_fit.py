@@ -9,21 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import (
-    BLUR,
-    BatchFit,
-    LevelPrior,
-    ProfileShape,
-    fit_batch,
-)
+from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
-from neurocal_cli.detection.fitting.edge_fit import (
-    REACH,
-    SHARP,
-    edge_model,
-    edge_pixels,
-    usual_stride,
-)
+from neurocal_cli.detection.fitting.edge_fit import REACH, SHARP, edge_model, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis, half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_typical
 from neurocal_cli.detection.fitting.shading import Shading

@@ -24,12 +24,7 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.linear_camera import fit_camera, is_flat, rigid_motion
-from neurocal_cli.detection.identity.messages import (
-    SYMMETRIC_BOARD,
-    NoBoardError,
-    ambiguous,
-    wrong_size,
-)
+from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError, ambiguous, wrong_size
 from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array

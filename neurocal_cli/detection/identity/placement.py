@@ -90,12 +90,7 @@ class Placement:
 
 
 def placements(
-    grid: Grid,
-    plane: Plane,
-    index: int,
-    ends: Mapping[tuple[int, int], End],
-    *,
-    mirrored: bool,
+    grid: Grid, plane: Plane, index: int, ends: Mapping[tuple[int, int], End], *, mirrored: bool
 ) -> Iterator[Placement]:
     """Enumerate the placements of a grid on the plane of this index that agree with the board's ends.
 

@@ -97,10 +97,7 @@ def _fill(
 def _cell_light(scene: Scene, u: Array, v: Array, parts: int) -> Array:
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     return illuminated(
-        scene.illumination,
-        scene.size,
-        u[:, None, None] + offsets,
-        v[:, None, None] + offsets[:, None],
+        scene.illumination, scene.size, u[:, None, None] + offsets, v[:, None, None] + offsets[:, None]
     )
 
 
