@@ -29,9 +29,9 @@ from neurocal_cli.network import (
     random_weights,
     residual_jacobian,
 )
+from neurocal_cli.training import Task
 from neurocal_cli.training import backprop_blocks as blocks
 from neurocal_cli.training.backprop import BackpropOptions, _Run, train_backprop
-from neurocal_cli.training.task import Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
 CENTRED = UPPER & (np.arange(3) < 2)

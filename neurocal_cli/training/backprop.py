@@ -26,7 +26,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, e_2d, e_orth, optimal_gamma, output
-from neurocal_cli.training.task import Task, Trained
+from neurocal_cli.training import Task, Trained
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
 # tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later

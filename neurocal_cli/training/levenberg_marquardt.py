@@ -28,7 +28,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
 from neurocal_cli.network import Patterns, optimal_gamma
-from neurocal_cli.training.task import Task, Trained
+from neurocal_cli.training import Task, Trained
 
 
 @frozen_dataclass
