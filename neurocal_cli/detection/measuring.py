@@ -53,7 +53,7 @@ def measure(
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
-    grid_image = GridImage.of(light, grid, floor)
+    grid_image = GridImage(light, grid, floor)
     if len(grid_image.edges.index) == 0:
         return _nothing(grid)
     fitted = fit_grid(grid_image)

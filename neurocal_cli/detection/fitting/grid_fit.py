@@ -8,6 +8,7 @@ independent levels, common parameters, a last fit, and the map through its edges
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,23 +77,17 @@ class GridEdges:
     known: NDArray[np.bool_]  # (E, 2) whether the vertices at both ends are known
 
     @classmethod
-    def of(cls, grid: Grid) -> GridEdges:
-        """All edges between two known vertices."""
-        return cls._with_known_ends(grid, 2)
+    def of(cls, grid: Grid, known_ends: int) -> GridEdges:
+        """All edges with so many known ends.
 
-    @classmethod
-    def to_rim(cls, grid: Grid) -> GridEdges:
-        """All edges with one known vertex: edges to the board's rim, and to vertices that were not found."""
-        return cls._with_known_ends(grid, 1)
-
-    @classmethod
-    def _with_known_ends(cls, grid: Grid, count: int) -> GridEdges:
+        With two they are between vertices; with one they lead to the rim, or to vertices that were not found.
+        """
         seen = np.pad(grid.seen, 1)
         ends = (
             np.stack([seen[1:-1, :-1], seen[1:-1, 1:]], axis=-1),
             np.stack([seen[:-1, 1:-1], seen[1:, 1:-1]], axis=-1),
         )
-        wanted = [known.sum(axis=2) == count for known in ends]
+        wanted = [known.sum(axis=2) == known_ends for known in ends]
         along_c, along_r = (
             np.argwhere(which)[:, ::-1] - first for which, first in zip(wanted, ([1, 0], [0, 1]), strict=True)
         )
@@ -119,23 +114,19 @@ class GridImage:
 
     image: Image
     grid: Grid
-    edges: GridEdges
-    anchors: Observations  # the found vertices
     floor: float  # [DN^2] least variance of the pixels, that of rounding
-
-    @classmethod
-    def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
-        """Prepare an image and a grid in it."""
-        vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
-        anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
-        return cls(image, grid, GridEdges.of(grid), anchors, floor)
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the image [px]."""
         return self.image.shape[1], self.image.shape[0]
 
-    @property
+    @cached_property
+    def edges(self) -> GridEdges:
+        """The edges between found vertices."""
+        return GridEdges.of(self.grid, 2)
+
+    @cached_property
     def vertices(self) -> Array:
         """(V, 2) grid coordinates of the found vertices."""
         return np.argwhere(self.grid.seen)[:, ::-1].astype(float)
@@ -145,13 +136,16 @@ class GridImage:
         """(V, 2) pixels of the found vertices."""
         return self.grid.pixels[self.grid.seen]
 
+    def anchors(self, sigma: float) -> Observations:
+        """The found vertices as observations of a map, with a standard deviation [px]."""
+        return Observations.of_points(self.vertices, self.pixels, sigma, 1)
+
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Use edges as observations of a map; a few edges are joined with the found vertices as anchors."""
         edges = self.edges.observations(lines, offset, variance)
         if len(offset) > _ENOUGH:
             return edges
-        anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
-        return edges.joined_with(anchors)
+        return edges.joined_with(self.anchors(_ANCHOR))
 
 
 @frozen_dataclass(eq=False)
@@ -187,9 +181,10 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     """Run all stages: map of the found vertices, moments, first fit, common parameters, last fit."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
-    found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    anchors = grid_image.anchors(_START_SIGMA)
+    found = select_map(start, anchors, np.zeros(1), _GOOD_START)
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
-        found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
+        found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = _shading_of(found.map, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
@@ -333,7 +328,7 @@ def _fitted(
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
     """Fit the edges to the board's rim with the common parameters of all other edges."""
-    edges = GridEdges.to_rim(grid_image.grid)
+    edges = GridEdges.of(grid_image.grid, 1)
     lines = edges.lines(fitted.map.map)
     shift = fitted.map.shift[0]
     fit = _fitted(
