@@ -40,6 +40,11 @@ class Comparison:
     stereo: dict[str, StereoEvaluation] | None
     notes: tuple[str, ...]
 
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.points[0].unit
+
 
 def compare(
     points: Sequence[Correspondences],
