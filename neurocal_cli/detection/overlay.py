@@ -22,13 +22,12 @@ _LINE = 26  # px, height of a line of text
 _CHARACTER = 10  # px, approximate width of a character
 _SHIFT = 4  # fractional bits of drawn coordinates
 _ARROW = 0.25  # squares; greatest drawn length of a median residual
+_FEWEST_WIDE = 12  # points needed for the equidistant lens
+_POINTS_A_TERM = 6  # least number of points per coefficient of the polynomial; for pictures only
 _SCALES = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
 
-_KINDS: dict[int, tuple[str, Colour]] = {
-    EDGE_H: ("h", (255, 170, 0)),
-    EDGE_V: ("v", (0, 220, 255)),
-    VERTEX: ("vertex", (120, 255, 120)),
-}
+_KINDS = {EDGE_H: "h orange", EDGE_V: "v cyan", VERTEX: "vertex green"}
+_COLOURS: dict[int, Colour] = {EDGE_H: (255, 170, 0), EDGE_V: (0, 220, 255), VERTEX: (120, 255, 120)}
 _RESIDUAL: Colour = (255, 70, 70)
 _WHITE: Colour = (255, 255, 255)
 _X_AXIS: Colour = (255, 60, 200)
@@ -54,7 +53,10 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     ]
     canvas = _Canvas(grey, lines)
     for located, measured, residual in zip(detection.located, detection.measured, residuals, strict=True):
-        _draw_points(canvas, measured, label(located, measured).kind, residual * scale)
+        for pixel, arrow in zip(measured.pixels, residual * scale, strict=True):
+            canvas.line(pixel, pixel + arrow, _RESIDUAL)
+        for pixel, kind in zip(measured.pixels, label(located, measured).kind.tolist(), strict=True):
+            canvas.cross(pixel, _COLOURS[kind])
         _draw_frame(canvas, located, measured)
     return canvas.picture
 
@@ -69,21 +71,13 @@ def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str)
     return canvas.picture
 
 
-def _draw_points(canvas: _Canvas, measured: Measured, kinds: NDArray[np.int64], arrows: Array) -> None:
-    for pixel, arrow in zip(measured.pixels, arrows, strict=True):
-        canvas.line(pixel, pixel + arrow, _RESIDUAL)
-    for kind, pixel in zip(kinds.tolist(), measured.pixels, strict=True):
-        canvas.cross(pixel, _KINDS[kind][1])
-
-
 def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
     """Draw the origin, the axes and the ids of the outermost vertices found."""
     pixels = np.where(np.isfinite(measured.vertices), measured.vertices, located.grid.pixels)
     rows, columns = np.nonzero(np.isfinite(pixels[..., 0]))
     places = np.rint(located.placement.apply(np.stack([columns, rows], axis=-1))).astype(int)
     at = {(x, y): pixels[r, c] for (x, y), r, c in zip(places.tolist(), rows, columns, strict=True)}
-    for axis, (colour, name) in enumerate(((_X_AXIS, "x"), (_Y_AXIS, "y"))):
-        tip = (2, 0) if axis == 0 else (0, 2)
+    for tip, colour, name in (((2, 0), _X_AXIS, "x"), ((0, 2), _Y_AXIS, "y")):
         if (0, 0) in at and tip in at:
             canvas.arrow(at[0, 0], at[tip], colour)
             canvas.text(at[tip], name, colour)
@@ -96,9 +90,7 @@ def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
 def _legend(detection: Detection) -> str:
     pairs = zip(detection.located, detection.measured, strict=True)
     every = np.concatenate([label(located, measured).kind for located, measured in pairs])
-    counts = {kind: int((every == kind).sum()) for kind in _KINDS}
-    colours = {EDGE_H: "orange", EDGE_V: "cyan", VERTEX: "green"}
-    kinds = [f"{_KINDS[kind][0]} {colours[kind]} ({n})" for kind, n in counts.items() if n]
+    kinds = [f"{name} ({n})" for kind, name in _KINDS.items() if (n := np.count_nonzero(every == kind))]
     offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
     return f"{', '.join(kinds)}; edges displaced by {offsets} px before correction"
 
@@ -164,10 +156,6 @@ def _put(picture: Picture, text: str, place: tuple[int, int], colour: Colour, si
     plain = text.encode("ascii", "replace").decode()  # the font has no other characters
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
-
-
-_FEWEST_WIDE = 12  # points needed for the equidistant lens
-_POINTS_A_TERM = 6  # least number of points per coefficient of the polynomial; for pictures only
 
 
 def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:

@@ -8,11 +8,12 @@ small, as they are under perspective and distortion, so few neighbours give a li
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.finding.subpixel import window
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -80,13 +81,6 @@ class PredictedVertices:
         return out
 
 
-@lru_cache(maxsize=64)
-def _window(width: int) -> NDArray[np.intp]:
-    """Flat index offsets from a place's first neighbour to all of them, in arrays of a width."""
-    size = np.arange(2 * _REACH + 1)
-    return (size[:, None] * width + size).ravel()
-
-
 def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
     """Predict vertices at rows and columns (N,), known or not, of an array (rows, cols, 2) [px]."""
     rows, cols = pixels.shape[:2]
@@ -96,7 +90,8 @@ def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]
     np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
     inner[2] = seen
     width = padded.shape[2]
-    near = padded.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
+    place = (row + _REACH) * width + col + _REACH
+    near = padded.reshape(3, -1).take(place[:, None] + window(_REACH, width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
     normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE

@@ -32,8 +32,8 @@ def _derivatives(sigma: float) -> tuple[int, Array]:
     return half, np.stack([k.ravel() for k in kernels], axis=-1).astype(np.float32)
 
 
-@lru_cache(maxsize=32)
-def _window(half: int, width: int) -> NDArray[np.intp]:
+@lru_cache(maxsize=64)
+def window(half: int, width: int) -> NDArray[np.intp]:
     """Flat index offsets from a pixel to the window around it, in an image of a width."""
     offset = np.arange(-half, half + 1)
     return (offset[:, None] * width + offset).ravel()
@@ -74,7 +74,7 @@ def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[n
     width = image.shape[1]
     half, kernels = _derivatives(sigma)
     place = (centre[1] * width + centre[0]).astype(np.intp)
-    u, v, uu, uv, vv = (image.ravel().take(place[:, None] + _window(half, width)) @ kernels).T.astype(float)
+    u, v, uu, uv, vv = (image.ravel().take(place[:, None] + window(half, width)) @ kernels).T.astype(float)
     determinant = uu * vv - uv * uv
     saddle = determinant < 0
     step = np.empty(centre.shape)

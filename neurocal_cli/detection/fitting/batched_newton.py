@@ -24,6 +24,7 @@ from neurocal_cli.geometry import Array
 
 Single = NDArray[np.float32]
 Part = NDArray[np.intp] | slice  # indices of some of the fits
+Some = TypeVar("Some", bound="PerFit")
 
 # Positions of the last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
@@ -38,7 +39,16 @@ _NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 
 @frozen_dataclass(eq=False)
-class FitPixels:
+class PerFit:
+    """Arrays whose first axis is the fit."""
+
+    def part(self: Some, which: Part) -> Some:
+        """Select some fits."""
+        return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
+
+@frozen_dataclass(eq=False)
+class FitPixels(PerFit):
     """Pixels of fits, (E, N) float32 arrays."""
 
     value: Single  # [DN] without the gradient of the mean level
@@ -46,10 +56,6 @@ class FitPixels:
     Q: Single  # effect of other lines on the light; see the models
     root: Single  # [1/DN] inverse standard deviation of the noise; 0 for pixels that are not used
     beyond: Array  # (E,) share of the pixels that lie outside the image
-
-    def part(self: Pixels, which: Part) -> Pixels:
-        """Select the pixels of some fits."""
-        return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
 
     def weighed(self: Pixels, weight: Single) -> Pixels:
         """Set the weights [1/DN^2] of the pixels; unused pixels stay unused."""
@@ -62,15 +68,11 @@ Pixels = TypeVar("Pixels", bound=FitPixels)
 
 
 @frozen_dataclass(eq=False)
-class LevelPrior:
+class LevelPrior(PerFit):
     """Gaussian prior for mean level, half contrast and blur."""
 
     mean: Array  # (E, 3) [DN, DN, px]
     precision: Array  # (E, 3, 3)
-
-    def part(self, which: NDArray[np.intp]) -> LevelPrior:
-        """Select the priors of some fits."""
-        return LevelPrior(self.mean[which], self.precision[which])
 
 
 @frozen_dataclass(eq=False)
@@ -96,7 +98,7 @@ class ProfileShape:
 
 
 @frozen_dataclass(eq=False)
-class Linearised:
+class Linearised(PerFit):
     """A model linearised at some values."""
 
     # (E, R, N) the residual and the derivatives by the P values, in standard deviations of the pixel noise;
@@ -113,10 +115,6 @@ class Linearised:
     def products(self, count: int) -> Array:
         """(E, P + 1, P + 1) sums of products over pixels: chi2 first, then gradient and information."""
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
-
-    def part(self, which: NDArray[np.intp]) -> Linearised:
-        """Select some fits."""
-        return Linearised(self.rows[which], self.z[which], self.x[which])
 
     def put(self, which: NDArray[np.intp], part: Linearised) -> None:
         """Replace some fits in place."""
@@ -237,14 +235,8 @@ class _State:
 
     def part(self, which: NDArray[np.intp]) -> _State:
         """Select some fits."""
-        return _State(
-            self.values[which],
-            self.linear.part(which),
-            self.products[which],
-            self.cost[which],
-            self.damping[which],
-            self.size[which],
-        )
+        values, products, cost = self.values[which], self.products[which], self.cost[which]
+        return _State(values, self.linear.part(which), products, cost, self.damping[which], self.size[which])
 
     def put(self, which: NDArray[np.intp], part: _State) -> None:
         """Copy the results of some fits back."""

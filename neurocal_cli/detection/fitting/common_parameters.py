@@ -29,10 +29,10 @@ from neurocal_cli.detection.fitting.edge_profile import (
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance, quadratic_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.strips import Lines
-from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -153,9 +153,8 @@ class BoardBlur:
         normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_EDGES
         uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
         matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
-        blur = cls(matrix, 0.0)
-        scatter = upper_median((sigma - blur.along(normal[good])) ** 2) / CHI2_MEDIAN
-        return cls(matrix, max(scatter - 2 * upper_median(fit.covariance[good, BLUR, BLUR]), 0.0))
+        left = sigma - cls(matrix, 0.0).along(normal[good])
+        return cls(matrix, excess_variance(left, fit.covariance[good, BLUR, BLUR]))
 
     def along(self, normal: Array) -> Array:
         """(E,) blur [px] of edges with normals (E, 2)."""
@@ -186,10 +185,10 @@ class FieldBlur:
             # The prior makes it constant unless many edges disagree.
             normal = (some.T * weight) @ some + np.eye(len(terms)) * _ROUND_EDGES
             terms = np.linalg.solve(normal, some.T @ (weight * log))
-        scatter = upper_median((log - some @ terms) ** 2) / CHI2_MEDIAN
-        noise = 2 * upper_median(fit.covariance[good, BLUR, BLUR] / fit.values[good, BLUR] ** 2)
+        noise = fit.covariance[good, BLUR, BLUR] / fit.values[good, BLUR] ** 2
+        relative = excess_variance(log - some @ terms, noise)
         terms[0] += np.log(usual)
-        return cls(frame, terms, max(scatter - noise, 0.0))
+        return cls(frame, terms, relative)
 
     def along(self, normal: Array, place: Array) -> Array:
         """(E,) blur [px] of edges with normals (E, 2) at places (E, 2) [px]."""
@@ -198,10 +197,8 @@ class FieldBlur:
 
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
-    x, y = ((place - frame.centre) / frame.unit).T
     n_u, n_v = normal.T
-    one = np.ones_like(x)
-    return np.stack([one, x, y, x * x, x * y, y * y, n_u * n_u - n_v * n_v, 2 * n_u * n_v], axis=-1)
+    return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
 def level_prior(

@@ -54,7 +54,7 @@ class Shading:
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = _terms(self.frame, place)
+        terms = quadratic_terms(self.frame, place)
         dark, light = terms @ self.dark, terms @ self.light
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
@@ -96,17 +96,16 @@ class LocalShading(Shading):
         for levels, coefficients, before in zip(
             (dark, light), (smooth.dark, smooth.light), smooth.spread, strict=True
         ):
-            rest = levels.level - _terms(smooth.frame, levels.place) @ coefficients
+            rest = levels.level - quadratic_terms(smooth.frame, levels.place) @ coefficients
             left = rest - _nearby(levels.place, rest, levels.place, itself=False)
-            chance = 2 * upper_median(levels.variance)
             above.append(rest)
-            spread.append(min(max(upper_median(left**2) / CHI2_MEDIAN - chance, 0.0), before))
+            spread.append(min(excess_variance(left, levels.variance), before))
         near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = _terms(self.frame, place)
+        terms = quadratic_terms(self.frame, place)
         dark, light = (
             terms @ coefficients + _nearby(near, above, place)
             for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
@@ -158,7 +157,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
         return coefficients, np.inf
-    terms = _terms(frame, levels.place)
+    terms = quadratic_terms(frame, levels.place)
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
     # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
@@ -180,6 +179,12 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     return coefficients, spread + most / n * upper_median(levels.variance)
 
 
-def _terms(frame: Frame, place: Array) -> Array:
+def excess_variance(residual: Array, variance: Array) -> float:
+    """Robust variance of residuals (N,) beyond twice the median of their known variances (N,)."""
+    return max(upper_median(residual**2) / CHI2_MEDIAN - 2 * upper_median(variance), 0.0)
+
+
+def quadratic_terms(frame: Frame, place: Array) -> Array:
+    """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, 6)."""
     x, y = ((place - frame.centre) / frame.unit).T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)

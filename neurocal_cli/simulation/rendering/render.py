@@ -35,7 +35,9 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
     level = scene.background.image(scene.size, pad)
     residual = np.zeros((height + 4 * pad, width + 4 * pad))
     edged = np.zeros(level.shape, dtype=bool)
-    for rows in _strips(level.shape):
+    step = max(1, _STRIP // level.shape[1])
+    for first in range(0, len(level), step):
+        rows = slice(first, min(first + step, len(level)))
         _fill(scene, composition, blur, rows, level, edged, residual)
     image = blur.convolve(*_shaded(scene, level, edged, pad))
     image += residual[2 * pad : height + 2 * pad, 2 * pad : width + 2 * pad]
@@ -54,11 +56,6 @@ def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) 
 def enough_parts(scene: Scene) -> int:
     """Default number of cells along a pixel's side in `image_light`."""
     return int(np.clip(np.ceil(_PARTS_BY_BLUR / scene.sigma_t), _FEWEST_PARTS, _MOST_PARTS))
-
-
-def _strips(shape: tuple[int, ...]) -> list[slice]:
-    step = max(1, _STRIP // shape[1])
-    return [slice(first, min(first + step, shape[0])) for first in range(0, shape[0], step)]
 
 
 def _fill(
@@ -82,23 +79,18 @@ def _fill(
     light, has_edges, rays = composition.pixels(u, v, behind)
     todo = np.flatnonzero(has_edges)
     step = max(1, _CHUNK // blur.parts**2)
+    offsets = (np.arange(blur.parts) + 0.5) / blur.parts - 0.5
     for first in range(0, len(todo), step):
         some = todo[first : first + step]
         near = rays.x[some], rays.y[some]
         cells = composition.cells(u[some], v[some], near, behind[some], blur.parts)
-        cells *= _cell_light(scene, u[some], v[some], blur.parts)
+        cell_u, cell_v = u[some, None, None] + offsets, v[some, None, None] + offsets[:, None]
+        cells *= illuminated(scene.illumination, scene.size, cell_u, cell_v)
         light[some] = cells.mean(axis=(1, 2))
         row, column = grid[0][some] + pad, grid[1][some] + pad
         blur.scatter(residual, row, column, cells - light[some, None, None])
     level[rows] = light.reshape(-1, level.shape[1])
     edged[rows] = has_edges.reshape(-1, level.shape[1])
-
-
-def _cell_light(scene: Scene, u: Array, v: Array, parts: int) -> Array:
-    offsets = (np.arange(parts) + 0.5) / parts - 0.5
-    return illuminated(
-        scene.illumination, scene.size, u[:, None, None] + offsets, v[:, None, None] + offsets[:, None]
-    )
 
 
 def _shaded(
