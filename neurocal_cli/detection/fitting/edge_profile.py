@@ -87,23 +87,23 @@ def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
     """E(z), its derivative, and the normal density, with coefficients a_3 and a_5 (E, 2)."""
     value, density = erf_and_density(z)
     slope = 2 * density
-    if tails.any():
-        more, steeper = tails_of(z, density, tails)
-        value += more
-        slope += steeper
+    _add_tails(value, slope, z, density, tails)
     return value, slope, density
 
 
-def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
-    """Contribution of the tails (E, 2) to the profile at z (E, N), and its derivative."""
+def _add_tails(value: Real, slope: Real, z: Real, density: Real, tails: Real) -> None:
+    """Add the tails (E, 2) to the profile at z (E, N) and to its derivative, in place."""
+    if not tails.any():
+        return
     square = z * z
     # Polynomials in z^2; d/dz phi He_k = -phi He_{k+1}.
-    value, slope = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
-    more, steeper = _polynomial(square, value), _polynomial(square, slope)
+    odd, even = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
+    more, steeper = _polynomial(square, odd), _polynomial(square, even)
     more *= z
     more *= density
     steeper *= density
-    return more, steeper
+    value += more
+    slope += steeper
 
 
 # Coefficients of He_3 / z and He_5 / z, and of -He_4 and -He_6, as polynomials in z^2.
@@ -221,8 +221,5 @@ def sharp_profile(
     widening *= sigma
     widening += z * slope
     density = erf_and_density(z)[1]
-    if tails.any():
-        more, steeper = tails_of(z, density, tails)
-        value += more
-        slope += steeper
+    _add_tails(value, slope, z, density, tails)
     return value, slope, widening, density

@@ -125,11 +125,11 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
     front of the camera.
     """
     kept: list[_Candidate] = []
-    for size in sorted({tuple(sorted((plane.cols, plane.rows))) for plane in board.planes}):
-        room = sum(tuple(sorted((plane.cols, plane.rows))) == size for plane in board.planes)
+    sizes = [tuple(sorted((plane.cols, plane.rows))) for plane in board.planes]
+    for size in sorted(set(sizes)):
+        room = sizes.count(size)
         alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
-        if len(alike) > 1:
-            alike.sort(key=lambda c: -c.grid.square)
+        alike.sort(key=lambda c: -c.grid.square)
         if len(alike) > room and alike[room - 1].grid.square < _NEARER * alike[room].grid.square:
             raise NoBoardError(
                 f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "
