@@ -60,7 +60,7 @@ class RateStudy:
     # Number of data sets on which `calibrate`, with the trainer backprop and these rates, reaches the minimum
     # of (3).
     calibrated: int
-    alpha_u: Array  # Errors of alpha_u in these calibrations, in reported standard deviations.
+    alpha_u: Array  # errors of alpha_u in these calibrations, in reported standard deviations
 
 
 @frozen_dataclass

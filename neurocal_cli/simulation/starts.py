@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,19 +150,15 @@ def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float
         return np.inf
 
 
-def _network(trainer: str) -> Callable[[Problem, np.random.Generator], float]:
+def _from_network(trainer: str, problem: Problem, rng: np.random.Generator) -> float:
     options = replace(options_for(trainer, 2, 0), starts=1)
-
-    def end(problem: Problem, rng: np.random.Generator) -> float:
-        if problem.type == 4:
-            return _rms(problem, solve_given_poses(problem, options, rng).state)
-        groups, _ = train_networks(problem, options, rng, np.ones(problem.views.n_views, dtype=bool))
-        entries = problem.normalised_entries[None]
-        if problem.type != 3:
-            entries = candidate_intrinsics(problem, groups, rng)[0]
-        return _rms(problem, problem.adjust(cameras_from_products(problem, groups, entries)).state)
-
-    return end
+    if problem.type == 4:
+        return _rms(problem, solve_given_poses(problem, options, rng).state)
+    groups, _ = train_networks(problem, options, rng, np.ones(problem.views.n_views, dtype=bool))
+    entries = problem.normalised_entries[None]
+    if problem.type != 3:
+        entries = candidate_intrinsics(problem, groups, rng)[0]
+    return _rms(problem, problem.adjust(cameras_from_products(problem, groups, entries)).state)
 
 
 def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
@@ -208,8 +205,8 @@ def _rms(problem: Problem, state: CameraState) -> float:
 
 
 _KINDS: dict[str, Callable[[Problem, np.random.Generator], float]] = {
-    "lm": _network("lm"),
-    "backprop": lambda problem, rng: _network("backprop")(problem, rng),
+    "lm": partial(_from_network, "lm"),
+    "backprop": partial(_from_network, "backprop"),
     "weights": _from_weights,
     "camera": _from_camera,
 }

@@ -114,12 +114,8 @@ def _best_of(
     curve = best.curve
     for start in range(count):
         which = slice(start, None, count)
-        rms, in_front, old, old_front = (
-            all_rms[which],
-            all_front[which],
-            best.rms[views],
-            best.in_front[views],
-        )
+        rms, in_front = all_rms[which], all_front[which]
+        old, old_front = best.rms[views], best.in_front[views]
         close = agreement.relative * np.minimum(rms, old) + agreement.absolute
         with np.errstate(invalid="ignore"):
             same = in_front & old_front & (np.abs(rms - old) <= close)
