@@ -29,8 +29,7 @@ from neurocal_cli.detection.finding.overlaps import (
     merge_lattices,
     trim_overlaps,
 )
-from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally, stretch
-from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -71,8 +70,10 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
     links: Links | None = None
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
-        lattices = [_to_finer_level(level, x) for x in lattices]
-        bent = [refined_locally(level, replace(x, pixels=2 * x.pixels), 2) for x in bent]
+        # On the next finer level, pixels have twice the coordinates.
+        lattices, bent = ([replace(x, pixels=2 * x.pixels) for x in part] for part in (lattices, bent))
+        lattices = [refined(level, x, x.derivative_sigma, 2) for x in lattices]
+        bent = [refined(level, x, local_sigma(x), 2) for x in bent]
         none = not lattices and not bent
         if level in small or (none and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
@@ -216,25 +217,9 @@ def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     for lattice in _find_new(part.level, links_of_part, []):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
-        grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
+        grid = grow(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
         found += _boards(remove_outliers(level, grid))
     return found
-
-
-def _to_finer_level(level: Level, lattice: Lattice) -> Lattice:
-    """The same grid on the next level."""
-    lattice = replace(lattice, pixels=2 * lattice.pixels)
-    return _refined(level, lattice, lattice.derivative_sigma, 2)
-
-
-def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Lattice:
-    """Move the vertices to the nearest saddle points, if these are within `most` px."""
-    start = lattice.pixels[lattice.seen]
-    refined = refine_saddles(level.image, start, sigma)
-    close = np.hypot(*(refined - start).T) < most
-    pixels = lattice.pixels.copy()
-    pixels[lattice.seen] = np.where(close[:, None], refined, start)
-    return replace(lattice, pixels=pixels)
 
 
 def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:

@@ -182,7 +182,7 @@ def _continued(base: Lattice, other: Lattice) -> Array:
     """Grid coordinates (N, 2) of the other lattice's vertices on the base, extrapolated by a homography."""
     row, col = np.nonzero(base.seen)
     p, q = base.pixels[row, col], other.pixels[other.seen]
-    away = np.sqrt(((p[:, None] - q[None]) ** 2).sum(axis=-1).min(axis=1))
+    away = _distance(p, q)
     # Lens distortion bends the plane, so the vertices near the other lattice have the largest weights.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
     centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)

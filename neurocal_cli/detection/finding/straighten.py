@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.from_links import linked_group
 from neurocal_cli.detection.finding.lattice import Index, Lattice
-from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.links import Links, whole_blocks
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
@@ -71,9 +71,7 @@ class PlaneView:
         """Sample the view from the image."""
         width, height = self.size
         v, u = np.mgrid[0:height, 0:width].astype(float)
-        places = self.back(np.stack([u, v], axis=-1)).astype(np.float32)
-        view = cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        return np.asarray(view, dtype=np.float32)
+        return interpolate(image, self.back(np.stack([u, v], axis=-1))).astype(np.float32)
 
 
 def any_left(links: Links, known: list[Lattice]) -> bool:
@@ -109,7 +107,7 @@ def find_bent(
     groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]
     groups += [(np.argwhere(x.seen)[:, ::-1], x.pixels[x.seen], 1.0, _WIDE) for x in unfinished]
     for places, pixels, more, wide in groups:
-        if len(pixels) < more * max((_shared(x, pixels) for x in (*known, *found)), default=0):
+        if len(pixels) < more * _most_shared([*known, *found], pixels):
             continue
         fit = _fitted(places.astype(float), pixels, level)
         if fit is None or fit.lens.angles(pixels).max() < wide:
@@ -117,9 +115,8 @@ def find_bent(
         view = PlaneView.of(fit, places.astype(float))
         for lattice in search(view.seen(level.image)):
             inside = _into_image(lattice, view, level)
-            if inside is not None and inside.seen.sum() > max(
-                (_shared(x, inside.pixels[inside.seen]) for x in (*known, *found)), default=0
-            ):
+            own = inside.pixels[inside.seen]
+            if len(own) and len(own) > _most_shared([*known, *found], own):
                 found.append(inside)
     return found
 
@@ -140,11 +137,14 @@ def _groups(links: Links) -> Iterator[tuple[Index, Index]]:
             yield places, members
 
 
-def _shared(lattice: Lattice, pixels: Array) -> int:
-    """Number of a lattice's vertices among pixels (N, 2)."""
-    own = lattice.pixels[lattice.seen]
-    away = np.hypot(*np.moveaxis(own[:, None] - pixels, -1, 0)).min(axis=1)
-    return int((away < 0.25 * lattice.width).sum())
+def _most_shared(lattices: list[Lattice], pixels: Array) -> int:
+    """Greatest number of vertices that a lattice has among pixels (N, 2)."""
+    counts = [0]
+    for lattice in lattices:
+        own = lattice.pixels[lattice.seen]
+        away = np.hypot(*np.moveaxis(own[:, None] - pixels, -1, 0)).min(axis=1)
+        counts.append(int((away < 0.25 * lattice.width).sum()))
+    return max(counts)
 
 
 def _fitted(places: Array, pixels: Array, level: Level) -> WideFit | None:
@@ -170,30 +170,33 @@ def _widths(fit: WideFit, places: Array) -> Array:
     return np.sqrt(np.maximum(np.abs(c[:, 0] * r[:, 1] - c[:, 1] * r[:, 0]), 1e-6))
 
 
-def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | None:
+def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice:
     """Map a lattice of the view to the level, without vertices outside the level."""
     pixels = view.back(lattice.pixels)
     room = np.array(level.image.shape[::-1]) - 2
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((pixels >= 1) & (pixels <= room)).all(axis=-1))
-    if not inside.any():
-        return None
     kept = replace(lattice, pixels=pixels).subset(inside)
-    return refined_locally(level, kept, _LARGEST)
+    return refined(level, kept, local_sigma(kept), _LARGEST)
 
 
-def refined_locally(level: Level, lattice: Lattice, most: float) -> Lattice:
-    """Move vertices to saddle points within `most` px, with smoothing by the local width of the squares."""
-    row, col, predicted = lattice.predicted
-    sigma = np.clip(np.round(_SIGMA * predicted.width / 0.25) * 0.25, 0.75, 2.0)
+def local_sigma(lattice: Lattice) -> Array:
+    """(N,) smoothing of derivatives [px] by the local width of the squares."""
+    return np.clip(np.round(_SIGMA * lattice.predicted[2].width / 0.25) * 0.25, 0.75, 2.0)
+
+
+def refined(level: Level, lattice: Lattice, sigma: Array | float, most: float) -> Lattice:
+    """Move vertices to saddle points within `most` px; derivatives are smoothed by `sigma` [px]."""
+    row, col = np.nonzero(lattice.seen)
+    sigma = np.broadcast_to(sigma, row.shape)
     pixels = lattice.pixels.copy()
     for value in np.unique(sigma):
         some = sigma == value
         start = pixels[row[some], col[some]]
-        refined = refine_saddles(level.image, start, float(value))
+        moved = refine_saddles(level.image, start, float(value))
         with np.errstate(invalid="ignore"):
-            close = np.hypot(*(refined - start).T) < most
-        pixels[row[some], col[some]] = np.where(close[:, None], refined, start)
+            close = np.hypot(*(moved - start).T) < most
+        pixels[row[some], col[some]] = np.where(close[:, None], moved, start)
     return replace(lattice, pixels=pixels)
 
 
@@ -240,13 +243,7 @@ def stretch(level: Level, saddles: Array) -> Stretched | None:
     turn = np.stack([_FACTOR * across, along])
     corners = np.array([[u, v] for u in (low[0], high[0]) for v in (low[1], high[1])]) @ turn.T
     shift = -corners.min(axis=0)
-    size = np.ceil(np.ptp(corners, axis=0)).astype(int)
+    size = np.ceil(np.ptp(corners, axis=0)).astype(int).tolist()
     forth = np.concatenate([turn, shift[:, None]], axis=1)
-    part = cv2.warpAffine(
-        level.image,
-        forth,
-        (int(size[0]), int(size[1])),
-        flags=cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    part = cv2.warpAffine(level.image, forth, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return Stretched(Level(np.asarray(part, dtype=np.float32), 1), forth)
