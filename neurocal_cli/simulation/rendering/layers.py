@@ -17,11 +17,14 @@ from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
-from neurocal_cli.simulation.rendering.scene import Occluder, Scene, Target
+from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
 _NEARBY = 2.0
+# Least component of a normal, to avoid division by 0; the error of the area is below 1e-5.
+_LEAST_COMPONENT = 1e-5
+_FINEST = 8  # divisions of the side of a cell with more than one edge
+_PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the corner of a pixel
 
 
 @frozen_dataclass(eq=False)
@@ -133,8 +136,36 @@ def _inward(a: Array, ends: tuple[float, float]) -> Array:
     return np.minimum(a - ends[0], ends[1] - a)
 
 
-_FINEST = 8  # divisions of the side of a cell with more than one edge
-_PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the corner of a pixel
+def half_plane(
+    distance: Array, normal_u: Array, normal_v: Array, cell: float, slack: float = 0.0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Share of square cells on the positive side of straight edges, and whether the edge crosses the cell.
+
+    `distance` [px] is from the edge to the cell's centre, positive on the positive side. The signs of the
+    unit normals do not matter. Cells with an edge as close as `slack` [px] count as touched, too.
+    """
+    support = (np.abs(normal_u) + np.abs(normal_v)) * (0.5 * cell)
+    touched = np.abs(distance) < support + slack
+    share = (distance > 0).astype(float)
+    if touched.any():
+        share[touched] = _area(distance[touched] / cell, normal_u[touched], normal_v[touched])
+    return share, touched
+
+
+def _area(distance: Array, normal_u: Array, normal_v: Array) -> Array:
+    """Area of the part of the unit square with ``n . x > -distance``, as a second difference of ramps."""
+    p = np.maximum(np.abs(normal_u), _LEAST_COMPONENT)
+    q = np.maximum(np.abs(normal_v), _LEAST_COMPONENT)
+    outer, inner = 0.5 * (p + q), 0.5 * (p - q)
+    total = (
+        _ramp(distance + outer) - _ramp(distance + inner) - _ramp(distance - inner) + _ramp(distance - outer)
+    )
+    return np.clip(total / (p * q), 0.0, 1.0)
+
+
+def _ramp(x: Array) -> Array:
+    positive = np.maximum(x, 0.0)
+    return 0.5 * positive * positive
 
 
 @frozen_dataclass(eq=False)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import field
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
@@ -19,7 +20,6 @@ from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import Cover
 
 
 @frozen_dataclass
@@ -68,6 +68,15 @@ class Target:
         x_low, x_high, y_low, y_high = self.pattern_box
         margin = self.margin
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
+
+
+class Cover(NamedTuple):
+    """Part of each cell that a layer covers."""
+
+    alpha: Array  # covered share of the cell
+    light: Array  # reflectance, integrated over the covered share
+    depth: Array  # [world unit] along the camera's axis; infinite if nothing is covered
+    edges: NDArray[np.int8]  # number of edges in the cell
 
 
 class Occluder(Protocol):
