@@ -24,6 +24,12 @@ _INTO = 0.3  # squares; offset of the samples in the four squares, along both ax
 _ALONG, _ASIDE = 0.36, 0.16  # squares; offsets of the samples beside the edges, along and across these
 _LEAST_EVENNESS = 0.6  # a visible vertex has at least 0.9, even if blurred or noisy
 _LEAST_EDGE = 0.3  # least step across an edge, relative to the contrast
+# Limits of whole lattices. Insensitive, except _EDGES, which is a share: doubled, it rejects all boards.
+_EDGES = 0.9  # least share of visible edges
+# Greatest rms distance of vertices from the predictions of their neighbours: in squares, plus px, plus px per
+# ratio of the noise (of second derivatives) to the contrast.
+_OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
+_MANY, _FEW_SMOOTH = 18, 0.6  # factor on this limit for fewer vertices, which may be aligned by chance
 
 
 @frozen_dataclass(eq=False)
@@ -71,14 +77,6 @@ def check_vertices(level: Level, points: Array, predicted: PredictedVertices, da
         # Samples beyond the border only repeat its pixels.
         is_vertex &= ((places > -1) & (places < size)).all(axis=(1, 2))
     return VertexCheck(contrast, flat, is_vertex)
-
-
-# Limits of whole lattices. Insensitive, except _EDGES, which is a share: doubled, it rejects all boards.
-_EDGES = 0.9  # least share of visible edges
-# Greatest rms distance of vertices from the predictions of their neighbours: in squares, plus px, plus px per
-# ratio of the noise (of second derivatives) to the contrast.
-_OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
-_MANY, _FEW_SMOOTH = 18, 0.6  # factor on this limit for fewer vertices, which may be aligned by chance
 
 
 def has_block(lattice: Lattice) -> bool:

@@ -25,6 +25,8 @@ _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the ne
 _SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
+_IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
+_SECOND = 0.4  # ... or greatest second difference times this weight
 
 
 @frozen_dataclass(eq=False)
@@ -115,11 +117,6 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     back = np.zeros_like(seen)
     back[first, p] = seen[to[first, p], entry[first, p]]
     return seen & back
-
-
-# Insensitive; tests/test_finding.py.
-_IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
-_SECOND = 0.4  # ... or greatest second difference times this weight
 
 
 def find_seeds_3x3(links: Links) -> Index:

@@ -20,6 +20,11 @@ _MEETS_PARTLY = 0.22  # ... and the same for vertices of incomplete rows
 _MOSTLY = 0.6  # share of such vertices above which a row is removed
 _COPY = 0.5  # share of vertices in another lattice above which a lattice is its copy
 _BESIDE = 2.0  # squares; lattices farther apart share no vertices
+# tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
+_NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
+_WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
+_LEAST = 4  # least number of vertices compared
+_TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
@@ -110,13 +115,6 @@ def _distance(points: Array, others: Array) -> Array:
         return np.full(len(points), np.inf)
     away = points[:, None] - others[None]
     return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))
-
-
-# tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
-_NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
-_WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
-_LEAST = 4  # least number of vertices compared
-_TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 
 
 def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:

@@ -42,6 +42,8 @@ _NEAREST_FIRST, _ENDS = 2.0, 0.12  # the same before the last fit: sigma, at mos
 _NEAREST_SHARP = 0.75  # px; the same for sharp edges: the crossing lines cut only nearer pixels
 _RIM, _RIM_BLUR = 0.1, 3.0  # share of the length, and sigma, left out at the board's end, which may be cut
 _COLUMNS = 40  # columns of pixels along an edge before the last fit
+OFFSET, TILT = 0, 1  # the first two values of an edge's fit
+_BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
 @frozen_dataclass(eq=False)
@@ -104,10 +106,6 @@ def edge_pixels(
 def usual_stride(lines: Lines) -> int:
     """Stride of columns before the last fit, chosen for speed."""
     return max(2, int(upper_median(lines.length) / _COLUMNS))
-
-
-OFFSET, TILT = 0, 1  # the first two values of an edge's fit
-_BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:

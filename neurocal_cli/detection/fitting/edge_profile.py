@@ -51,6 +51,10 @@ _C = (
 )
 _ROOT_HALF = float(np.sqrt(0.5))
 _PEAK = float(1 / np.sqrt(2 * np.pi))
+PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
+# Limits that avoid division by 0, below what can be measured; insensitive.
+_LEAST_PSF = 0.02  # px
+_LEAST_HALF = 5e-3  # px
 
 
 def erf_and_density(z: Real) -> tuple[Real, Real]:
@@ -162,12 +166,6 @@ def box_kurtosis(normal: Array, sigma: Array) -> Array:
     It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
     """
     return np.asarray((normal**4).sum(axis=-1) / (1440 * sigma**4))
-
-
-PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
-# Limits that avoid division by 0, below what can be measured; insensitive.
-_LEAST_PSF = 0.02  # px
-_LEAST_HALF = 5e-3  # px
 
 
 def half_widths(normal: Array) -> Array:

@@ -15,11 +15,14 @@ from neurocal_cli.simulation.rendering.layers import Composition
 from neurocal_cli.simulation.rendering.scene import Illumination, Scene, Sensor
 from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
 # Product of cells along a pixel's side and blur [px] that keeps the error below 0.0005 of full scale.
 _PARTS_BY_BLUR = 8.0
 _FEWEST_PARTS, _MOST_PARTS = 4, 24
 _STRIP = 32768  # pixels processed at a time; they fit into the cache
 _CHUNK = 65536  # cells processed at a time
+_SRGB_LINEAR = 0.0031308
 
 
 def image_light(scene: Scene, parts: int | None = None) -> Array:
@@ -118,11 +121,6 @@ def _vignetting(scene: Scene) -> Array | float:
     u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
     corner = max(0.25 * ((width - 1) ** 2 + (height - 1) ** 2), 1.0)
     return np.asarray(1 - strength * (u**2 + v[:, None] ** 2) / corner)
-
-
-Image = NDArray[np.uint8] | NDArray[np.uint16]
-
-_SRGB_LINEAR = 0.0031308
 
 
 @frozen_dataclass(eq=False)
