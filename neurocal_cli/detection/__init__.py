@@ -9,7 +9,7 @@ image -> levels of a pyramid                `finding.levels`
 -> saddle points of the brightness          `finding.saddles` (`finding.subpixel`)
 -> links along edges -> seeds               `finding.links`
 -> growing lattices                         `finding.from_links`, `finding.grow` (`finding.lattice`,
-                                            `finding.predict`, `finding.vertex_check`)
+                                            `finding.predict`, `finding.checks`)
 -> grids, one for each plane                `finding.grids` (`finding.folds`, `overlaps`, `straighten`)
 -> identity: the board's coordinates        `identity.identify` (`ends`, `placement`, `linear_camera`)
 -> edge fits to all pixels nearby           `fitting.grid_fit` (`initial_fit`, `edge_fit`, `edge_profile`,
