@@ -27,21 +27,11 @@ from neurocal_cli.geometry import Array
 
 @frozen_dataclass(eq=False)
 class Patterns:
-    """Training data of a stack of networks.
+    """Training data of a stack of G networks."""
 
-    Parameters
-    ----------
-    inputs : (G, N, I) array
-        Normalised world points, with the last input 1. All networks share them if G is 1.
-    targets : (G, N, 3) array
-        Normalised pixels (u, v, 1).
-    weights : (G, N) array
-        Weight w_i of each pattern; 0 for padding.
-    """
-
-    inputs: Array
-    targets: Array
-    weights: Array
+    inputs: Array  # (G, N, I) normalised world points, with the last input 1; shared if G is 1
+    targets: Array  # (G, N, 3) normalised pixels (u, v, 1)
+    weights: Array  # (G, N) weight w_i of each pattern; 0 for padding
 
     @property
     def n_inputs(self) -> int:
@@ -79,17 +69,11 @@ def e_2d(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Array:
 
 
 def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
-    """Residuals d - gamma o with gamma eliminated, and their derivative by the product W V.
+    """Residuals d - gamma o (G, N, 3) with gamma eliminated, and their derivative by the product W V.
 
-    The residual is the component of the target perpendicular to the ray o. The derivative of gamma is along
-    the ray and is dropped (Kaufman's variable projection). The gradient is exact, and the Hessian is that of
-    Gauss-Newton.
-
-    Returns
-    -------
-    residuals : (G, N, 3) array
-    jacobian : (G, N, 3, 3, I) array
-        By the entries of the (3, I) product.
+    The derivative is (G, N, 3, 3, I), by the entries of the (3, I) product. The residual is the component of
+    the target perpendicular to the ray o. The derivative of gamma is along the ray and is dropped (Kaufman's
+    variable projection). The gradient is exact, and the Hessian is that of Gauss-Newton.
     """
     Z = patterns.inputs
     o = output(W, V, Z)
@@ -103,13 +87,7 @@ def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Ar
 
 
 def _rotation_part(V: Array) -> Array:
-    """Columns of V that form the rotation.
-
-    Raises
-    ------
-    InputError
-        V of a flat board, whose third column is missing.
-    """
+    """Columns of V that form the rotation; InputError for a flat board, whose third column is missing."""
     if V.shape[-1] != 4:
         raise InputError("E_orth needs V with four inputs; a flat board's V lacks a column of the rotation")
     return V[..., :, :3]

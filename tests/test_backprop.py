@@ -29,10 +29,9 @@ from neurocal_cli.network import (
     random_weights,
     residual_jacobian,
 )
+from neurocal_cli.training import Task
 from neurocal_cli.training import backprop_blocks as blocks
-from neurocal_cli.training import compile  # noqa: A004
 from neurocal_cli.training.backprop import BackpropOptions, _Run, train_backprop
-from neurocal_cli.training.task import Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
 CENTRED = UPPER & (np.arange(3) < 2)
@@ -174,7 +173,7 @@ def plain_rule(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The kernel's module loaded once more, without a compiler."""
     from neurocal_cli.training import backprop_kernel
 
-    monkeypatch.setattr(compile, "_NUMBA", None)
+    monkeypatch.setitem(sys.modules, "numba", None)
     spec = util.spec_from_file_location("plain_rule", backprop_kernel.__file__)
     assert spec is not None
     assert spec.loader is not None
@@ -524,8 +523,8 @@ def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
 def test_without_numba_training_goes_in_blocks() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
-        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks, compile\n"
-        "print(compile.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
+        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks\n"
+        "print(backprop_kernel.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
         " backprop._presenter('patterns')[0] is backprop_kernel.present)"
     )
     assert run(code) == "False True True\n"
@@ -540,6 +539,8 @@ def test_machine_code_that_cannot_be_kept_is_compiled_each_time(monkeypatch: pyt
     def caching(*, cache: bool) -> Any:
         return lambda function: njit(function, cache=cache)
 
+    from neurocal_cli.training import backprop_kernel
+
     fake = SimpleNamespace(njit=lambda function=None, **k: caching(**k) if k else njit(function))
-    monkeypatch.setattr(compile, "_NUMBA", fake)
-    assert compile.jit(lambda: None) == "compiled"  # type: ignore[comparison-overlap]
+    monkeypatch.setattr(backprop_kernel, "_NUMBA", fake)
+    assert backprop_kernel.jit(lambda: None) == "compiled"  # type: ignore[comparison-overlap]

@@ -93,7 +93,7 @@ def test_each_edge_to_the_rim_serves_one_midpoint_beside_its_vertex() -> None:
     seen = np.ones((5, 6), dtype=bool)
     seen[2, 3] = seen[0, 0] = False
     grid = Grid(np.where(seen[..., None], 0.0, np.nan) + np.zeros((5, 6, 2)), 0)
-    edges, rim = GridEdges.of(grid), GridEdges.to_rim(grid)
+    edges, rim = GridEdges.of(grid, 2), GridEdges.of(grid, 1)
     served = edges_served(grid.shape, edges, rim, np.ones(len(edges.index), dtype=bool))
     assert (served >= 0).all()
     ends = edges.index[:, None] + np.where(edges.vertical[:, None, None], [[0, 0], [0, 1]], [[0, 0], [1, 0]])
@@ -114,7 +114,7 @@ def test_each_lens_has_a_model_without_a_polynomial(kind: type[SmoothMap]) -> No
 def test_nothing_is_told_of_a_board_that_departs_from_the_map() -> None:
     _, picture = take("base", 0)
     grid, _ = found(picture.truth.planes[0], 1)
-    grid_image = GridImage.of(picture.image, grid, 1 / 12)
+    grid_image = GridImage(picture.image, grid, 1 / 12)
     fitted = fit_grid(grid_image)
     along = positions_along_edges(grid_image, fitted)
     assert along is not None

@@ -19,8 +19,7 @@ from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
-from neurocal_cli.detection.finding.links import find_links
-from neurocal_cli.detection.finding.seeds import find_seeds_3x3
+from neurocal_cli.detection.finding.links import find_links, find_seeds_3x3
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth

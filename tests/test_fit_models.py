@@ -11,18 +11,19 @@ import pytest
 from support.maps import some_map
 
 from neurocal_cli.detection.fitting.batched_newton import ProfileShape
-from neurocal_cli.detection.fitting.edge_fit import edge_model
-from neurocal_cli.detection.fitting.edge_pixels import EdgePixels
+from neurocal_cli.detection.fitting.edge_fit import EdgePixels, edge_model
 from neurocal_cli.detection.fitting.edge_profile import (
+    PIXEL,
     RESPONSE_TERMS,
     box_kurtosis,
+    box_profile,
     erf_and_density,
+    half_widths,
     profile,
     response,
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.pixel_box import PIXEL, box_profile, half_widths
 from neurocal_cli.detection.fitting.smooth_map import homography_start
 from neurocal_cli.detection.fitting.vertex_fit import VertexPixels, vertex_model
 from neurocal_cli.geometry import Array

@@ -18,8 +18,7 @@ from neurocal_cli.detection.identity.ends import DIRECTIONS, End, board_ends
 from neurocal_cli.detection.identity.identify import identify
 from neurocal_cli.detection.identity.linear_camera import fit_camera, rigid_motion
 from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError
-from neurocal_cli.detection.identity.placement import Placement, placements
-from neurocal_cli.detection.identity.trim import trimmed
+from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import Rendered, Scene, Sides, Target, ground_truth
 

@@ -8,8 +8,7 @@ from support.rendered import condition, picture
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.overlay import draw_detection, draw_failure
-from neurocal_cli.detection.plane_residuals import plane_residuals
+from neurocal_cli.detection.overlay import draw_detection, draw_failure, plane_residuals
 from neurocal_cli.geometry import Array
 
 

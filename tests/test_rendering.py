@@ -35,9 +35,8 @@ from neurocal_cli.simulation.rendering import (
     render,
 )
 from neurocal_cli.simulation.rendering.blur import Blur
-from neurocal_cli.simulation.rendering.coverage import half_plane
-from neurocal_cli.simulation.rendering.light import image_light
-from neurocal_cli.simulation.rendering.render import digitised
+from neurocal_cli.simulation.rendering.layers import half_plane
+from neurocal_cli.simulation.rendering.render import digitised, image_light
 
 SMALL = Camera(Intrinsics(250.0, 252.0, 81.0, 58.0), image_size=(160, 120))
 PLANE = Plane("", 5, 4, 10.0)

@@ -28,7 +28,7 @@ from neurocal_cli.simulation.rendering import (
     Target,
     ground_truth,
 )
-from neurocal_cli.simulation.rendering.light import image_light
+from neurocal_cli.simulation.rendering.render import image_light
 
 PLANE = Plane("", 5, 4, 10.0)
 EXACT = Sensor(read_noise=0.0, bits=16)

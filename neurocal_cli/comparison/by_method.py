@@ -15,22 +15,11 @@ METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 def calibrate_with(
     method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
 ) -> Calibration:
-    """Calibrate a camera by a method, with nothing known (type 1), from all points of a given target.
+    """Calibrate a camera by one of `METHODS`, with nothing known (type 1), from all points of a given target.
 
-    Parameters
-    ----------
-    method : str
-        One of `METHODS`; backprop is the network with the paper's trainer, opencv is `calibrateCamera`.
-    points : Correspondences
-    model : str
-        Distortion model; linear uses none, and tsai at most k1.
-    skew : bool
-    seed : int
-
-    Raises
-    ------
-    NeurocalError
-        The method has no solution.
+    The method backprop is the network with the paper's trainer, and opencv is `calibrateCamera`. Of the
+    requested distortion model, linear uses none, and tsai at most k1. Raises NeurocalError if the method has
+    no solution.
     """
     if method == "opencv":
         return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))

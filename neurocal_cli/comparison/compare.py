@@ -22,44 +22,28 @@ _FOLDS = 5
 
 @frozen_dataclass(eq=False)
 class Compared:
-    """Result of a method for the points of one camera.
+    """Result of a method for the points of one camera."""
 
-    Attributes
-    ----------
-    calibration : Calibration or None
-        None if the method has no solution.
-    held_out_px : float [px]
-        Five-fold cross-validation error (rms); nan if a fold has no solution.
-    seconds : float
-        Time of the calibration.
-    problem : str
-        Reason why there is no solution.
-    """
-
-    calibration: Calibration | None
-    held_out_px: float = np.nan
-    seconds: float = np.nan
-    problem: str = ""
+    calibration: Calibration | None  # None if the method has no solution
+    held_out_px: float = np.nan  # five-fold cross-validation error (rms); nan if a fold has no solution
+    seconds: float = np.nan  # time of the calibration
+    problem: str = ""  # reason why there is no solution
 
 
 @frozen_dataclass(eq=False)
 class Comparison:
-    """Result of `compare`.
+    """Result of `compare`."""
 
-    Attributes
-    ----------
-    points : tuple of Correspondences
-        Points of one or two cameras, the same for all methods.
-    cameras : tuple of dict of Compared by method
-    stereo : dict of StereoEvaluation by method, or None
-        For two cameras, each calibrated alone as in the paper's section 5.2; None for one camera.
-    notes : tuple of str
-    """
-
-    points: tuple[Correspondences, ...]
-    cameras: tuple[dict[str, Compared], ...]
+    points: tuple[Correspondences, ...]  # of one or two cameras, the same for all methods
+    cameras: tuple[dict[str, Compared], ...]  # by the method
+    # For two cameras, each calibrated alone as in the paper's section 5.2, by the method.
     stereo: dict[str, StereoEvaluation] | None
     notes: tuple[str, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.points[0].unit
 
 
 def compare(
@@ -71,26 +55,11 @@ def compare(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Calibrate one or two cameras by every method.
+    """Calibrate one or two cameras, whose views are paired by name, by every method of `METHODS`.
 
-    Parameters
-    ----------
-    points : one or two of Correspondences
-        Views of two cameras are paired by name.
-    methods : sequence of str
-        From `by_method.METHODS`.
-    distortion : str
-        With auto, all methods use the model selected by the network's calibration.
-    skew : bool
-    outliers : {"reject", "keep"}
-        With reject, points that the network's calibration rejects are left out for all methods.
-    seed : int
-    progress : callable, optional
-
-    Raises
-    ------
-    NeurocalError
-        The network's calibration has no solution.
+    With the distortion "auto", all methods use the model selected by the network's calibration. With the
+    outliers "reject", points that the network's calibration rejects are left out for all methods. Raises
+    NeurocalError if the network's calibration has no solution.
     """
     report = progress or (lambda stage, share: None)
     notes: list[str] = []

@@ -10,6 +10,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.comparison.compare import Compared, Comparison
 from neurocal_cli.report import align, number_or_none, rounded
+from neurocal_cli.stereo.space_error import SpaceError
 
 _MODELS = {"none": "no distortion"}
 _SIDES = "left", "right"
@@ -36,31 +37,20 @@ def _table(title: str, rows: list[list[str]]) -> str:
 def _errors(camera: dict[str, Compared]) -> list[list[str]]:
     rows = [["method", "rms [px]", "held-out [px]", "time [ms]", "distortion"]]
     for method, one in camera.items():
-        if one.calibration is None:
-            rows.append([method, "-", "-", "-", "-"])
-            continue
-        model = one.calibration.distortion_model
-        milliseconds = f"{1000 * one.seconds:.0f}"
-        rows.append(
-            [
-                method,
-                _px(one.calibration.rmse_px),
-                _px(one.held_out_px),
-                milliseconds,
-                _MODELS.get(model, model),
-            ]
-        )
+        cells = ["-"] * 4
+        if one.calibration is not None:
+            model = one.calibration.distortion_model
+            cells = [_px(one.calibration.rmse_px), _px(one.held_out_px), f"{1000 * one.seconds:.0f}"]
+            cells.append(_MODELS.get(model, model))
+        rows.append([method, *cells])
     return rows
 
 
 def _parameters(camera: dict[str, Compared]) -> list[list[str]]:
     known = {method: one.calibration for method, one in camera.items() if one.calibration is not None}
-    names = [*INTRINSIC_NAMES]
-    for calibration in known.values():
-        names += [n for n in coefficient_names(calibration.distortion_model) if n not in names]
-    rows = [["parameter", *known]]
-    rows += [[name, *(_value(calibration, name) for calibration in known.values())] for name in names]
-    return rows
+    names = dict.fromkeys([*INTRINSIC_NAMES, *(name for one in known.values() for name in _values(one))])
+    rows = [[name, *(_value(calibration, name) for calibration in known.values())] for name in names]
+    return [["parameter", *known], *rows]
 
 
 def _value(calibration: Calibration, name: str) -> str:
@@ -81,10 +71,8 @@ def _values(calibration: Calibration) -> dict[str, float]:
 
 def _triangulation(comparison: Comparison) -> list[list[str]]:
     assert comparison.stereo is not None
-    unit = comparison.points[0].unit
-    rows = [
-        ["method", f"RMSE [{unit}]", "NSCE", f"baseline [{unit}]", f"through one rig: RMSE [{unit}]", "NSCE"]
-    ]
+    unit = f"[{comparison.unit}]"
+    rows = [["method", f"RMSE {unit}", "NSCE", f"baseline {unit}", f"through one rig: RMSE {unit}", "NSCE"]]
     for method, one in comparison.stereo.items():
         rig = ["-", "-"] if one.rig is None else [_px(one.rig.rmse), _px(one.rig.nsce)]
         rows.append([method, _px(one.by_view.rmse), _px(one.by_view.nsce), f"{one.baseline:.2f}", *rig])
@@ -100,12 +88,9 @@ def _below(comparison: Comparison) -> list[str]:
         lines += _lowest(f"{name}lowest held-out error", errors, " px")
         lines += [f"{name}{method}: {one.problem}" for method, one in camera.items() if one.problem]
     if comparison.stereo is not None:
-        unit = comparison.points[0].unit
-        found = comparison.stereo
-        lines += _lowest(
-            "lowest RMSE", {method: one.by_view.rmse for method, one in found.items()}, f" {unit}"
-        )
-        lines += _lowest("lowest NSCE", {method: one.by_view.nsce for method, one in found.items()}, "")
+        found, unit = {method: one.by_view for method, one in comparison.stereo.items()}, comparison.unit
+        lines += _lowest("lowest RMSE", {method: one.rmse for method, one in found.items()}, f" {unit}")
+        lines += _lowest("lowest NSCE", {method: one.nsce for method, one in found.items()}, "")
     return lines
 
 
@@ -133,19 +118,20 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         ],
     }
     if comparison.stereo is not None:
-        found["unit"] = comparison.points[0].unit
+        found["unit"] = comparison.unit
         found["stereo"] = {
             method: {
-                "rmse": number_or_none(one.by_view.rmse),
-                "nsce": number_or_none(one.by_view.nsce),
+                **_triangulated_json(one.by_view),
                 "baseline": number_or_none(one.baseline),
-                "rig": None
-                if one.rig is None
-                else {"rmse": number_or_none(one.rig.rmse), "nsce": number_or_none(one.rig.nsce)},
+                "rig": None if one.rig is None else _triangulated_json(one.rig),
             }
             for method, one in comparison.stereo.items()
         }
     return found
+
+
+def _triangulated_json(errors: SpaceError) -> dict[str, float | None]:
+    return {"rmse": number_or_none(errors.rmse), "nsce": number_or_none(errors.nsce)}
 
 
 def _camera_json(one: Compared) -> dict[str, Any]:

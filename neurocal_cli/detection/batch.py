@@ -31,52 +31,26 @@ _KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's thresh
 
 @frozen_dataclass
 class DetectionOptions:
-    """Options of a detection.
-
-    Attributes
-    ----------
-    board : Board
-    points : {"midpoints", "edges", "vertices"}
-    gamma : float, optional
-    overlay : bool
-        Whether to draw the detection.
-    strict : bool
-        Raise unexpected errors instead of reporting them as the problem of one image.
-    cache : DetectionCache, optional
-        Outcomes of earlier runs; new ones are added.
-    """
+    """Options of a detection; `points` and `gamma` are those of `detect_points`."""
 
     board: Board
     points: Points = "midpoints"
     gamma: float | None = None
-    overlay: bool = False
-    strict: bool = False
-    cache: DetectionCache | None = None
+    overlay: bool = False  # whether to draw the detection
+    strict: bool = False  # raise unexpected errors instead of reporting them as the problem of one image
+    cache: DetectionCache | None = None  # outcomes of earlier runs; new ones are added
 
 
 @frozen_dataclass(eq=False)
 class Outcome:
-    """Result of one image file: a detection, or a problem in one line.
-
-    Attributes
-    ----------
-    path : str
-    detection : Detection, optional
-    problem : str
-        Empty if there is a detection.
-    notes : tuple of str
-        Remarks for the user on the image and its detection.
-    overlay : bytes, optional
-        A PNG; images without the board have one, too.
-    shown : (cols, rows), optional
-        Number of inner vertices of another board in the image.
-    """
+    """Result of one image file: a detection, or a problem in one line."""
 
     path: str
     detection: Detection | None = None
-    problem: str = ""
-    notes: tuple[str, ...] = ()
-    overlay: bytes | None = None
+    problem: str = ""  # empty if there is a detection
+    notes: tuple[str, ...] = ()  # remarks for the user on the image and its detection
+    overlay: bytes | None = None  # a PNG; images without the board have one, too
+    # (cols, rows): number of inner vertices of another board in the image
     shown: tuple[int, int] | None = None
 
 
@@ -86,15 +60,7 @@ def default_jobs(images: int) -> int:
 
 
 def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
-    """Detect boards in image files; yields outcomes in the order of the paths.
-
-    Parameters
-    ----------
-    paths : sequence of str
-    options : DetectionOptions
-    jobs : int
-        Number of processes; it does not change the outcomes.
-    """
+    """Detect boards in image files with any number of processes, in the order of the paths."""
     jobs = min(jobs, len(paths))
     if jobs <= 1:
         retain_freed_memory()

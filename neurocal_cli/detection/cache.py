@@ -27,14 +27,9 @@ _FORMAT = 3  # raised when the same image gives other points than before
 
 
 class DetectionCache:
-    """A folder of cached outcomes.
+    """A folder of cached outcomes, created if it does not exist.
 
-    Parameters
-    ----------
-    folder : str
-        Created if it does not exist.
-    request : str
-        A text that differs if the requested detection differs.
+    The text of the request differs if the requested detection differs.
     """
 
     def __init__(self, folder: str, request: str) -> None:
@@ -61,10 +56,7 @@ class DetectionCache:
     def store(self, image: bytes, outcome: Outcome) -> None:
         """Write an outcome at once, because the outputs that a command holds back are lost if it stops.
 
-        Raises
-        ------
-        NeurocalError
-            The folder cannot be written to.
+        Raises NeurocalError if the folder cannot be written to.
         """
         found, overlay = outcome.detection, outcome.overlay
         tree = {

@@ -29,20 +29,11 @@ _PREFIXES = ("h:", "v:", "")  # by kind: prefix of a point's id
 
 @frozen_dataclass(eq=False)
 class Labels:
-    """Labels of the points of a plane.
-
-    Attributes
-    ----------
-    plane : Plane
-    kind : (N,) int array
-        `EDGE_H` along the plane's x axis, `EDGE_V` along its y axis, or `VERTEX`.
-    place : (N, 2) int array
-        The vertex (c, r) named in the id.
-    """
+    """Labels of N points of a plane."""
 
     plane: Plane
-    kind: NDArray[np.int64]
-    place: NDArray[np.int64]
+    kind: NDArray[np.int64]  # (N,) `EDGE_H` along the plane's x axis, `EDGE_V` along its y axis, or `VERTEX`
+    place: NDArray[np.int64]  # (N, 2) the vertex (c, r) named in the id
 
     @property
     def ids(self) -> list[str]:
@@ -190,14 +181,7 @@ def _sound(measured: Measured) -> Measured:
 
 
 def label(located: Located, measured: Measured) -> Labels:
-    """Label the measured points of a grid with those of its plane.
-
-    Parameters
-    ----------
-    located : Located
-        The points' grid.
-    measured : Measured
-    """
+    """Label the measured points of a grid with those of its plane."""
     steps = _STEPS[measured.kind]
     first = located.placement.apply(measured.index)
     second = located.placement.apply(measured.index + steps)
@@ -208,18 +192,10 @@ def label(located: Located, measured: Measured) -> Labels:
 
 
 def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Correspondences:
-    """Join the points of several images of one camera.
+    """Join the points of several images of one camera, by the name of the view.
 
-    Parameters
-    ----------
-    detections : dict of Detection by the name of the view
-    unit : str
-        The board's.
-
-    Raises
-    ------
-    InputError
-        There is no image, or image sizes differ, so the images come from more than one camera.
+    Raises InputError if there is no image, or image sizes differ, so the images come from more than one
+    camera.
     """
     if not detections:
         raise InputError("there are no images with points; give at least one")

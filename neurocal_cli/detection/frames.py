@@ -34,15 +34,10 @@ class _Best:
 
 
 def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 30.0) -> list[int]:
-    """Choose frames by their numbers, in the order of the video.
+    """Choose at most `most` of the grey frames of a video by their numbers, in the order of the video.
 
-    Parameters
-    ----------
-    frames : iterable of (height, width) uint8 arrays
-    most : int
-        Greatest number of frames to choose.
-    rate : float
-        Frames per second. In a slow video, such as one of single photographs, every frame is a stretch.
+    `rate` is in frames per second. In a slow video, such as one of single photographs, every frame is a
+    stretch.
     """
     length = int(np.clip(round(_STRETCH * rate), 1, _LONGEST))
     stretches: list[_Best] = []

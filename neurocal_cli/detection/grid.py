@@ -24,19 +24,12 @@ EDGE_H, EDGE_V, VERTEX = 0, 1, 2
 
 @frozen_dataclass(eq=False)
 class Grid:
-    """Vertices found on one chessboard.
+    """Vertices found on one chessboard."""
 
-    Attributes
-    ----------
-    pixels : (rows, cols, 2) array [px]
-        Of vertex (c, r) at ``[r, c]``; NaN where it was not found. The first and last row and column
-        each hold at least one vertex.
-    dark : int
-        0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
-    """
-
+    # (rows, cols, 2) [px] of vertex (c, r) at [r, c]; NaN where it was not found. The first and last row and
+    # column each hold at least one vertex.
     pixels: Array
-    dark: int
+    dark: int  # 0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where c + r + dark is even
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -62,35 +55,18 @@ _OF_POINTS = ("kind", "index", "pixels", "covariance", "across")  # of `Measured
 
 @frozen_dataclass(eq=False)
 class Measured:
-    """Points of one grid, measured in the image.
+    """N points of one grid, measured in the image."""
 
-    Attributes
-    ----------
-    kind : (N,) int array
-        `EDGE_H`, `EDGE_V` or `VERTEX`.
-    index : (N, 2) int array
-        (c, r), in the grid's coordinates.
-    pixels : (N, 2) array [px]
-    covariance : (N, 3) array [px^2]
-        suu, suv, svv.
-    across : (N, 2) array or None
-        Unit normals of the edges of mid-points, the direction in which each is measured; 0 for mid-points
-        that are measured in both directions; None for vertices.
-    vertices : (rows, cols, 2) array [px]
-        The grid's vertices after refinement, NaN where not found or not fitted.
-    rejected : int
-        Number of fits that were rejected.
-    polarity : float [px]
-        Displacement of the edges towards the dark side by gamma, ink spread and blooming; already removed.
-    """
-
-    kind: NDArray[np.int64]
-    index: NDArray[np.int64]
-    pixels: Array
-    covariance: Array
+    kind: NDArray[np.int64]  # (N,) `EDGE_H`, `EDGE_V` or `VERTEX`
+    index: NDArray[np.int64]  # (N, 2) (c, r), in the grid's coordinates
+    pixels: Array  # (N, 2) [px]
+    covariance: Array  # (N, 3) [px^2] suu, suv, svv
+    # (N, 2) unit normals of the edges of mid-points, the direction in which each is measured; 0 for
+    # mid-points that are measured in both directions; None for vertices
     across: Array | None
-    vertices: Array
-    rejected: int
+    vertices: Array  # (rows, cols, 2) [px] after refinement; NaN where not found or not fitted
+    rejected: int  # number of fits that were rejected
+    # [px] displacement of the edges towards the dark side by gamma, ink spread and blooming; already removed
     polarity: float
 
     def only(self, good: NDArray[np.bool_]) -> Measured:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.crossing_edges import AlongEdges, positions_along_edges
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
-from neurocal_cli.detection.fitting.edge_profile import response
+from neurocal_cli.detection.fitting.edge_profile import response, sharp_profile
 from neurocal_cli.detection.fitting.grid_fit import (
     GridEdges,
     GridFit,
@@ -28,7 +28,6 @@ from neurocal_cli.detection.fitting.grid_fit import (
     fit_grid_vertices,
     fit_rim,
 )
-from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
@@ -42,35 +41,19 @@ _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides,
 
 
 def measure(
-    image: NDArray[np.generic],
-    grid: Grid,
-    points: Points = "midpoints",
-    gamma: float | None = None,
+    image: NDArray[np.generic], grid: Grid, points: Points = "midpoints", gamma: float | None = None
 ) -> Measured:
-    """Measure the mid-points of edges, or the vertices.
+    """Measure the mid-points of edges, or the vertices, of a grid with vertices known to half a pixel.
 
-    Parameters
-    ----------
-    image : (H, W) array of uint8, uint16 or float
-        Grey.
-    grid : Grid
-        Vertices known to about half a pixel.
-    points : {"midpoints", "edges", "vertices"}
-        Mid-points of the edges between known vertices; these and the mid-points of the edges to the rim; or
-        vertices.
-    gamma : float, optional
-        Pixels are ``light^(1 / gamma)``; they are linearised first. Without it, the effect of the response on
-        the edges is estimated.
-
-    Returns
-    -------
-    measured : Measured
-        Without the points whose fits were rejected.
+    The grey image (H, W) is uint8, uint16 or float. `points` are the mid-points of the edges between known
+    vertices ("midpoints"), these and the mid-points of the edges to the rim ("edges"), or the vertices. If a
+    camera's `gamma` is given, pixels are ``light^(1 / gamma)`` and are linearised first; without it, the
+    effect of the response on the edges is estimated. Points whose fits are rejected are left out.
     """
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
-    grid_image = GridImage.of(light, grid, floor)
+    grid_image = GridImage(light, grid, floor)
     if len(grid_image.edges.index) == 0:
         return _nothing(grid)
     fitted = fit_grid(grid_image)

@@ -21,18 +21,7 @@ _WANTED = "neurocal takes a chessboard; `neurocal detect --help` describes it"
 
 
 def other_target(grey: NDArray[np.generic]) -> str:
-    """Name the other target that an image shows.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-        Of 8 or 16 bits.
-
-    Returns
-    -------
-    str
-        A message; empty if nothing is recognised.
-    """
+    """Message about the other target that a grey image shows; empty if none is recognised."""
     small = _small(grey)
     if _shows_markers(small):
         return f"the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; {_WANTED}"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located
-from neurocal_cli.detection.plane_residuals import plane_residuals
+from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.geometry import Array
 
 Picture = NDArray[np.uint8]
@@ -22,13 +22,12 @@ _LINE = 26  # px, height of a line of text
 _CHARACTER = 10  # px, approximate width of a character
 _SHIFT = 4  # fractional bits of drawn coordinates
 _ARROW = 0.25  # squares; greatest drawn length of a median residual
+_FEWEST_WIDE = 12  # points needed for the equidistant lens
+_POINTS_A_TERM = 6  # least number of points per coefficient of the polynomial; for pictures only
 _SCALES = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
 
-_KINDS: dict[int, tuple[str, Colour]] = {
-    EDGE_H: ("h", (255, 170, 0)),
-    EDGE_V: ("v", (0, 220, 255)),
-    VERTEX: ("vertex", (120, 255, 120)),
-}
+_KINDS = {EDGE_H: "h orange", EDGE_V: "v cyan", VERTEX: "vertex green"}
+_COLOURS: dict[int, Colour] = {EDGE_H: (255, 170, 0), EDGE_V: (0, 220, 255), VERTEX: (120, 255, 120)}
 _RESIDUAL: Colour = (255, 70, 70)
 _WHITE: Colour = (255, 255, 255)
 _X_AXIS: Colour = (255, 60, 200)
@@ -37,21 +36,11 @@ _GRIDS: tuple[Colour, ...] = ((255, 170, 0), (0, 220, 255), (120, 255, 120), (25
 
 
 def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
-    """Draw the points of a detection.
+    """Draw the points of a detection over a grey image; (height, width, 3) in the order red, green, blue.
 
     Crosses are the measured points, coloured by kind. Red lines are the residuals from a smooth map of the
     plane (`plane_residuals`), enlarged by the factor in the title. A circle marks vertex (0, 0), from which
     the axes of the plane start; the outermost vertices carry their ids.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-    detection : Detection
-
-    Returns
-    -------
-    picture : (height, width, 3) uint8 array
-        Red, green, blue.
     """
     residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
@@ -64,20 +53,16 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     ]
     canvas = _Canvas(grey, lines)
     for located, measured, residual in zip(detection.located, detection.measured, residuals, strict=True):
-        _draw_points(canvas, measured, label(located, measured).kind, residual * scale)
+        for pixel, arrow in zip(measured.pixels, residual * scale, strict=True):
+            canvas.line(pixel, pixel + arrow, _RESIDUAL)
+        for pixel, kind in zip(measured.pixels, label(located, measured).kind.tolist(), strict=True):
+            canvas.cross(pixel, _COLOURS[kind])
         _draw_frame(canvas, located, measured)
     return canvas.picture
 
 
 def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str) -> Picture:
-    """Draw the grids found in an image in which the board was not detected, with the reason.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-    grids : sequence of Grid
-    problem : str
-    """
+    """Draw the grids found in an image in which the board was not detected, with the reason."""
     sizes = ", ".join("{} x {}".format(*grid.shape) for grid in grids) or "none"
     canvas = _Canvas(grey, [problem, f"grids found: {sizes}"])
     for k, grid in enumerate(grids):
@@ -86,21 +71,13 @@ def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str)
     return canvas.picture
 
 
-def _draw_points(canvas: _Canvas, measured: Measured, kinds: NDArray[np.int64], arrows: Array) -> None:
-    for pixel, arrow in zip(measured.pixels, arrows, strict=True):
-        canvas.line(pixel, pixel + arrow, _RESIDUAL)
-    for kind, pixel in zip(kinds.tolist(), measured.pixels, strict=True):
-        canvas.cross(pixel, _KINDS[kind][1])
-
-
 def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
     """Draw the origin, the axes and the ids of the outermost vertices found."""
     pixels = np.where(np.isfinite(measured.vertices), measured.vertices, located.grid.pixels)
     rows, columns = np.nonzero(np.isfinite(pixels[..., 0]))
     places = np.rint(located.placement.apply(np.stack([columns, rows], axis=-1))).astype(int)
     at = {(x, y): pixels[r, c] for (x, y), r, c in zip(places.tolist(), rows, columns, strict=True)}
-    for axis, (colour, name) in enumerate(((_X_AXIS, "x"), (_Y_AXIS, "y"))):
-        tip = (2, 0) if axis == 0 else (0, 2)
+    for tip, colour, name in (((2, 0), _X_AXIS, "x"), ((0, 2), _Y_AXIS, "y")):
         if (0, 0) in at and tip in at:
             canvas.arrow(at[0, 0], at[tip], colour)
             canvas.text(at[tip], name, colour)
@@ -113,9 +90,7 @@ def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
 def _legend(detection: Detection) -> str:
     pairs = zip(detection.located, detection.measured, strict=True)
     every = np.concatenate([label(located, measured).kind for located, measured in pairs])
-    counts = {kind: int((every == kind).sum()) for kind in _KINDS}
-    colours = {EDGE_H: "orange", EDGE_V: "cyan", VERTEX: "green"}
-    kinds = [f"{_KINDS[kind][0]} {colours[kind]} ({n})" for kind, n in counts.items() if n]
+    kinds = [f"{name} ({n})" for kind, name in _KINDS.items() if (n := np.count_nonzero(every == kind))]
     offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
     return f"{', '.join(kinds)}; edges displaced by {offsets} px before correction"
 
@@ -181,3 +156,28 @@ def _put(picture: Picture, text: str, place: tuple[int, int], colour: Colour, si
     plain = text.encode("ascii", "replace").decode()  # the font has no other characters
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+
+def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
+    """Residuals (N, 2) [px] of points from a smooth map of their plane, to show the noise without a camera.
+
+    The plane is projected by a pinhole or an equidistant lens, whichever fits better; only by a pinhole if
+    the size of the image is not given. A polynomial models the deviations of the real lens; its degree is
+    five, or less for few points. Residuals are zero for fewer than five points, because a homography fits
+    four exactly.
+    """
+    grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
+    if len(grid) < 5:
+        return np.zeros_like(measured.pixels)
+    H, _ = cv2.findHomography(grid, measured.pixels, 0)
+    if H is None:
+        return np.zeros_like(measured.pixels)
+    seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T
+    left = np.asarray(measured.pixels - seen[:, :2] / seen[:, 2:], dtype=float)
+    if size is not None and len(grid) >= _FEWEST_WIDE:
+        wide = fit_wide_lens(grid, measured.pixels, size).residual
+        left = wide if (wide**2).sum() < (left**2).sum() else left
+    degree = max((d for d in range(1, 6) if _POINTS_A_TERM * (d + 1) * (d + 2) <= 2 * len(grid)), default=0)
+    x, y = ((grid - grid.mean(axis=0)) / max(float(np.ptp(grid)), 1.0)).T
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    return np.asarray(left - terms @ np.linalg.lstsq(terms, left, rcond=None)[0])

@@ -24,16 +24,10 @@ _FARTHEST = 3.0  # rad; no lens covers more
 
 @frozen_dataclass(eq=False)
 class WideLens:
-    """An equidistant lens.
+    """An equidistant lens."""
 
-    Attributes
-    ----------
-    focal : float [px / rad]
-    centre : (2,) array [px]
-    """
-
-    focal: float
-    centre: Array
+    focal: float  # [px / rad]
+    centre: Array  # (2,) [px]
 
     def angles(self, pixels: Array) -> Array:
         """Angles (...) between the axis and the rays of pixels (..., 2) [rad]."""
@@ -50,20 +44,11 @@ class WideLens:
 
 @frozen_dataclass(eq=False)
 class WideFit:
-    """A lens and a plane in front of it.
-
-    Attributes
-    ----------
-    lens : WideLens
-    matrix : (3, 3) array
-        Homography from grid coordinates (c, r, 1) to directions.
-    residual : (N, 2) array [px]
-        Of the vertices.
-    """
+    """A lens and a plane in front of it."""
 
     lens: WideLens
-    matrix: Array
-    residual: Array
+    matrix: Array  # (3, 3) homography from grid coordinates (c, r, 1) to directions
+    residual: Array  # (N, 2) [px] of the vertices
 
     def at(self, grid: Array) -> Array:
         """Pixels (..., 2) of grid coordinates (..., 2)."""
@@ -76,15 +61,9 @@ class WideFit:
 
 
 def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
-    """Fit a lens and a plane to the vertices of a lattice.
+    """Fit a lens and a plane to the pixels of at least 3 x 3 vertices (c, r) of a lattice; (N, 2) arrays.
 
-    Parameters
-    ----------
-    grid : (N, 2) array
-        Coordinates (c, r) of at least 3 x 3 vertices.
-    pixels : (N, 2) array [px]
-    size : (width, height) [px]
-        Of the image; its middle is the prior mean of the lens's centre.
+    The middle of the image, of size (width, height), is the prior mean of the lens's centre.
     """
     middle, half = 0.5 * (np.array(size, dtype=float) - 1), 0.5 * float(np.hypot(*size))
     farthest = max(float(np.hypot(*(pixels - middle).T).max()), 1.0)

@@ -35,48 +35,25 @@ _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below whi
 
 @frozen_dataclass(eq=False)
 class MethodErrors:
-    """Errors of one method; P parameters, S standard deviations of the noise.
+    """Errors of one method; P parameters, S standard deviations of the noise."""
 
-    Attributes
-    ----------
-    exact : (P,) array
-        Error without noise.
-    rms, bias : (S, P) arrays
-        Root mean square and mean error; for poses over all views.
-    bound : (P,) array
-        Cramer-Rao bound for noise of 1 px; 0 for given parameters.
-    failed : (S,) int array
-        Number of trials without an answer, which are left out of the means.
-    """
-
-    exact: Array
-    rms: Array
-    bias: Array
-    bound: Array
-    failed: NDArray[np.int64]
+    exact: Array  # (P,) error without noise
+    rms: Array  # (S, P) root mean square error; for poses over all views
+    bias: Array  # (S, P) mean error
+    bound: Array  # (P,) Cramer-Rao bound for noise of 1 px; 0 for given parameters
+    failed: NDArray[np.int64]  # (S,) number of trials without an answer, which are left out of the means
 
 
 @frozen_dataclass(eq=False)
 class NoiseStudy:
-    """Result of `study_noise`.
-
-    Attributes
-    ----------
-    names : tuple of P str
-    truth : (P,) array
-        True parameters; the pose is that of the first view.
-    sigma : (S,) array [px]
-    trials : int
-    methods : dict of MethodErrors by method
-    apart : dict of float by pair of methods
-        Largest difference between two methods in any trial and parameter, over the bound.
-    """
+    """Result of `study_noise`."""
 
     names: tuple[str, ...]
-    truth: Array
-    sigma: Array
+    truth: Array  # (P,) true parameters; the pose is that of the first view
+    sigma: Array  # (S,) [px]
     trials: int
-    methods: dict[str, MethodErrors]
+    methods: dict[str, MethodErrors]  # by the method's name
+    # Largest difference between two methods in any trial and parameter, over the bound.
     apart: dict[tuple[str, str], float] = field(default_factory=dict)
 
 
@@ -97,20 +74,9 @@ def study_noise(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> NoiseStudy:
-    """Calibrate with each method, without noise and then in many trials with noise.
+    """Calibrate with each method of `METHODS`, without noise and then in many trials at each sigma [px].
 
-    Parameters
-    ----------
-    scene : SimulatedScene
-    sigma : sequence of float [px]
-    trials : int
-        Number of trials at each sigma.
-    methods : sequence of str
-        From `comparison.by_method.METHODS`.
-    seed : int
-    jobs : int
-        Number of processes; it does not change the result.
-    progress : callable, optional
+    The number of processes, `jobs`, does not change the result.
     """
     chosen = tuple(methods)
     blocks = [
@@ -148,13 +114,10 @@ def study_noise(
 
 
 def cramer_rao(scene: SimulatedScene, method: str) -> Array:
-    """Cramer-Rao bound of the parameters for noise of 1 px, from the normal matrix.
+    """Cramer-Rao bound of the parameters for noise of 1 px, from the normal matrix; (5 + K + 6 V,).
 
-    Returns
-    -------
-    (5 + K + 6 V,) array
-        Least standard deviations of intrinsics, coefficients and poses; 0 for parameters that are given to
-        the method; nan if the points do not determine the others.
+    These are the least standard deviations of intrinsics, coefficients and poses; 0 for parameters that are
+    given to the method; nan if the points do not determine the others.
     """
     camera, points = scene.camera, scene.points()
     problem = problem_for_method(method, problem_for(points, 1, distortion=Distortion(camera.model)))

@@ -19,36 +19,17 @@ _MARGIN = 0.5  # squares of white paper around a board of one plane
 
 @frozen_dataclass(eq=False)
 class Picture:
-    """A rendered view.
-
-    Attributes
-    ----------
-    name : str
-        Name of the view.
-    image : (height, width) uint8 array
-    visible : frozenset of str
-        Ids of the mid-points whose edges are visible.
-    """
+    """A rendered view."""
 
     name: str
     image: NDArray[np.uint8]
-    visible: frozenset[str]
+    visible: frozenset[str]  # ids of the mid-points whose edges are visible
 
 
 def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
-    """Render every view of a scene, with default blur and noise.
+    """Render every view of a scene of a board, with default blur and noise of a seed.
 
-    Parameters
-    ----------
-    scene : SimulatedScene
-        Of a board.
-    seed : int
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        The scene has no board.
+    Raises InputError if the scene has no board.
     """
     if scene.board is None:
         raise InputError("there is no board to render: the scene's points are those of a file; give a board")

@@ -38,13 +38,7 @@ _OWN = 0.9  # a method whose bound is below this share of the largest one has it
 def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kind: str = "png") -> bytes:
     """Draw the rms errors of four parameters over the noise, and the outcomes of random starts.
 
-    Parameters
-    ----------
-    study : NoiseStudy
-    starts : StartStudy, optional
-    unit : str
-        Of the world coordinates.
-    kind : {"png", "pdf", "svg"}
+    `unit` is that of the world coordinates, and `kind` png, pdf or svg.
     """
 
     def draw(figure: Figure) -> None:

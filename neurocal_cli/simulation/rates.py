@@ -49,33 +49,18 @@ class DataSet:
 
 @frozen_dataclass(eq=False)
 class RateStudy:
-    """Result of `study_rates`.
+    """Result of `study_rates`."""
 
-    Attributes
-    ----------
-    rates_weights, rates_gamma : (A,), (B,) arrays
-    sets : int
-    converged : (A, B) int array
-        Number of data sets on which the start converged.
-    epochs : (A, B) array
-        Median number of epochs on these; nan if there are none.
-    default : (float, float)
-        The default rates of `calibrate`.
-    calibrated : int
-        Number of data sets on which `calibrate`, with the trainer backprop and these rates, reaches the
-        minimum of (3).
-    alpha_u : (n,) array
-        Errors of alpha_u in these calibrations, in reported standard deviations.
-    """
-
-    rates_weights: Array
-    rates_gamma: Array
+    rates_weights: Array  # (A,)
+    rates_gamma: Array  # (B,)
     sets: int
-    converged: NDArray[np.int64]
-    epochs: Array
-    default: tuple[float, float]
+    converged: NDArray[np.int64]  # (A, B) number of data sets on which the start converged
+    epochs: Array  # (A, B) median number of epochs on these; nan if there are none
+    default: tuple[float, float]  # the default rates of `calibrate`
+    # Number of data sets on which `calibrate`, with the trainer backprop and these rates, reaches the minimum
+    # of (3).
     calibrated: int
-    alpha_u: Array
+    alpha_u: Array  # errors of alpha_u in these calibrations, in reported standard deviations
 
 
 @frozen_dataclass
@@ -95,17 +80,9 @@ def study_rates(
     rates_weights: Sequence[float] = RATES_WEIGHTS,
     rates_gamma: Sequence[float] = RATES_GAMMA,
 ) -> RateStudy:
-    """Train on many data sets with each pair of rates.
+    """Train on many data sets with each pair of rates, the paper's alpha_1 and alpha_2.
 
-    Parameters
-    ----------
-    sets : int
-    seed : int
-    jobs : int
-        Number of processes; it does not change the result.
-    progress : callable, optional
-    rates_weights, rates_gamma : sequence of float
-        Grid of the paper's alpha_1 and alpha_2.
+    The number of processes, `jobs`, does not change the result.
     """
     usual = BackpropOptions()
     grid = list(product(rates_weights, rates_gamma))

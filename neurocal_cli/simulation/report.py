@@ -39,12 +39,7 @@ def simulation_tables(
 ) -> tuple[list[tuple[str, Table]], list[str]]:
     """Tables of the studies of noise and starts, and lines below them.
 
-    Parameters
-    ----------
-    study : NoiseStudy
-    starts : StartStudy, optional
-    paper : bool
-        Whether the scene is that of the paper, so that its printed errors are shown, too.
+    For the scene of the `paper`, its printed errors are shown, too.
     """
     tables = [("error without noise (Table 1)", _exact(study, paper))]
     if study.trials:
@@ -54,9 +49,11 @@ def simulation_tables(
             ("mean error of each parameter over its standard error, at the largest sigma", _biases(study)),
         ]
     if starts is not None:
-        tables.append(
-            (f"single random starts that reach the minimum (noise {starts.sigma:g} px)", _starts(starts))
-        )
+        rows = [
+            [_KINDS[kind], str(count), str(len(starts.rms[kind]))] for kind, count in starts.reached.items()
+        ]
+        title = f"single random starts that reach the minimum (noise {starts.sigma:g} px)"
+        tables.append((title, [["start", "reached", "of"], *rows]))
     return tables, _findings(study)
 
 
@@ -75,7 +72,8 @@ def _error(value: float) -> str:
 
 def _fig_1(study: NoiseStudy) -> Table:
     rows = [["parameter", "sigma [px]", "bound", *study.methods]]
-    bound = _whole_bound(study)
+    # That of the method with the most unknowns.
+    bound = max((one.bound for one in study.methods.values()), key=lambda bound: np.count_nonzero(bound > 0))
     for name in FIG_1:
         p = study.names.index(name)
         for k, sigma in enumerate(study.sigma):
@@ -108,18 +106,6 @@ def _bias(one: MethodErrors, p: int, trials: int) -> str:
         return "given"
     spread = np.sqrt(max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0) / max(trials - one.failed[-1], 1))
     return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
-
-
-def _whole_bound(study: NoiseStudy) -> Any:
-    """Bound of the method with the most unknowns."""
-    return max((one.bound for one in study.methods.values()), key=lambda bound: int((bound > 0).sum()))
-
-
-def _starts(starts: StartStudy) -> Table:
-    rows = [["start", "reached", "of"]]
-    for kind, count in starts.reached.items():
-        rows.append([_KINDS[kind], str(count), str(len(starts.rms[kind]))])
-    return rows
 
 
 def _findings(study: NoiseStudy) -> list[str]:

@@ -35,30 +35,16 @@ _TRIES = 1000
 
 @frozen_dataclass(eq=False)
 class SimulatedScene:
-    """A camera, a target and the poses of its views.
-
-    Attributes
-    ----------
-    camera : Camera
-    poses : dict of Pose by view
-    world : (N, 3) array [world unit]
-    pixels : (N, 2) array [px]
-        Exact.
-    view : (N,) array of str
-    point : (N,) array of str, or None
-    unit : str
-    board : Board or None
-        If given, the points are its mid-points.
-    """
+    """A camera, a target and the poses of its views."""
 
     camera: Camera
-    poses: Mapping[str, Pose]
-    world: Array
-    pixels: Array
-    view: NDArray[np.str_]
-    point: NDArray[np.str_] | None
+    poses: Mapping[str, Pose]  # by the view
+    world: Array  # (N, 3) [world unit]
+    pixels: Array  # (N, 2) [px] exact
+    view: NDArray[np.str_]  # (N,)
+    point: NDArray[np.str_] | None  # (N,) ids
     unit: str
-    board: Board | None = None
+    board: Board | None = None  # if given, the points are its mid-points
 
     def points(self, sigma: float = 0.0, rng: np.random.Generator | None = None) -> Correspondences:
         """The points with Gaussian noise of standard deviation `sigma` [px] in u and in v.
@@ -81,10 +67,7 @@ def paper_scene() -> SimulatedScene:
 def scene_of(camera: Camera, board: Board, poses: Mapping[str, Pose]) -> SimulatedScene:
     """Simulate views of all mid-points of a board.
 
-    Raises
-    ------
-    InputError
-        The camera cannot see all of the board in a pose.
+    Raises InputError if the camera cannot see all of the board in a pose.
     """
     ids, world = zip(*(plane.midpoints() for plane in board.planes), strict=True)
     labels, target = np.concatenate(ids), np.concatenate(world)
@@ -98,10 +81,7 @@ def scene_of(camera: Camera, board: Board, poses: Mapping[str, Pose]) -> Simulat
 def calibrated_scene(calibration: Calibration) -> SimulatedScene:
     """Simulate a calibration without noise, with its own points and poses.
 
-    Raises
-    ------
-    InputError
-        The calibration has no points.
+    Raises InputError if the calibration has no points.
     """
     points, camera = calibration.points, calibration.camera
     if not len(points):
@@ -154,10 +134,7 @@ def _seen(camera: Camera, pose: Pose, world: Array, name: str) -> Array:
 def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Generator) -> dict[str, Pose]:
     """Random poses of a board, tilted by 15 to 45 degrees to all sides, with all of it in the image.
 
-    Raises
-    ------
-    InputError
-        The camera has no image size, or no pose shows the whole board.
+    Raises InputError if the camera has no image size, or no pose shows the whole board.
     """
     if camera.image_size is None:
         raise InputError("the camera has no image size; give a camera with one")

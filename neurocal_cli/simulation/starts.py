@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,21 +51,12 @@ _NOISE = 10**6  # part of the seeds; the study of noise uses lower numbers
 
 @frozen_dataclass(eq=False)
 class StartStudy:
-    """Outcomes of single starts of each kind.
+    """Outcomes of single starts of each kind."""
 
-    Attributes
-    ----------
-    rms : dict of (n,) arrays by kind [px]
-        Final rms error of each start; infinite if the result is not a camera.
-    best : float [px]
-        The lowest of these and of the descent from the linear solution.
-    sigma : float [px]
-        Noise of the points.
-    """
-
+    # [px] Final rms error of each start by kind; infinite if the result is not a camera
     rms: dict[str, Array]
-    best: float
-    sigma: float
+    best: float  # [px] the lowest of these and of the descent from the linear solution
+    sigma: float  # [px] noise of the points
 
     @property
     def reached(self) -> dict[str, int]:
@@ -94,24 +86,11 @@ def study_starts(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> StartStudy:
-    """Start the network and a plain descent many times on one set of points.
+    """Start the network and a plain descent many times, with each kind, on one set of points with noise [px].
 
-    Parameters
-    ----------
-    scene : SimulatedScene
-        Its distortion is ignored; all starts use a pinhole.
-    sigma : float [px]
-    starts : int
-        Number of starts of each kind.
-    seed : int
-    jobs : int
-        Number of processes; it does not change the result.
-    progress : callable, optional
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine a camera, so there is no minimum to reach.
+    The scene's distortion is ignored; all starts use a pinhole. The number of processes, `jobs`, does not
+    change the result. Raises DegenerateGeometryError if the points do not determine a camera, so there is no
+    minimum to reach.
     """
     problem = _problem(scene, sigma, seed)
     check_points(problem)
@@ -159,15 +138,9 @@ def can_start(problem: Problem, kind: str) -> bool:
 
 
 def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float:
-    """Final rms error [px] of one random start; infinite if the result is not a camera.
+    """Final rms error [px] of one random start of a kind of `STARTS`; infinite if the result is not a camera.
 
-    Parameters
-    ----------
-    problem : Problem
-        Without a distortion.
-    kind : str
-        One of `STARTS`.
-    rng : numpy.random.Generator
+    The problem must be without a distortion.
     """
     try:
         with np.errstate(all="ignore"):
@@ -176,19 +149,15 @@ def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float
         return np.inf
 
 
-def _network(trainer: str) -> Callable[[Problem, np.random.Generator], float]:
+def _from_network(trainer: str, problem: Problem, rng: np.random.Generator) -> float:
     options = replace(options_for(trainer, 2, 0), starts=1)
-
-    def end(problem: Problem, rng: np.random.Generator) -> float:
-        if problem.type == 4:
-            return _rms(problem, solve_given_poses(problem, options, rng).state)
-        groups, _ = train_networks(problem, options, rng, np.ones(problem.views.n_views, dtype=bool))
-        entries = problem.normalised_entries[None]
-        if problem.type != 3:
-            entries = candidate_intrinsics(problem, groups, rng)[0]
-        return _rms(problem, problem.adjust(cameras_from_products(problem, groups, entries)).state)
-
-    return end
+    if problem.type == 4:
+        return _rms(problem, solve_given_poses(problem, options, rng).state)
+    groups, _ = train_networks(problem, options, rng, np.ones(problem.views.n_views, dtype=bool))
+    entries = problem.normalised_entries[None]
+    if problem.type != 3:
+        entries = candidate_intrinsics(problem, groups, rng)[0]
+    return _rms(problem, problem.adjust(cameras_from_products(problem, groups, entries)).state)
 
 
 def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
@@ -235,8 +204,8 @@ def _rms(problem: Problem, state: CameraState) -> float:
 
 
 _KINDS: dict[str, Callable[[Problem, np.random.Generator], float]] = {
-    "lm": _network("lm"),
-    "backprop": lambda problem, rng: _network("backprop")(problem, rng),
+    "lm": partial(_from_network, "lm"),
+    "backprop": partial(_from_network, "backprop"),
     "weights": _from_weights,
     "camera": _from_camera,
 }

@@ -26,7 +26,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, e_2d, e_orth, optimal_gamma, output
-from neurocal_cli.training.task import Task, Trained
+from neurocal_cli.training import Task, Trained
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
 # tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later
@@ -43,41 +43,21 @@ _DIVERGED = 10.0
 
 @frozen_dataclass
 class BackpropOptions:
-    """Options of `train_backprop`.
-
-    Parameters
-    ----------
-    epochs : int
-        Most epochs.
-    rate_weights, rate_gamma : float
-        The paper's learning constants alpha_1 and alpha_2, for normalised patterns.
-    beta : float
-        Weight of E_orth relative to the E_2D of a pattern, eq. (14).
-    a : float
-        Squared length of the rows of V in E_orth.
-    resting_gamma : bool
-        Start each gamma at the fixed point of (11) for the initial weights, not at 1. This continues from
-        trained weights without a detour.
-    tolerance : float
-        Relative change of the loss that is taken for none.
-    floor : float
-        Rms error, in normalised pixels, below which training ends.
-    halvings : int
-        Most restarts of a network that diverges, each with half the rates.
-    method : {"auto", "patterns", "blocks"}
-        One pattern at a time, as in the paper, or small blocks of patterns with rates that are bounded for
-        stability. "auto" uses blocks only if numba is missing.
-    """
+    """Options of `train_backprop`."""
 
     epochs: int = 50_000
-    rate_weights: float = 0.05
-    rate_gamma: float = 0.4
-    beta: float = 0.0
-    a: float = 1.0
+    rate_weights: float = 0.05  # the paper's learning constant alpha_1, for normalised patterns
+    rate_gamma: float = 0.4  # alpha_2
+    beta: float = 0.0  # weight of E_orth relative to the E_2D of a pattern, eq. (14)
+    a: float = 1.0  # squared length of the rows of V in E_orth
+    # Start each gamma at the fixed point of (11) for the initial weights, not at 1. This continues from
+    # trained weights without a detour.
     resting_gamma: bool = False
-    tolerance: float = 1e-3
-    floor: float = 1e-9
-    halvings: int = 6
+    tolerance: float = 1e-3  # relative change of the loss that is taken for none
+    floor: float = 1e-9  # rms error, in normalised pixels, below which training ends
+    halvings: int = 6  # most restarts of a network that diverges, each with half the rates
+    # One pattern at a time, as in the paper, or small blocks of patterns with rates that are bounded for
+    # stability. "auto" uses blocks only if numba is missing.
     method: Literal["auto", "patterns", "blocks"] = "auto"
 
     def __post_init__(self) -> None:
@@ -88,33 +68,17 @@ class BackpropOptions:
 
 
 def train_backprop(
-    task: Task,
-    options: BackpropOptions | None = None,
-    progress: Callable[[float], None] | None = None,
+    task: Task, options: BackpropOptions | None = None, progress: Callable[[float], None] | None = None
 ) -> Trained:
     """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
 
     The rates of a network are halved whenever its loss no longer decreases. A network has settled when two
-    successive halvings do not change the loss, or when the loss is below the floor.
+    successive halvings do not change the loss, or when the loss is below the floor. One that diverges at all
+    rates has its initial weights and is not settled. The curve is the loss that is minimised: E_2D, plus beta
+    E_orth for each pattern. `progress` is called with the share of the epochs that is done, 0 to 1.
 
-    Parameters
-    ----------
-    task : Task
-    options : BackpropOptions, optional
-    progress : callable, optional
-        Called with the share of the epochs that is done, 0 to 1.
-
-    Returns
-    -------
-    Trained
-        Its curve is the loss that is minimised: E_2D, plus beta E_orth for each pattern. A network that
-        diverges at all rates has its initial weights and is not settled.
-
-    Raises
-    ------
-    InputError
-        Weights or patterns that are not finite; E_orth for a flat board, whose V lacks a column of the
-        rotation.
+    Raises InputError for weights or patterns that are not finite, and for E_orth of a flat board, whose V
+    lacks a column of the rotation.
     """
     run = _Run(task, options or BackpropOptions())
     while run.active.any() and run.epoch < run.options.epochs:
@@ -133,9 +97,8 @@ def _presenter(method: str) -> tuple[_Present, _Bound | None]:
     """Functions that present the patterns and bound the rates; only this imports numba."""
     if method != "blocks":
         from neurocal_cli.training import backprop_kernel as kernel
-        from neurocal_cli.training.compile import COMPILING
 
-        if COMPILING or method == "patterns":
+        if kernel.COMPILING or method == "patterns":
             return kernel.present, None
     from neurocal_cli.training import backprop_blocks as blocks
 

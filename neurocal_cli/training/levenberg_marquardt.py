@@ -28,29 +28,17 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
 from neurocal_cli.network import Patterns, optimal_gamma
-from neurocal_cli.training.task import Task, Trained
+from neurocal_cli.training import Task, Trained
 
 
 @frozen_dataclass
 class LMOptions:
-    """Settings of `train_lm`.
+    """Settings of `train_lm`."""
 
-    Parameters
-    ----------
-    stiffness : tuple of float
-        Values of mu in turn; the last must be 0.
-    tolerance : float
-        Training has converged when a step lowers E by less than this share.
-    max_iterations : int
-        Most steps of each network.
-    damping : float
-        Initial lambda, relative to the mean diagonal of the normal matrix.
-    """
-
-    stiffness: tuple[float, ...] = (300.0, 0.0)
-    tolerance: float = 1e-6
-    max_iterations: int = 60
-    damping: float = 1e-3
+    stiffness: tuple[float, ...] = (300.0, 0.0)  # values of mu in turn; the last must be 0
+    tolerance: float = 1e-6  # training has converged when a step lowers E by less than this share
+    max_iterations: int = 60  # of each network
+    damping: float = 1e-3  # initial lambda, relative to the mean diagonal of the normal matrix
 
 
 _FLOOR = 1e-13  # rms error of rounding alone, in units of the normalised image
@@ -63,23 +51,10 @@ _SOFTENED = 0.1  # share of the initial damping after the stiffness is taken awa
 
 
 def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
-    """Train a stack of networks, all at once.
+    """Train a stack of networks, all at once. V is free, or V is fixed and W free in part.
 
-    Parameters
-    ----------
-    task : Task
-        V is free, or V is fixed and W free in part.
-    options : LMOptions, optional
-
-    Returns
-    -------
-    Trained
-        If V is free, W keeps its initial value and V is W^-1 times the product.
-
-    Raises
-    ------
-    InputError
-        Weights of V that are only partly free.
+    If V is free, W keeps its initial value and V is W^-1 times the product. Raises InputError if V is only
+    partly free.
     """
     options = options or LMOptions()
     if task.free_V.all():

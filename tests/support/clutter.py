@@ -8,7 +8,7 @@ import numpy as np
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import half_plane
+from neurocal_cli.simulation.rendering.layers import half_plane
 from neurocal_cli.simulation.rendering.scene import Background
 
 _REFERENCE_AREA = 640 * 480  # px^2

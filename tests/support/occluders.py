@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
+from neurocal_cli.simulation.rendering.layers import half_plane
+from neurocal_cli.simulation.rendering.scene import Cover
 
 
 @dataclass(frozen=True)

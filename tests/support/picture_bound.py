@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
-from neurocal_cli.simulation.rendering.light import enough_parts, image_light
-from neurocal_cli.simulation.rendering.render import response, signal
+from neurocal_cli.simulation.rendering.render import enough_parts, image_light, response, signal
 from neurocal_cli.simulation.rendering.scene import Scene, Sensor
 from support.wide_camera import WideCamera
 

@@ -29,8 +29,7 @@ from neurocal_cli.simulation.rendering import (
     Target,
     ground_truth,
 )
-from neurocal_cli.simulation.rendering.light import image_light
-from neurocal_cli.simulation.rendering.render import digitised
+from neurocal_cli.simulation.rendering.render import digitised, image_light
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 

@@ -32,21 +32,9 @@ _WHOLE = 0.5  # least share of linked vertices in an outer line; links beyond th
 
 
 def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[np.bool_]) -> Lattice | None:
-    """Follow the links that start at a vertex, and test the resulting lattice.
+    """Follow the links that start at a vertex, whose port 0 points along c, and test the resulting lattice.
 
-    Parameters
-    ----------
-    level : Level
-    links : Links
-    middle : int
-        Index of the vertex; its port 0 points along c.
-    taken : (N,) bool array
-        Saddles that belong to other grids.
-
-    Returns
-    -------
-    lattice : Lattice or None
-        None if the vertices fail the tests.
+    `taken` (N,) marks saddles that belong to other grids. None if the vertices fail the tests.
     """
     places = _follow(links, middle, taken.tolist())
     if len(places) < _FEWEST:

@@ -16,19 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.accept import edges_visible, has_block, is_smooth
+from neurocal_cli.detection.finding.checks import edges_visible, has_block, is_smooth
 from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grow import grow, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
-from neurocal_cli.detection.finding.links import Links, find_links
-from neurocal_cli.detection.finding.merge import merge_lattices
-from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
-from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
-from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally
-from neurocal_cli.detection.finding.stretch import stretch
-from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.detection.finding.links import Links, find_links, find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.overlaps import (
+    any_overlap,
+    drop_duplicates,
+    merge_lattices,
+    trim_overlaps,
+)
+from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -47,22 +48,14 @@ Size = tuple[int, int]
 
 
 def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list[Grid]:
-    """Find every chessboard in an image.
+    """Find every chessboard in a grey image (height, width) of 8 or 16 bits, or of real numbers of any range.
 
-    Parameters
-    ----------
-    image : (height, width) array
-        Grey, of 8 or 16 bits or real numbers of any range.
-    sizes : collection of (int, int), optional
-        Columns and rows, in either order, of the only board wanted. Once it is found whole, boards far behind
-        it, with squares less than a third as large, are not searched.
+    `sizes` are the columns and rows, in either order, of the only board wanted. Once it is found whole,
+    boards far behind it, with squares less than a third as large, are not searched.
 
-    Returns
-    -------
-    grids : list of Grid
-        The largest in the image first. Vertices are accurate to a few tenths of a pixel. Planes that meet at
-        a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones occur in clutter
-        and no third vertex tests their lines.
+    Returns the largest grid in the image first. Vertices are accurate to a few tenths of a pixel. Planes that
+    meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones occur in
+    clutter and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
@@ -77,8 +70,10 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
     links: Links | None = None
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
-        lattices = [_to_finer_level(level, x) for x in lattices]
-        bent = [refined_locally(level, replace(x, pixels=2 * x.pixels), 2) for x in bent]
+        # On the next finer level, pixels have twice the coordinates.
+        lattices, bent = ([replace(x, pixels=2 * x.pixels) for x in part] for part in (lattices, bent))
+        lattices = [refined(level, x, x.derivative_sigma, 2) for x in lattices]
+        bent = [refined(level, x, local_sigma(x), 2) for x in bent]
         none = not lattices and not bent
         if level in small or (none and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
@@ -97,11 +92,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
 
 
 def _find_bent(
-    level: Level,
-    links: Links | None,
-    masked: int,
-    known: list[Lattice],
-    wanted: frozenset[Size],
+    level: Level, links: Links | None, masked: int, known: list[Lattice], wanted: frozenset[Size]
 ) -> tuple[list[Lattice], list[Lattice]]:
     """Known lattices that are no pieces of bent ones, and the bent ones.
 
@@ -226,25 +217,9 @@ def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     for lattice in _find_new(part.level, links_of_part, []):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
-        grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
+        grid = grow(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
         found += _boards(remove_outliers(level, grid))
     return found
-
-
-def _to_finer_level(level: Level, lattice: Lattice) -> Lattice:
-    """The same grid on the next level."""
-    lattice = replace(lattice, pixels=2 * lattice.pixels)
-    return _refined(level, lattice, lattice.derivative_sigma, 2)
-
-
-def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Lattice:
-    """Move the vertices to the nearest saddle points, if these are within `most` px."""
-    start = lattice.pixels[lattice.seen]
-    refined = refine_saddles(level.image, start, sigma)
-    close = np.hypot(*(refined - start).T) < most
-    pixels = lattice.pixels.copy()
-    pixels[lattice.seen] = np.where(close[:, None], refined, start)
-    return replace(lattice, pixels=pixels)
 
 
 def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:

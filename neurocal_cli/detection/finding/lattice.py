@@ -21,21 +21,11 @@ LEAST_SIGMA = 0.75  # px; least smoothing of derivatives, for the narrowest squa
 
 @frozen_dataclass(eq=False)
 class Lattice:
-    """A grid that is being found.
+    """A grid that is being found."""
 
-    Attributes
-    ----------
-    pixels : (rows, cols, 2) array [px of its level]
-        NaN where unknown.
-    contrast : (rows, cols) array [DN]
-        Of each known vertex; NaN elsewhere.
-    dark : int
-        0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
-    """
-
-    pixels: Array
-    contrast: Array
-    dark: int
+    pixels: Array  # (rows, cols, 2) [px of its level]; NaN where unknown
+    contrast: Array  # (rows, cols) [DN]; NaN where unknown
+    dark: int  # 0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where c + r + dark is even
 
     @property
     def seen(self) -> NDArray[np.bool_]:

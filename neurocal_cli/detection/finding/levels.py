@@ -27,18 +27,10 @@ _LEAST_NOISE = 0.12  # DN/px^2; caused by rounding to 8 bits
 
 @frozen_dataclass(eq=False)
 class Level:
-    """A level of the pyramid.
+    """A level of the pyramid."""
 
-    Attributes
-    ----------
-    image : (height, width) float32 array
-        In grey levels of an 8-bit image.
-    scale : int
-        Size of a pixel in pixels of the original.
-    """
-
-    image: Image
-    scale: int
+    image: Image  # (height, width), in grey levels of an 8-bit image
+    scale: int  # size of a pixel in pixels of the original
 
     @cached_property
     def smooth(self) -> Image:
@@ -67,17 +59,9 @@ class Level:
 
 
 def levels_of(image: NDArray[np.generic]) -> list[Level]:
-    """Halve an image repeatedly.
+    """Halve an image (height, width) of 8 or 16 bits, or of real numbers of any range, repeatedly.
 
-    Parameters
-    ----------
-    image : (height, width) array
-        Of 8 or 16 bits, or real numbers of any range.
-
-    Returns
-    -------
-    levels : list of Level
-        The original first; empty if the image is too small for a board.
+    The original is first; there are no levels if it is too small for a board.
     """
     return pyramid(_grey(image))
 

@@ -1,8 +1,9 @@
-"""Link neighbouring saddles along the edges of the squares.
+"""Link neighbouring saddles along the edges of the squares, and find the blocks of squares that they close.
 
-In: a level. Out: its saddles, and the neighbour of each at its four ports. An edge that leaves a vertex at a
-port followed by a dark sector enters the next vertex at a port preceded by a dark sector. So along a line of
-the board, each edge connects an even with an odd port.
+In: a level. Out: its saddles, and the neighbour of each at its four ports; from these the seeds of grids, the
+most regular ones first, for `grids` to grow. An edge that leaves a vertex at a port followed by a dark sector
+enters the next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects
+an even with an odd port.
 """
 
 from __future__ import annotations
@@ -24,24 +25,17 @@ _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the ne
 _SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
+_IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
+_SECOND = 0.4  # ... or greatest second difference times this weight
 
 
 @frozen_dataclass(eq=False)
 class Links:
-    """Saddles and their neighbours along their edges.
-
-    Attributes
-    ----------
-    saddles : Saddles
-    to : (N, 4) int array
-        The neighbour at each port; -1 if there is none.
-    port : (N, 4) int array
-        The neighbour's port at the other end of the edge.
-    """
+    """Saddles and their neighbours along their edges."""
 
     saddles: Saddles
-    to: Index
-    port: Index
+    to: Index  # (N, 4) the neighbour at each port; -1 if there is none
+    port: Index  # (N, 4) the neighbour's port at the other end of the edge
 
     @cached_property
     def lists(self) -> tuple[list[list[int]], list[list[int]]]:
@@ -52,16 +46,8 @@ class Links:
 def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links | None:
     """Find saddles, and link pairs that are each other's nearest suitable neighbour at their ports.
 
-    Parameters
-    ----------
-    level : Level
-    covered : (height, width) uint8 array, optional
-        Non-zero pixels are not searched.
-
-    Returns
-    -------
-    links : Links or None
-        None if there are fewer saddles than vertices of the smallest board.
+    Pixels where `covered` is not 0 are not searched. None if there are fewer saddles than vertices of the
+    smallest board.
     """
     saddles = find_saddles(level, covered)
     count = len(saddles)
@@ -131,3 +117,83 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     back = np.zeros_like(seen)
     back[first, p] = seen[to[first, p], entry[first, p]]
     return seen & back
+
+
+def find_seeds_3x3(links: Links) -> Index:
+    """Find blocks of four closed squares around a vertex, the most regular first.
+
+    Returns saddles (S, 3, 3); ``[.., r, c]`` with c along port 0 of the middle saddle and r along port 1.
+    """
+    centre = whole_blocks(links)
+    block = np.empty((len(centre), 3, 3), dtype=np.intp)
+    block[:, 1, 1] = centre
+    for p, (c, r) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+        block[:, 1 + r, 1 + c] = links.to[centre, p]
+        # The vertex between ports p and p + 1: from the neighbour, through the port before the entry.
+        corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
+        c2, r2 = ((1, 1), (-1, 1), (-1, -1), (1, -1))[p]
+        block[:, 1 + r2, 1 + c2] = corner
+    grid = links.saddles.points[block]
+    irregularity = _irregularity(grid)
+    order = np.argsort(irregularity, kind="stable")
+    return block[order[irregularity[order] < _IRREGULAR]]
+
+
+def whole_blocks(links: Links) -> Index:
+    """Saddles (S,) with four closed squares around them."""
+    return np.flatnonzero(_closed(links).all(axis=1))
+
+
+def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
+    """Find blocks of two closed squares side by side, the most regular first.
+
+    Returns saddles (S, 2, 3), and whether each block is dark (S,) as in `Lattice`.
+    """
+    closed = _closed(links)
+    middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
+    right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
+    # The outer vertices of the first and the second square.
+    corner = links.to[right, (links.port[middle, p] - 1) % 4]
+    other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
+    block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
+    grid = links.saddles.points[block]
+    c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
+    second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
+    irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)
+    order = np.argsort(irregularity, kind="stable")
+    return block[order], (p[order] + 1) % 2
+
+
+def _closed(links: Links) -> NDArray[np.bool_]:
+    """(N, 4) whether four links, starting at port p, lead around a square and back to port p + 1."""
+    count = len(links.to)
+    at = np.repeat(np.arange(count)[:, None], 4, axis=1)
+    port = np.repeat(np.arange(4)[None], count, axis=0)
+    alive = np.ones((count, 4), dtype=bool)
+    for _ in range(4):
+        alive &= links.to[at, port] >= 0
+        at, port = links.to[at, port], (links.port[at, port] - 1) % 4
+    home = np.arange(count)[:, None]
+    return alive & (at == home) & (port == np.arange(4)[None])
+
+
+def _irregularity(grid: Array) -> Array:
+    """(S,) deviation of (S, 3, 3, 2) blocks from a smooth map [squares].
+
+    Perspective and distortion change the size of squares steadily, and alike in neighbouring rows.
+    """
+    if not len(grid):
+        return np.zeros(0)
+    c = 0.5 * (grid[:, 1, 2] - grid[:, 1, 0])
+    r = 0.5 * (grid[:, 2, 1] - grid[:, 0, 1])
+    area = c[:, 0] * r[:, 1] - c[:, 1] * r[:, 0]
+    area = np.where(area > 1e-6, area, 1e-6)[:, None]
+    along_c = grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]
+    along_r = grid[:, 0] + grid[:, 2] - 2 * grid[:, 1]
+    worst = np.zeros(len(grid))
+    for second in (along_c, along_r):
+        for part, weight in ((second, _SECOND), (np.diff(second, axis=1), 1.0)):
+            along = (part[..., 0] * r[:, None, 1] - part[..., 1] * r[:, None, 0]) / area
+            across = (c[:, None, 0] * part[..., 1] - c[:, None, 1] * part[..., 0]) / area
+            worst = np.maximum(worst, weight * np.maximum(np.abs(along), np.abs(across)).max(axis=1))
+    return worst

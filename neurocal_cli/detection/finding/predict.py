@@ -8,11 +8,12 @@ small, as they are under perspective and distortion, so few neighbours give a li
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.finding.subpixel import window
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -33,20 +34,11 @@ _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 @frozen_dataclass(eq=False)
 class PredictedVertices:
-    """Predicted vertices.
+    """N predicted vertices."""
 
-    Attributes
-    ----------
-    points : (N, 2) array [px]
-    steps : (N, 2, 2) array [px]
-        From the point to the next vertex along its row, and along its column.
-    spread : (N,) array
-        Standard deviation of the point for unit standard deviation of the vertices.
-    """
-
-    points: Array
-    steps: Array
-    spread: Array
+    points: Array  # (N, 2) [px]
+    steps: Array  # (N, 2, 2) [px] to the next vertex along the point's row, and along its column
+    spread: Array  # (N,) standard deviation of the point for unit standard deviation of the vertices
 
     def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
         """Select some predictions."""
@@ -89,22 +81,8 @@ class PredictedVertices:
         return out
 
 
-@lru_cache(maxsize=64)
-def _window(width: int) -> NDArray[np.intp]:
-    """Flat index offsets from a place's first neighbour to all of them, in arrays of a width."""
-    size = np.arange(2 * _REACH + 1)
-    return (size[:, None] * width + size).ravel()
-
-
 def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
-    """Predict vertices, known or unknown, from their neighbours.
-
-    Parameters
-    ----------
-    pixels : (rows, cols, 2) array [px]
-        NaN where unknown.
-    row, col : (N,) int arrays
-    """
+    """Predict vertices at rows and columns (N,), known or not, of an array (rows, cols, 2) [px]."""
     rows, cols = pixels.shape[:2]
     padded = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
     inner = padded[:, _REACH:-_REACH, _REACH:-_REACH]
@@ -112,7 +90,8 @@ def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]
     np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
     inner[2] = seen
     width = padded.shape[2]
-    near = padded.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
+    place = (row + _REACH) * width + col + _REACH
+    near = padded.reshape(3, -1).take(place[:, None] + window(_REACH, width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
     normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE

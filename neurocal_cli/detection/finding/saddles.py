@@ -35,20 +35,11 @@ _PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400
 
 @frozen_dataclass(eq=False)
 class Saddles:
-    """Candidates for vertices.
+    """N candidates for vertices."""
 
-    Attributes
-    ----------
-    points : (N, 2) array [px]
-    ports : (N, 4) array [rad]
-        Directions of the four edges; see the module.
-    contrast : (N,) array [DN]
-        Mean of the bright minus mean of the dark sectors.
-    """
-
-    points: Array
-    ports: Array
-    contrast: Array
+    points: Array  # (N, 2) [px]
+    ports: Array  # (N, 4) [rad] directions of the four edges; see the module
+    contrast: Array  # (N,) [DN] mean of the bright minus mean of the dark sectors
 
     def __len__(self) -> int:
         """Number of saddles."""
@@ -56,14 +47,7 @@ class Saddles:
 
 
 def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Saddles:
-    """Find saddle points at the crossings of edges in a level.
-
-    Parameters
-    ----------
-    level : Level
-    covered : (height, width) uint8 array, optional
-        Non-zero pixels are not searched.
-    """
+    """Find saddle points at the crossings of edges in a level, except in pixels where `covered` is not 0."""
     points = _steepest_pixels(level, covered)
     points = refine_saddles(level.image, points, 1.0, rounds=2)
     points = points[np.isfinite(points[:, 0])]

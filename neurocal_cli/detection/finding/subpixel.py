@@ -32,29 +32,18 @@ def _derivatives(sigma: float) -> tuple[int, Array]:
     return half, np.stack([k.ravel() for k in kernels], axis=-1).astype(np.float32)
 
 
-@lru_cache(maxsize=32)
-def _window(half: int, width: int) -> NDArray[np.intp]:
+@lru_cache(maxsize=64)
+def window(half: int, width: int) -> NDArray[np.intp]:
     """Flat index offsets from a pixel to the window around it, in an image of a width."""
     offset = np.arange(-half, half + 1)
     return (offset[:, None] * width + offset).ravel()
 
 
 def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
-    """Move points to the nearest saddle points.
+    """Move points (N, 2) [px] to the nearest saddle points by some rounds of Newton steps.
 
-    Parameters
-    ----------
-    image : (height, width) float32 array
-    start : (N, 2) array [px]
-    sigma : float [px]
-        Smoothing of the derivatives: about a sixth of the squares' width.
-    rounds : int
-        Newton steps.
-
-    Returns
-    -------
-    points : (N, 2) array [px]
-        NaN if there is no saddle point or the window leaves the image.
+    Derivatives are smoothed by `sigma` [px], about a sixth of the squares' width. A point becomes NaN if
+    there is no saddle point or the window leaves the image.
     """
     half, _ = _derivatives(sigma)
     height, width = image.shape
@@ -85,7 +74,7 @@ def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[n
     width = image.shape[1]
     half, kernels = _derivatives(sigma)
     place = (centre[1] * width + centre[0]).astype(np.intp)
-    u, v, uu, uv, vv = (image.ravel().take(place[:, None] + _window(half, width)) @ kernels).T.astype(float)
+    u, v, uu, uv, vv = (image.ravel().take(place[:, None] + window(half, width)) @ kernels).T.astype(float)
     determinant = uu * vv - uv * uv
     saddle = determinant < 0
     step = np.empty(centre.shape)

@@ -24,6 +24,7 @@ from neurocal_cli.geometry import Array
 
 Single = NDArray[np.float32]
 Part = NDArray[np.intp] | slice  # indices of some of the fits
+Some = TypeVar("Some", bound="PerFit")
 
 # Positions of the last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
@@ -38,32 +39,23 @@ _NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 
 @frozen_dataclass(eq=False)
-class FitPixels:
-    """Pixels of fits, (E, N) float32 arrays.
+class PerFit:
+    """Arrays whose first axis is the fit."""
 
-    Attributes
-    ----------
-    value : array [DN]
-        Without the gradient of the mean level.
-    gain : array
-        Half contrast at the pixel, relative to that at the fit's middle.
-    Q : array
-        Effect of other lines on the light; see the models.
-    root : array [1/DN]
-        Inverse standard deviation of the noise; 0 for pixels that are not used.
-    beyond : (E,) array
-        Share of the pixels that lie outside the image.
-    """
-
-    value: Single
-    gain: Single
-    Q: Single
-    root: Single
-    beyond: Array
-
-    def part(self: Pixels, which: Part) -> Pixels:
-        """Select the pixels of some fits."""
+    def part(self: Some, which: Part) -> Some:
+        """Select some fits."""
         return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
+
+@frozen_dataclass(eq=False)
+class FitPixels(PerFit):
+    """Pixels of fits, (E, N) float32 arrays."""
+
+    value: Single  # [DN] without the gradient of the mean level
+    gain: Single  # half contrast at the pixel, relative to that at the fit's middle
+    Q: Single  # effect of other lines on the light; see the models
+    root: Single  # [1/DN] inverse standard deviation of the noise; 0 for pixels that are not used
+    beyond: Array  # (E,) share of the pixels that lie outside the image
 
     def weighed(self: Pixels, weight: Single) -> Pixels:
         """Set the weights [1/DN^2] of the pixels; unused pixels stay unused."""
@@ -76,40 +68,21 @@ Pixels = TypeVar("Pixels", bound=FitPixels)
 
 
 @frozen_dataclass(eq=False)
-class LevelPrior:
-    """Gaussian prior for mean level, half contrast and blur.
+class LevelPrior(PerFit):
+    """Gaussian prior for mean level, half contrast and blur."""
 
-    Attributes
-    ----------
-    mean : (E, 3) array [DN, DN, px]
-    precision : (E, 3, 3) array
-    """
-
-    mean: Array
-    precision: Array
-
-    def part(self, which: NDArray[np.intp]) -> LevelPrior:
-        """Select the priors of some fits."""
-        return LevelPrior(self.mean[which], self.precision[which])
+    mean: Array  # (E, 3) [DN, DN, px]
+    precision: Array  # (E, 3, 3)
 
 
 @frozen_dataclass(eq=False)
 class ProfileShape:
-    """Shape of the edges' profiles; see `edge_profile`.
+    """Shape of the edges' profiles; see `edge_profile`."""
 
-    Attributes
-    ----------
-    tails : (E, 2) array
-        a_3 and a_5 of each edge.
-    nonlinearity : (RESPONSE_TERMS,) array
-        b_0, b_1, ... of the response, the same for all edges.
-    half : (E, 2) array or None [px]
-        Half widths of the pixel's box along the edges' normals (see `pixel_box`), if edges are so sharp that
-        they matter; (V, 2, 2) for both lines through vertices.
-    """
-
-    tails: Array
-    nonlinearity: Array
+    tails: Array  # (E, 2) a_3 and a_5 of each edge
+    nonlinearity: Array  # (RESPONSE_TERMS,) b_0, b_1, ... of the response, the same for all edges
+    # (E, 2) [px] `half_widths` of the pixel's box, if edges are so sharp that they matter; (V, 2, 2) for both
+    # lines through vertices
     half: Array | None = None
 
     def part(self, which: Part) -> ProfileShape:
@@ -125,21 +98,14 @@ class ProfileShape:
 
 
 @frozen_dataclass(eq=False)
-class Linearised:
-    """A model linearised at some values.
+class Linearised(PerFit):
+    """A model linearised at some values."""
 
-    Attributes
-    ----------
-    rows : (E, R, N) array
-        The residual and the model's derivatives by the P values, in standard deviations of the pixel noise;
-        see `rows_for`.
-    z, x : (E, N) arrays
-        Distance from the edge in sigma, and light between the levels.
-    """
-
+    # (E, R, N) the residual and the derivatives by the P values, in standard deviations of the pixel noise;
+    # see `rows_for`
     rows: Single
-    z: Single
-    x: Single
+    z: Single  # (E, N) distance from the edge in sigma
+    x: Single  # (E, N) light between the levels
 
     @property
     def residual(self) -> Single:
@@ -149,10 +115,6 @@ class Linearised:
     def products(self, count: int) -> Array:
         """(E, P + 1, P + 1) sums of products over pixels: chi2 first, then gradient and information."""
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
-
-    def part(self, which: NDArray[np.intp]) -> Linearised:
-        """Select some fits."""
-        return Linearised(self.rows[which], self.z[which], self.x[which])
 
     def put(self, which: NDArray[np.intp], part: Linearised) -> None:
         """Replace some fits in place."""
@@ -172,35 +134,17 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
 
 @frozen_dataclass(eq=False)
 class BatchFit:
-    """Result of many fits.
+    """Result of many fits."""
 
-    Attributes
-    ----------
-    values : (E, P) array
-        Offsets and tilts first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
-    information : (E, P, P) array
-        Fisher information of the pixels, without the prior.
-    prior : LevelPrior
-    chi2 : (E,) array
-        Weighted sum of squared residuals.
-    model : function of pixels, values and shape
-    pixels : FitPixels
-    shape : ProfileShape
-    step : (E,) array
-        Length of the last step, in standard deviations.
-    linear : Linearised
-        The model at the values.
-    """
-
-    values: Array
-    information: Array
+    values: Array  # (E, P) offsets and tilts first; the last three are at `MEAN`, `CONTRAST`, `BLUR`
+    information: Array  # (E, P, P) Fisher information of the pixels, without the prior
     prior: LevelPrior
-    chi2: Array
+    chi2: Array  # (E,) weighted sum of squared residuals
     model: Callable[[Any, Array, ProfileShape], Linearised]
     pixels: FitPixels
     shape: ProfileShape
-    step: Array
-    linear: Linearised
+    step: Array  # (E,) length of the last step, in standard deviations
+    linear: Linearised  # the model at the values
 
     @cached_property
     def covariance(self) -> Array:
@@ -249,18 +193,9 @@ def fit_batch(
     steps: int,
     more: int = _MORE_STEPS,
 ) -> BatchFit:
-    """Run all fits together, and then continue those that have not converged.
+    """Run all fits together from values (E, P), and then continue those that have not converged.
 
-    Parameters
-    ----------
-    model : function of pixels, values and shape
-    pixels : FitPixels
-    start : (E, P) array
-        Initial values.
-    prior : LevelPrior
-    shape : ProfileShape
-    steps, more : int
-        Greatest numbers of steps of all fits together, and of those that have not converged.
+    `steps` and `more` are the greatest numbers of steps of all, and of those that continue.
     """
 
     def model_of(part: Part) -> Callable[[Array], Linearised]:
@@ -300,14 +235,8 @@ class _State:
 
     def part(self, which: NDArray[np.intp]) -> _State:
         """Select some fits."""
-        return _State(
-            self.values[which],
-            self.linear.part(which),
-            self.products[which],
-            self.cost[which],
-            self.damping[which],
-            self.size[which],
-        )
+        values, products, cost = self.values[which], self.products[which], self.cost[which]
+        return _State(values, self.linear.part(which), products, cost, self.damping[which], self.size[which])
 
     def put(self, which: NDArray[np.intp], part: _State) -> None:
         """Copy the results of some fits back."""

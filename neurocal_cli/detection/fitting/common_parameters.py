@@ -29,10 +29,10 @@ from neurocal_cli.detection.fitting.edge_profile import (
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance, quadratic_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.strips import Lines
-from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -62,14 +62,7 @@ class PixelNoise:
 
     @classmethod
     def of(cls, fit: BatchFit, floor: float) -> PixelNoise:
-        """Estimate the noise from the residuals of fits.
-
-        Parameters
-        ----------
-        fit : BatchFit
-        floor : float [DN^2]
-            Least variance, that of rounding.
-        """
+        """Estimate the noise from the residuals of fits; `floor` [DN^2], that of rounding, is the least."""
         x, root = fit.linear.x, fit.pixels.root
         used = root > 0
         square = np.square(fit.linear.residual / np.maximum(root, _TINY))
@@ -96,15 +89,9 @@ class PixelNoise:
 
 
 def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
-    """Improve the shape of the profile by linear least squares on the residuals of all fits.
+    """Improve the shape of the profile by linear least squares on the residuals of the good fits.
 
     Shift, blur and levels are unknowns, too, because they have absorbed a part of the shape.
-
-    Parameters
-    ----------
-    fit : BatchFit
-    good : (E,) bool array
-        Edges to use.
     """
     # A part of the pixels is enough for a dozen unknowns.
     data, shape = fit.pixels, fit.shape
@@ -147,18 +134,10 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
 
 @frozen_dataclass(eq=False)
 class BoardBlur:
-    """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n.
+    """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n."""
 
-    Attributes
-    ----------
-    matrix : (2, 2) array [px^2]
-        S; a multiple of the identity if there is no motion blur and no astigmatism.
-    spread : float [px^2]
-        Variance of the blur of single edges around it, without the variance of the fits.
-    """
-
-    matrix: Array
-    spread: float
+    matrix: Array  # (2, 2) [px^2] S; a multiple of the identity if there is no motion blur and no astigmatism
+    spread: float  # [px^2] variance of the blur of single edges around it, without the variance of the fits
 
     @classmethod
     def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
@@ -174,9 +153,8 @@ class BoardBlur:
         normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_EDGES
         uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
         matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
-        blur = cls(matrix, 0.0)
-        scatter = upper_median((sigma - blur.along(normal[good])) ** 2) / CHI2_MEDIAN
-        return cls(matrix, max(scatter - 2 * upper_median(fit.covariance[good, BLUR, BLUR]), 0.0))
+        left = sigma - cls(matrix, 0.0).along(normal[good])
+        return cls(matrix, excess_variance(left, fit.covariance[good, BLUR, BLUR]))
 
     def along(self, normal: Array) -> Array:
         """(E,) blur [px] of edges with normals (E, 2)."""
@@ -186,21 +164,12 @@ class BoardBlur:
 
 @frozen_dataclass(eq=False)
 class FieldBlur:
-    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction.
-
-    Attributes
-    ----------
-    frame : Frame
-        Scales the pixels.
-    terms : (8,) array
-        Coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a.
-    relative : float
-        Variance of log sigma of single edges around it, without the variance of the fits.
-    """
+    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction."""
 
     frame: Frame
+    # (8,) coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a
     terms: Array
-    relative: float
+    relative: float  # variance of log sigma of single edges around it, without the variance of the fits
 
     @classmethod
     def of(cls, fit: BatchFit, lines: Lines, good: NDArray[np.bool_], frame: Frame) -> FieldBlur:
@@ -216,10 +185,10 @@ class FieldBlur:
             # The prior makes it constant unless many edges disagree.
             normal = (some.T * weight) @ some + np.eye(len(terms)) * _ROUND_EDGES
             terms = np.linalg.solve(normal, some.T @ (weight * log))
-        scatter = upper_median((log - some @ terms) ** 2) / CHI2_MEDIAN
-        noise = 2 * upper_median(fit.covariance[good, BLUR, BLUR] / fit.values[good, BLUR] ** 2)
+        noise = fit.covariance[good, BLUR, BLUR] / fit.values[good, BLUR] ** 2
+        relative = excess_variance(log - some @ terms, noise)
         terms[0] += np.log(usual)
-        return cls(frame, terms, max(scatter - noise, 0.0))
+        return cls(frame, terms, relative)
 
     def along(self, normal: Array, place: Array) -> Array:
         """(E,) blur [px] of edges with normals (E, 2) at places (E, 2) [px]."""
@@ -228,27 +197,17 @@ class FieldBlur:
 
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
-    x, y = ((place - frame.centre) / frame.unit).T
     n_u, n_v = normal.T
-    one = np.ones_like(x)
-    return np.stack([one, x, y, x * x, x * y, y * y, n_u * n_u - n_v * n_v, 2 * n_u * n_v], axis=-1)
+    return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
 def level_prior(
     shading: Shading, place: Array, sigma: Array, blur_spread: Array | float, noise: float
 ) -> LevelPrior:
-    """Prior for the levels and the blur of single edges from those of the whole board.
+    """Prior for the levels and the blur of single edges at places (E, 2) [px] from those of the whole board.
 
-    Parameters
-    ----------
-    shading : Shading
-    place : (E, 2) array [px]
-    sigma : (E,) array [px]
-        Blur.
-    blur_spread : float or (E,) array [px^2]
-        Variance of the blur of single edges around it.
-    noise : float [DN^2]
-        Variance of a pixel.
+    `sigma` (E,) [px] is their blur, `blur_spread` [px^2] the variance of single edges around it, and `noise`
+    [DN^2] that of a pixel.
     """
     mean, contrast = shading.at(place)
     low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)

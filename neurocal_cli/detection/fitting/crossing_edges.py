@@ -39,33 +39,16 @@ _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to t
 
 @frozen_dataclass(eq=False)
 class AlongEdges:
-    """Positions of mid-points along their edges: ``direction . p = value``.
+    """Positions of M mid-points along their edges: ``direction . p = value``."""
 
-    Attributes
-    ----------
-    rows : (M,) int array
-        Of the mid-points among the edges of the grid.
-    direction : (M, 2) array
-        Unit normals of the grid lines that cross the edges.
-    value : (M,) array [px]
-    variance : (M,) array [px^2]
-    """
-
-    rows: NDArray[np.intp]
-    direction: Array
-    value: Array
-    variance: Array
+    rows: NDArray[np.intp]  # (M,) of the mid-points among the edges of the grid
+    direction: Array  # (M, 2) unit normals of the grid lines that cross the edges
+    value: Array  # (M,) [px]
+    variance: Array  # (M,) [px^2]
 
 
 def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges | None:
-    """Measure the positions of the outermost mid-points along their edges; None if the map is not accurate.
-
-    Parameters
-    ----------
-    grid_image : GridImage
-    fitted : GridFit
-        The fits of the edges between the vertices of the grid.
-    """
+    """Measure where the outermost mid-points lie along their edges; None if the map is not accurate."""
     if fitted.map.excess > _AGREES:
         return None
     rim, fit = fit_rim(grid_image, fitted)
@@ -96,24 +79,10 @@ def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges 
 def edges_served(
     shape: tuple[int, int], edges: GridEdges, rim: GridEdges, good: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Find the edge whose mid-point each edge to the rim serves.
+    """Find the edge whose mid-point each edge to the rim serves, among the `good` ones; -1 for none.
 
     Two edges between vertices cross the edge to the rim at its known vertex. The one towards the middle of
-    the board is preferred.
-
-    Parameters
-    ----------
-    shape : (cols, rows)
-        Number of the grid's vertices.
-    edges, rim : GridEdges
-        Edges between vertices, and edges to the rim.
-    good : (E,) bool array
-        Edges between vertices that have a mid-point.
-
-    Returns
-    -------
-    rows : (F,) int array
-        Among `edges`; -1 for none.
+    the board, of (cols, rows) vertices, is preferred.
     """
     cols, rows = shape
     row_of = np.full((2, cols + 2, rows + 2), -1, dtype=np.intp)  # one longer on each side

@@ -1,4 +1,4 @@
-"""Edge spread function, from -1 on the dark side to +1 on the light side.
+"""Edge spread function, from -1 on the dark side to +1 on the light side, and the response.
 
 With z the distance from the edge in units of sigma_t, ``sigma_t^2 = psf^2 + 1/12``,
 
@@ -11,6 +11,17 @@ response, due to gamma or clipping, maps the light x between the levels -1 and +
     F(x) = x + (1 - x^2) (b_0 + b_1 x + b_2 x^2 + ...)
 
 Both are the same along all edges of an image.
+
+For edges so sharp that the pixel's box dominates the blur, E is exact (`box_profile`). With psf the blur's
+standard deviation [px], x the distance from the edge [px], e = erf(x / (psf sqrt 2)) and p the normal density
+of x / psf, the light of a step and its integrals are
+
+    e,    G = x e + 2 psf p,    H = (x^2 + psf^2) e / 2 + psf x p.
+
+Along the edge's normal, the pixel is the convolution of two boxes with half widths a = |n_u| / 2 and
+b = |n_v| / 2. Therefore E is the second difference of H over 4 a b, and its slope is that of G. Because
+dH/dpsf = psf e, the derivative of E by psf is the second difference of psf e. The profile without blur, a
+ramp with rounded ends, is computed separately to avoid cancellation in these differences.
 """
 
 from __future__ import annotations
@@ -40,16 +51,14 @@ _C = (
 )
 _ROOT_HALF = float(np.sqrt(0.5))
 _PEAK = float(1 / np.sqrt(2 * np.pi))
+PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
+# Limits that avoid division by 0, below what can be measured; insensitive.
+_LEAST_PSF = 0.02  # px
+_LEAST_HALF = 5e-3  # px
 
 
 def erf_and_density(z: Real) -> tuple[Real, Real]:
-    """Error function ``erf(z / sqrt 2)`` and normal density ``exp(-z^2 / 2) / sqrt(2 pi)``.
-
-    Parameters
-    ----------
-    z : array
-        float32 or float64; the results have the same type.
-    """
+    """``erf(z / sqrt 2)`` and the normal density ``exp(-z^2 / 2) / sqrt(2 pi)``, in float32 or float64."""
     bell = z * z
     bell *= -0.5
     np.exp(bell, out=bell)
@@ -79,33 +88,26 @@ _SIGN_BITS = {4: (np.int32, np.int32(-(2**31))), 8: (np.int64, np.int64(-(2**63)
 
 
 def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
-    """E(z), its derivative, and the normal density.
-
-    Parameters
-    ----------
-    z : (E, N) array
-    tails : (E, 2) array
-        Coefficients a_3 and a_5.
-    """
+    """E(z), its derivative, and the normal density, with coefficients a_3 and a_5 (E, 2)."""
     value, density = erf_and_density(z)
     slope = 2 * density
-    if tails.any():
-        more, steeper = tails_of(z, density, tails)
-        value += more
-        slope += steeper
+    _add_tails(value, slope, z, density, tails)
     return value, slope, density
 
 
-def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
-    """Contribution of the tails (E, 2) to the profile at z (E, N), and its derivative."""
+def _add_tails(value: Real, slope: Real, z: Real, density: Real, tails: Real) -> None:
+    """Add the tails (E, 2) to the profile at z (E, N) and to its derivative, in place."""
+    if not tails.any():
+        return
     square = z * z
     # Polynomials in z^2; d/dz phi He_k = -phi He_{k+1}.
-    value, slope = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
-    more, steeper = _polynomial(square, value), _polynomial(square, slope)
+    odd, even = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
+    more, steeper = _polynomial(square, odd), _polynomial(square, even)
     more *= z
     more *= density
     steeper *= density
-    return more, steeper
+    value += more
+    slope += steeper
 
 
 # Coefficients of He_3 / z and He_5 / z, and of -He_4 and -He_6, as polynomials in z^2.
@@ -159,15 +161,63 @@ def response_terms(x: Real, scale: Real, out: Real) -> None:
 
 
 def box_kurtosis(normal: Array, sigma: Array) -> Array:
-    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``.
+    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``, for normals (E, 2).
 
     It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
-
-    Parameters
-    ----------
-    normal : (E, 2) array
-        Unit normals.
-    sigma : (E,) array [px]
-        sigma_t.
     """
     return np.asarray((normal**4).sum(axis=-1) / (1440 * sigma**4))
+
+
+def half_widths(normal: Array) -> Array:
+    """Half widths (E, 2) of the two boxes [px] of a pixel along unit normals (E, 2); the wider one first."""
+    return np.asarray(np.maximum(np.sort(0.5 * np.abs(normal), axis=1)[:, ::-1], _LEAST_HALF))
+
+
+def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
+    """Edge spread function at distances d (E, N) [px], and its derivatives by d and by sigma [1/px].
+
+    `sigma` is (E, 1) [px], ``sigma^2 = psf^2 + 1/12``, and `half` (E, 2) [px] as of `half_widths`.
+    """
+    kind = d.dtype
+    a, b = (half[:, k, None].astype(kind) for k in (0, 1))
+    psf = np.sqrt(np.maximum(sigma * sigma - kind.type(PIXEL), kind.type(_LEAST_PSF**2)))
+    share = 1 / (4 * a * b)
+    # Without blur, the profile is a ramp, rounded off within 2 b of its ends.
+    size = np.abs(d)
+    ramp = np.minimum(size, a - b) / a
+    beyond = np.clip(size - (a - b), 0, 2 * b)
+    value = with_sign(ramp + beyond * (4 * b - beyond) * share, d)
+    slope = np.where(size < a + b, (2 * b - beyond) * (2 * share), 0)
+    widening = np.zeros_like(d)
+    for x, sign in ((d + (a + b), 1), (d + (a - b), -1), (d - (a - b), -1), (d - (a + b), 1)):
+        z = x / psf
+        e, p = erf_and_density(z)
+        rest = e - with_sign(np.ones_like(x), x)
+        weight = sign * share
+        p *= psf
+        value += weight * (0.5 * (x * x * rest + psf * psf * e) + x * p)
+        slope += weight * (x * rest + 2 * p)
+        widening += weight * e
+    widening *= sigma
+    return value, slope, widening
+
+
+def sharp_profile(
+    z: Real, sigma: Real, tails: Real, half: Array | None
+) -> tuple[Real, Real, Real | None, Real]:
+    """E(z), its derivative by z, the extra derivative by log sigma, and the normal density.
+
+    If the profile only scaled with sigma, the derivative of E(d / sigma) by log sigma would be -z times that
+    by z. The pixel's box does not grow with the blur, which adds the third result. Without half widths of the
+    box, it is `profile`.
+    """
+    if half is None:
+        value, slope, density = profile(z, tails)
+        return value, slope, None, density
+    value, slope, widening = box_profile(z * sigma, sigma, half)
+    slope *= sigma
+    widening *= sigma
+    widening += z * slope
+    density = erf_and_density(z)[1]
+    _add_tails(value, slope, z, density, tails)
+    return value, slope, widening, density

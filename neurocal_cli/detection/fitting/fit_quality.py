@@ -40,14 +40,8 @@ def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
 def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:
     """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
 
-    Parameters
-    ----------
-    fit : BatchFit
-    departure : (E,) array
-        Distance from the map, in standard deviations.
-    known : array, optional
-        chi2 per pixel of fits that are known to be reliable; without it, the fits are compared with each
-        other.
+    `departure` (E,) is the distance from the map in standard deviations. `known` are values of chi2 per pixel
+    of fits that are known to be reliable; without it, the fits are compared with each other.
     """
     contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]

@@ -8,17 +8,12 @@ independent levels, common parameters, a last fit, and the map through its edges
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import (
-    CONTRAST,
-    MEAN,
-    BatchFit,
-    ProfileShape,
-    fit_batch,
-)
+from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
@@ -26,22 +21,24 @@ from neurocal_cli.detection.fitting.common_parameters import (
     level_prior,
     profile_shape,
 )
-from neurocal_cli.detection.fitting.edge_fit import OFFSET, edge_model, light_at, moments
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_fit import (
+    OFFSET,
+    REACH,
+    SHARP,
+    edge_model,
+    edge_pixels,
+    light_at,
+    moments,
+    usual_stride,
+)
+from neurocal_cli.detection.fitting.edge_profile import half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
-from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import (
-    FIRST,
-    SECOND,
-    vertex_lines,
-    vertex_model,
-    vertex_pixels,
-)
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, vertex_lines, vertex_model, vertex_pixels
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -71,44 +68,26 @@ _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile
 
 @frozen_dataclass(eq=False)
 class GridEdges:
-    """The edges between neighbouring vertices of a grid, those along c first.
+    """E edges of a grid, those along c first."""
 
-    Attributes
-    ----------
-    index : (E, 2) int array
-        First vertex, (c, r).
-    vertical : (E,) bool array
-    centre : (E, 2) array [squares]
-    light : (E,) array
-        +1 if the light side is that of growing r (growing c for vertical edges), else -1.
-    known : (E, 2) bool array
-        Whether the vertices at both ends are known.
-    """
-
-    index: NDArray[np.int64]
+    index: NDArray[np.int64]  # (E, 2) first vertex, (c, r)
     vertical: NDArray[np.bool_]
-    centre: Array
-    light: Array
-    known: NDArray[np.bool_]
+    centre: Array  # (E, 2) [squares]
+    light: Array  # (E,) +1 if the light side is that of growing r (growing c for vertical edges), else -1
+    known: NDArray[np.bool_]  # (E, 2) whether the vertices at both ends are known
 
     @classmethod
-    def of(cls, grid: Grid) -> GridEdges:
-        """All edges between two known vertices."""
-        return cls._with_known_ends(grid, 2)
+    def of(cls, grid: Grid, known_ends: int) -> GridEdges:
+        """All edges with so many known ends.
 
-    @classmethod
-    def to_rim(cls, grid: Grid) -> GridEdges:
-        """All edges with one known vertex: edges to the board's rim, and to vertices that were not found."""
-        return cls._with_known_ends(grid, 1)
-
-    @classmethod
-    def _with_known_ends(cls, grid: Grid, count: int) -> GridEdges:
+        With two they are between vertices; with one they lead to the rim, or to vertices that were not found.
+        """
         seen = np.pad(grid.seen, 1)
         ends = (
             np.stack([seen[1:-1, :-1], seen[1:-1, 1:]], axis=-1),
             np.stack([seen[:-1, 1:-1], seen[1:, 1:-1]], axis=-1),
         )
-        wanted = [known.sum(axis=2) == count for known in ends]
+        wanted = [known.sum(axis=2) == known_ends for known in ends]
         along_c, along_r = (
             np.argwhere(which)[:, ::-1] - first for which, first in zip(wanted, ([1, 0], [0, 1]), strict=True)
         )
@@ -131,38 +110,23 @@ class GridEdges:
 
 @frozen_dataclass(eq=False)
 class GridImage:
-    """An image and a grid in it, prepared for the fits.
-
-    Attributes
-    ----------
-    image : (H, W) array [DN]
-    grid : Grid
-    edges : GridEdges
-    anchors : Observations
-        The found vertices.
-    floor : float [DN^2]
-        Least variance of the pixels, that of rounding.
-    """
+    """An image [DN] and a grid in it, prepared for the fits."""
 
     image: Image
     grid: Grid
-    edges: GridEdges
-    anchors: Observations
-    floor: float
-
-    @classmethod
-    def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
-        """Prepare an image and a grid in it."""
-        vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
-        anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
-        return cls(image, grid, GridEdges.of(grid), anchors, floor)
+    floor: float  # [DN^2] least variance of the pixels, that of rounding
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the image [px]."""
         return self.image.shape[1], self.image.shape[0]
 
-    @property
+    @cached_property
+    def edges(self) -> GridEdges:
+        """The edges between found vertices."""
+        return GridEdges.of(self.grid, 2)
+
+    @cached_property
     def vertices(self) -> Array:
         """(V, 2) grid coordinates of the found vertices."""
         return np.argwhere(self.grid.seen)[:, ::-1].astype(float)
@@ -172,36 +136,28 @@ class GridImage:
         """(V, 2) pixels of the found vertices."""
         return self.grid.pixels[self.grid.seen]
 
+    def anchors(self, sigma: float) -> Observations:
+        """The found vertices as observations of a map, with a standard deviation [px]."""
+        return Observations.of_points(self.vertices, self.pixels, sigma, 1)
+
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Use edges as observations of a map; a few edges are joined with the found vertices as anchors."""
         edges = self.edges.observations(lines, offset, variance)
         if len(offset) > _ENOUGH:
             return edges
-        anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
-        return edges.joined_with(anchors)
+        return edges.joined_with(self.anchors(_ANCHOR))
 
 
 @frozen_dataclass(eq=False)
 class GridFit:
-    """Fitted edges and their common parameters.
-
-    Attributes
-    ----------
-    lines : Lines
-    fit : BatchFit
-    map : MapFit
-    shading : Shading
-    noise : PixelNoise
-    good : (E,) bool array
-        Edges that passed the quality tests.
-    """
+    """Fitted edges and their common parameters."""
 
     lines: Lines
     fit: BatchFit
     map: MapFit
     shading: Shading
     noise: PixelNoise
-    good: NDArray[np.bool_]
+    good: NDArray[np.bool_]  # (E,) edges that passed the quality tests
 
     @property
     def offset_variance(self) -> Array:
@@ -225,9 +181,10 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     """Run all stages: map of the found vertices, moments, first fit, common parameters, last fit."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
-    found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    anchors = grid_image.anchors(_START_SIGMA)
+    found = select_map(start, anchors, np.zeros(1), _GOOD_START)
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
-        found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
+        found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = _shading_of(found.map, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
@@ -371,7 +328,7 @@ def _fitted(
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
     """Fit the edges to the board's rim with the common parameters of all other edges."""
-    edges = GridEdges.to_rim(grid_image.grid)
+    edges = GridEdges.of(grid_image.grid, 1)
     lines = edges.lines(fitted.map.map)
     shift = fitted.map.shift[0]
     fit = _fitted(

@@ -9,24 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import (
-    BLUR,
-    BatchFit,
-    LevelPrior,
-    ProfileShape,
-    fit_batch,
-)
+from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
-from neurocal_cli.detection.fitting.edge_fit import edge_model
-from neurocal_cli.detection.fitting.edge_pixels import (
-    REACH,
-    SHARP,
-    edge_pixels,
-    usual_stride,
-)
-from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
+from neurocal_cli.detection.fitting.edge_fit import REACH, SHARP, edge_model, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis, half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_typical
-from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
@@ -46,19 +33,9 @@ _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to co
 def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
 ) -> BatchFit:
-    """Fit edges with independent levels.
+    """Fit edges with independent levels, from initial distances (E,) from their lines and blur [px].
 
-    Parameters
-    ----------
-    image : (H, W) array
-    lines : Lines
-    offset : (E,) array [px]
-        Initial distances of the edges from their lines.
-    sigma : float [px]
-        Initial blur.
-    shading : Shading
-    noise : float [DN^2]
-        Variance of a pixel.
+    `noise` [DN^2] is the variance of a pixel.
     """
     known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)

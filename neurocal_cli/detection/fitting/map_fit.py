@@ -44,24 +44,13 @@ _UNEVEN = 4.0  # ratio of residuals to noise above which polynomials are tried a
 
 @frozen_dataclass(eq=False)
 class Observations:
-    """Positions measured along one direction each: ``direction . p = value``.
+    """N positions measured along one direction each: ``direction . p = value``."""
 
-    Attributes
-    ----------
-    grid : (N, 2) array [squares]
-    direction : (N, 2) array
-        Unit vectors.
-    value : (N,) array [px]
-    variance : (N,) array [px^2]
-    shift : (N, K) array
-        Derivatives of the values by additional unknowns, which are fitted with the map.
-    """
-
-    grid: Array
-    direction: Array
-    value: Array
-    variance: Array
-    shift: Array
+    grid: Array  # (N, 2) [squares]
+    direction: Array  # (N, 2) unit vectors
+    value: Array  # (N,) [px]
+    variance: Array  # (N,) [px^2]
+    shift: Array  # (N, K) derivatives of the values by additional unknowns, which are fitted with the map
 
     @classmethod
     def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Observations:
@@ -89,28 +78,15 @@ class Observations:
 
 @frozen_dataclass(eq=False)
 class MapFit:
-    """A map fitted to observations.
-
-    Attributes
-    ----------
-    map : SmoothMap
-    shift : (K,) array [px]
-        Values of the additional unknowns; see `Observations.shift`.
-    shift_variance : (K,) array [px^2]
-    residual : (N,) array [px]
-        Value minus map and shift.
-    weight : (N,) array
-        Tukey's weight, from 1 to 0 for outliers.
-    excess : float
-        Variance of the good and informative residuals relative to the given variances; shrunk towards 1 if
-        it may differ by chance, at most 1 then.
-    """
+    """A map fitted to N observations."""
 
     map: SmoothMap
-    shift: Array
-    shift_variance: Array
-    residual: Array
-    weight: Array
+    shift: Array  # (K,) [px] values of the additional unknowns; see `Observations.shift`
+    shift_variance: Array  # (K,) [px^2]
+    residual: Array  # (N,) [px] value minus map and shift
+    weight: Array  # (N,) Tukey's weight, from 1 to 0 for outliers
+    # Variance of the good and informative residuals relative to the given variances; shrunk towards 1 if it
+    # may differ by chance, at most 1 then.
     excess: float
 
     @property
@@ -120,16 +96,7 @@ class MapFit:
 
 
 def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFit:
-    """Fit a map by Levenberg-Marquardt with Tukey's weights, from a nearby initial map.
-
-    Parameters
-    ----------
-    start : SmoothMap
-        Its model is kept.
-    observations : Observations
-    shift : (K,) array [px]
-        Initial shifts.
-    """
+    """Fit a map of the start's model by Levenberg-Marquardt with Tukey's weights, from nearby values."""
     return _with_covariance(_solved_map(start, observations, shift), observations)
 
 
@@ -140,18 +107,10 @@ def select_map(
     enough: float = 0.0,
     models: Sequence[tuple[int, int]] | None = None,
 ) -> MapFit:
-    """Fit the simplest model that the observations do not contradict.
+    """Fit the simplest model that the observations do not contradict, from a map of any model.
 
-    Parameters
-    ----------
-    start : SmoothMap
-        May have any model.
-    observations : Observations
-    shift : (K,) array [px]
-    enough : float
-        Chi2 per observation below which no richer model is tried.
-    models : sequence of (radial, degree), optional
-        Models that are tried, the simplest first; by default all of the map's `models`.
+    No richer model is tried once chi2 per observation is below `enough`. The `models` (radial, degree) are
+    tried from the simplest to the richest; by default all of the map's `models`.
     """
     best: _Solution | None = None
     now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials

@@ -33,44 +33,28 @@ _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 @frozen_dataclass(eq=False)
 class Levels:
-    """Levels [DN] measured at places of the image.
+    """Levels measured at N places of the image."""
 
-    Attributes
-    ----------
-    place : (N, 2) array [px]
-    level, variance : (N,) arrays [DN], [DN^2]
-    noise : (N,) array [DN^2]
-        Variance of the pixels there, if measured.
-    """
-
-    place: Array
-    level: Array
-    variance: Array
+    place: Array  # (N, 2) [px]
+    level: Array  # (N,) [DN]
+    variance: Array  # (N,) [DN^2]
+    # (N,) [DN^2] variance of the pixels there, if measured
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @frozen_dataclass(eq=False)
 class Shading:
-    """Dark and light level as polynomials of the place.
-
-    Attributes
-    ----------
-    frame : Frame
-        Scales the pixels.
-    dark, light : (6,) arrays [DN]
-        Coefficients of 1, x, y, x^2, x y, y^2.
-    spread : (2,) array [DN^2]
-        Variance of single squares around the dark and the light polynomial, including that of the polynomial.
-    """
+    """Dark and light level as polynomials of the place, scaled by the frame."""
 
     frame: Frame
-    dark: Array
-    light: Array
+    dark: Array  # (6,) [DN] coefficients of 1, x, y, x^2, x y, y^2
+    light: Array  # (6,) [DN] the same
+    # (2,) [DN^2] variance of single dark and light squares around the polynomials, including that of these
     spread: Array
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = _terms(self.frame, place)
+        terms = quadratic_terms(self.frame, place)
         dark, light = terms @ self.dark, terms @ self.light
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
@@ -86,19 +70,8 @@ class Shading:
     def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
         """Remove the gradient of the mean level at places (N, 2) from the pixels around them.
 
-        Parameters
-        ----------
-        place : (N, 2) array [px]
-        u, v : (N, M) arrays [px]
-            Coordinates of the pixels relative to the places.
-        value : (N, M) array [DN]
-
-        Returns
-        -------
-        value : (N, M) array [DN]
-            Without the gradient of the mean level.
-        gain : (N, M) array
-            Half contrast relative to that at the places.
+        `u` and `v` (N, M) [px] are the coordinates of the pixels relative to the places. Returns the values
+        (N, M) [DN], and the half contrast (N, M) relative to that at the places.
         """
         by_mean, by_contrast = (slope.astype(np.float32) for slope in self.slopes(place))
         by_contrast /= self.at(place)[1].astype(np.float32)[:, None]
@@ -108,18 +81,11 @@ class Shading:
 
 @frozen_dataclass(eq=False)
 class LocalShading(Shading):
-    """Levels that also follow nearby squares, for the strong vignetting of wide lenses.
+    """Levels that also follow nearby squares, for the strong vignetting of wide lenses."""
 
-    Attributes
-    ----------
-    near : pair of (N, 2) arrays [px]
-        Places at which the dark and the light levels were measured.
-    above : pair of (N,) arrays [DN]
-        Their differences from the polynomials.
-    """
-
+    # Two arrays (N, 2) [px]: places at which the dark and the light levels were measured
     near: tuple[Array, Array]
-    above: tuple[Array, Array]
+    above: tuple[Array, Array]  # two arrays (N,) [DN]: their differences from the polynomials
 
     @classmethod
     def of(cls, smooth: Shading, dark: Levels, light: Levels) -> Shading:
@@ -130,17 +96,16 @@ class LocalShading(Shading):
         for levels, coefficients, before in zip(
             (dark, light), (smooth.dark, smooth.light), smooth.spread, strict=True
         ):
-            rest = levels.level - _terms(smooth.frame, levels.place) @ coefficients
+            rest = levels.level - quadratic_terms(smooth.frame, levels.place) @ coefficients
             left = rest - _nearby(levels.place, rest, levels.place, itself=False)
-            chance = 2 * upper_median(levels.variance)
             above.append(rest)
-            spread.append(min(max(upper_median(left**2) / CHI2_MEDIAN - chance, 0.0), before))
+            spread.append(min(excess_variance(left, levels.variance), before))
         near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = _terms(self.frame, place)
+        terms = quadratic_terms(self.frame, place)
         dark, light = (
             terms @ coefficients + _nearby(near, above, place)
             for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
@@ -192,7 +157,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
         return coefficients, np.inf
-    terms = _terms(frame, levels.place)
+    terms = quadratic_terms(frame, levels.place)
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
     # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
@@ -214,6 +179,12 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     return coefficients, spread + most / n * upper_median(levels.variance)
 
 
-def _terms(frame: Frame, place: Array) -> Array:
+def excess_variance(residual: Array, variance: Array) -> float:
+    """Robust variance of residuals (N,) beyond twice the median of their known variances (N,)."""
+    return max(upper_median(residual**2) / CHI2_MEDIAN - 2 * upper_median(variance), 0.0)
+
+
+def quadratic_terms(frame: Frame, place: Array) -> Array:
+    """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, 6)."""
     x, y = ((place - frame.centre) / frame.unit).T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)

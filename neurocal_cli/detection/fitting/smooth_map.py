@@ -41,21 +41,12 @@ _CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
 @frozen_dataclass
 class Frame:
-    """Scales of grid and pixels.
+    """Scales of grid and pixels."""
 
-    Attributes
-    ----------
-    origin, half : (2,) arrays [squares]
-        Grid coordinates of the scaled coordinate 0, and the grid length of 1.
-    centre : (2,) array [px]
-    unit : float [px]
-        Half of the image's diagonal.
-    """
-
-    origin: Array
-    half: Array
-    centre: Array
-    unit: float
+    origin: Array  # (2,) [squares] grid coordinates of the scaled coordinate 0
+    half: Array  # (2,) [squares] the grid length of 1
+    centre: Array  # (2,) [px]
+    unit: float  # [px] half of the image's diagonal
 
     @classmethod
     def of(cls, grid: Array, size: tuple[int, int]) -> Frame:
@@ -74,43 +65,17 @@ class Frame:
 
 @frozen_dataclass(eq=False)
 class Places:
-    """Grid points, each with a direction in the image, prepared for maps of one model.
+    """N grid points, each with a direction in the image, prepared for maps of one model."""
 
-    Attributes
-    ----------
-    ground : (3, N) array
-        Scaled coordinates x and y, and 1.
-    axis : (2, N) array [px]
-        The directions as unit vectors, times the frame's unit.
-    origin : (N,) array [px]
-        Coordinate of the frame's centre along each direction.
-    rest : (2 m, N) array or None [px]
-        Derivatives by the polynomials' coefficients, along u and along v.
-    """
-
-    ground: Array
-    axis: Array
-    origin: Array
-    rest: Array | None
+    ground: Array  # (3, N) scaled coordinates x and y, and 1
+    axis: Array  # (2, N) [px] the directions as unit vectors, times the frame's unit
+    origin: Array  # (N,) [px] coordinate of the frame's centre along each direction
+    rest: Array | None  # (2 m, N) [px] derivatives by the polynomials' coefficients, along u and along v
 
 
 @frozen_dataclass(eq=False)
 class SmoothMap:
-    """A map with its parameters, some of which may be fixed at 0.
-
-    Attributes
-    ----------
-    frame : Frame
-    parameters : (P,) array
-        h0..h7, c_u, c_v, k1, k2, m, n, tau_u, tau_v, k3, then a_k along u and along v.
-    radial : int
-        Index of the set of free lens parameters: none; k1; k1, k2 and the centre; these with m and n; with
-        tau; all.
-    degree : int
-        Of the polynomial; 0 for none.
-    covariance : (P, P) array
-        Of the parameters; 0 for fixed ones.
-    """
+    """A map with its parameters, some of which may be fixed at 0."""
 
     # (radial, degree) of each model, the simplest first.
     models: ClassVar[tuple[tuple[int, int], ...]] = (
@@ -123,10 +88,11 @@ class SmoothMap:
     rest: ClassVar[int] = _REST  # position of the first coefficient of the polynomial
 
     frame: Frame
-    parameters: Array
+    parameters: Array  # (P,) h0..h7, c_u, c_v, k1, k2, m, n, tau_u, tau_v, k3, then a_k along u and along v
+    # Index of the set of free lens parameters: none; k1; with k2 and the centre; with m and n; with tau; all.
     radial: int = 0
-    degree: int = 0
-    covariance: Array | None = None
+    degree: int = 0  # of the polynomial; 0 for none
+    covariance: Array | None = None  # (P, P) of the parameters; 0 for fixed ones
 
     @property
     def free(self) -> NDArray[np.intp]:
@@ -213,19 +179,7 @@ class SmoothMap:
         return Places(ground, axis, frame.centre @ direction, rest)
 
     def along(self, places: Places) -> tuple[Array, Array]:
-        """Pixel coordinates along the places' directions, and their derivatives.
-
-        Parameters
-        ----------
-        places : Places
-            Of N points.
-
-        Returns
-        -------
-        value : (N,) array [px]
-        derivatives : (P, N) array
-            By the parameters; 0 for fixed parameters of the lens.
-        """
+        """Pixels (N,) along the places' directions, and their derivatives (P, N) by the parameters."""
         values, axis = self.parameters, places.axis
         out = np.empty((len(values), axis.shape[1]))
         homogeneous = self._homography @ places.ground

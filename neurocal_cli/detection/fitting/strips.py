@@ -21,31 +21,15 @@ _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 @frozen_dataclass(eq=False)
 class Lines:
-    """Pieces of grid lines in the image, one square long, each with a local frame.
+    """Pieces of E grid lines in the image, one square long, each with a local frame."""
 
-    Attributes
-    ----------
-    middle : (E, 2) array [px]
-        Pixel of the middle of the piece, the origin of the frame.
-    tangent, normal : (E, 2) arrays
-        Unit vectors; the normal points to the light side.
-    curvature : (E,) array [1/px]
-        The line is ``d = curvature s^2 / 2`` in the frame.
-    ends : (E, 2) array [px]
-        Tangential coordinates of the two ends.
-    crossing : (E, 2, 2) array
-        Unit normals of the lines that cross at the two ends, pointing into the piece.
-    apart : (E, 2) array [px]
-        Distances to the next parallel lines, against the normal and along it.
-    """
-
-    middle: Array
-    tangent: Array
-    normal: Array
-    curvature: Array
-    ends: Array
-    crossing: Array
-    apart: Array
+    middle: Array  # (E, 2) [px] middle of the piece, the origin of the frame
+    tangent: Array  # (E, 2) unit vectors
+    normal: Array  # (E, 2) unit vectors, which point to the light side
+    curvature: Array  # (E,) [1/px]; the line is d = curvature s^2 / 2 in the frame
+    ends: Array  # (E, 2) [px] tangential coordinates of the two ends
+    crossing: Array  # (E, 2, 2) unit normals of the lines that cross at the two ends, pointing into the piece
+    apart: Array  # (E, 2) [px] distances to the next parallel lines, against the normal and along it
 
     @property
     def width(self) -> Array:
@@ -72,17 +56,10 @@ class Lines:
 
 
 def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
-    """Map lines of a grid to the image.
+    """Map pieces of grid lines, half a square to both sides of their middles (E, 2) [squares], to the image.
 
-    Parameters
-    ----------
-    at : SmoothMap
-    centre : (E, 2) array [squares]
-        Grid coordinates of the middles; a piece reaches half a square to both sides.
-    vertical : (E,) bool array
-        Whether the line runs along r.
-    light : (E,) array
-        +1 if the light side is that of growing r (growing c for vertical lines), else -1.
+    `vertical` (E,) tells whether a line runs along r. `light` (E,) is +1 if the light side is that of growing
+    r (growing c for vertical lines), else -1.
     """
     swap = vertical[:, None, None]
     offsets = np.concatenate([_AROUND, _NEIGHBOURS])
@@ -111,47 +88,25 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
 
 @frozen_dataclass(eq=False)
 class Strips:
-    """Pixels around lines, padded to the same number for each line; float32.
+    """Pixels around lines, padded to the same number N for each of E lines; float32."""
 
-    Attributes
-    ----------
-    s, d : (E, N) arrays [px]
-        Tangential coordinate, and normal distance from the curved line.
-    value : (E, N) array [DN]
-    inside : (E, N) bool array
-        False for the padding and for pixels outside the strip or the image.
-    u, v : (E, N) arrays [px]
-        Relative to the line's middle.
-    beyond : (E,) array
-        Share of the strip's pixels that lie outside the image.
-    """
-
-    s: Single
-    d: Single
-    value: Single
-    inside: NDArray[np.bool_]
-    u: Single
-    v: Single
-    beyond: Array
+    s: Single  # (E, N) [px] tangential coordinate
+    d: Single  # (E, N) [px] normal distance from the curved line
+    value: Single  # (E, N) [DN]
+    inside: NDArray[np.bool_]  # (E, N) False for the padding and for pixels outside the strip or the image
+    u: Single  # (E, N) [px] relative to the line's middle
+    v: Single  # (E, N) [px] the same
+    beyond: Array  # (E,) share of the strip's pixels that lie outside the image
 
 
 def strip_pixels(
     image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
 ) -> Strips:
-    """Gather the pixels of the strips ``|d| <= half_width`` between the ends of lines.
+    """Gather the pixels of the strips ``|d| <= half_width`` (E,) [px] between the ends of lines.
 
-    A strip is selected from a parallelogram of whole pixels: columns along the line (rows if the line is more
+    `trim` (E, 2) [px] is the length to leave out at the two ends. Only every `stride`-th column is used. A
+    strip is selected from a parallelogram of whole pixels: columns along the line (rows if the line is more
     vertical than horizontal), and in each column the pixels around the line.
-
-    Parameters
-    ----------
-    image : (H, W) array
-    lines : Lines
-    half_width : (E,) array [px]
-    trim : (E, 2) array [px]
-        Length to leave out at the two ends.
-    stride : int
-        Use only every n-th column.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -202,20 +157,10 @@ def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> S
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Indices of the wanted elements of each row, without gaps.
+    """Indices (E, M) in the flat array of the wanted elements of each row, without gaps.
 
-    Parameters
-    ----------
-    wanted : (E, N) bool array
-    count : (E,) int array
-        Number of wanted elements in each row.
-
-    Returns
-    -------
-    index : (E, M) int array
-        Indices in the flat array; 0 beyond a row's count.
-    inside : (E, M) bool array
-        False beyond a row's count.
+    `count` (E,) is the number of wanted elements in each row. Beyond it, an index is 0 and the second result,
+    a mask (E, M), is False.
     """
     most = int(count.max(initial=1))
     inside = np.arange(most) < count[:, None]

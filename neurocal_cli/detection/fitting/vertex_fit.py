@@ -22,9 +22,8 @@ from neurocal_cli.detection.fitting.batched_newton import (
     Single,
     rows_for,
 )
-from neurocal_cli.detection.fitting.edge_pixels import ALONE, REACH
-from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response
-from neurocal_cli.detection.fitting.pixel_box import sharp_profile
+from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
+from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response, sharp_profile
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
@@ -43,20 +42,13 @@ _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 
 @frozen_dataclass(eq=False)
 class VertexPixels(FitPixels):
-    """Pixels of vertices for the fits; (V, N) float32 arrays, Q with the sign of the square.
+    """Pixels of vertices for the fits; (V, N) float32 arrays, Q with the sign of the square."""
 
-    Attributes
-    ----------
-    lever1, d1, lever2, d2 : arrays
-        Tangential coordinates of both lines over half their lengths, and distances from the lines [px].
-    rho : (V, 1) array
-    """
-
-    lever1: Single
-    d1: Single
+    lever1: Single  # tangential coordinate of the first line over half its length
+    d1: Single  # [px] distance from the first line
     lever2: Single
     d2: Single
-    rho: Single
+    rho: Single  # (V, 1)
 
 
 def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
@@ -77,19 +69,10 @@ def vertex_pixels(
     shading: Shading,
     last: NDArray[np.bool_],
 ) -> VertexPixels:
-    """Gather the pixels around vertices, all with weight 1.
+    """Gather the pixels around vertices of blur `sigma` (V,) [px], all with weight 1.
 
-    Parameters
-    ----------
-    image : (H, W) array
-    lines : pair of Lines
-    light : (V,) array
-        +1 if the square between the two normals is light, else -1.
-    sigma : (V,) array [px]
-        Blur.
-    shading : Shading
-    last : (V, 2, 2) bool array
-        Which ends of the two lines are ends of the board. At a fold, light of another plane blurs into them.
+    `light` (V,) is +1 if the square between the two normals is light, else -1. `last` (V, 2, 2) tells which
+    ends of the two lines are ends of the board. At a fold, light of another plane blurs into them.
     """
     parts = []
     for k in (0, 1):

@@ -46,15 +46,7 @@ _LEAST = 1e-9
 
 @frozen_dataclass(eq=False)
 class WideMap(SmoothMap):
-    """A map with its parameters h, c, a, m, n, b, some of which may be fixed at 0.
-
-    Attributes
-    ----------
-    turn : (3, 3) array
-        R.
-    widest : float [rad]
-        t_max.
-    """
+    """A map with its parameters h, c, a, m, n, b, some of which may be fixed at 0."""
 
     models: ClassVar[tuple[tuple[int, int], ...]] = (
         *((k, 0) for k in range(len(_LENSES))),
@@ -65,8 +57,8 @@ class WideMap(SmoothMap):
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
     rest: ClassVar[int] = _REST
 
-    turn: Array = field(default_factory=lambda: np.eye(3))
-    widest: float = 1.0
+    turn: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) R
+    widest: float = 1.0  # [rad] t_max
 
     @property
     def prior(self) -> Array:
@@ -139,15 +131,7 @@ class WideMap(SmoothMap):
 
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:
-    """Fit the map of an equidistant lens to vertices; None if no plane fits them.
-
-    Parameters
-    ----------
-    frame : Frame
-    grid : (N, 2) array [squares]
-    pixels : (N, 2) array [px]
-    size : (width, height) [px]
-    """
+    """Fit the map of an equidistant lens to vertices in an image of a size; None if no plane fits them."""
     fit = fit_wide_lens(grid, pixels, size)
     if not np.isfinite(fit.rms):
         return None

@@ -38,13 +38,7 @@ class End(Enum):
 
 
 def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
-    """Classify the sides of a grid, named by their directions.
-
-    Parameters
-    ----------
-    grey : (height, width) array
-    grid : Grid
-    """
+    """Classify the sides of a grid in a grey image, named by their directions."""
     with np.errstate(invalid="ignore"):  # unknown values are NaN
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)

@@ -24,14 +24,8 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.linear_camera import fit_camera, is_flat, rigid_motion
-from neurocal_cli.detection.identity.messages import (
-    SYMMETRIC_BOARD,
-    NoBoardError,
-    ambiguous,
-    wrong_size,
-)
-from neurocal_cli.detection.identity.placement import Placement, placements
-from neurocal_cli.detection.identity.trim import trimmed
+from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError, ambiguous, wrong_size
+from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -47,14 +41,7 @@ _KEPT = 200  # best arrangements that are extended by a further grid; limits the
 
 @frozen_dataclass(eq=False)
 class Located:
-    """A grid and its place on the board.
-
-    Attributes
-    ----------
-    grid : Grid
-    plane : Plane
-    placement : Placement
-    """
+    """A grid and its place on the board."""
 
     grid: Grid
     plane: Plane
@@ -63,36 +50,17 @@ class Located:
 
 @frozen_dataclass(eq=False)
 class Identified:
-    """The grids of an image that belong to the board.
-
-    Attributes
-    ----------
-    located : tuple of Located
-        In the order of the board's planes.
-    warnings : tuple of str
-        Their texts do not depend on the image.
-    """
+    """The grids of an image that belong to the board, in the order of its planes."""
 
     located: tuple[Located, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # their texts do not depend on the image
 
 
 def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> Identified:
-    """Locate the grids of one image on the board.
+    """Locate the grids of one grey image on the board.
 
-    Parameters
-    ----------
-    board : Board
-    grids : sequence of Grid
-        All grids found in the image, including those that do not belong to the board.
-    grey : (height, width) array
-        The image, in which the ends of the board are searched.
-
-    Raises
-    ------
-    NoBoardError
-        There is no board, a board of another size, or more than one possible arrangement. The message says
-        which.
+    The grids are all that were found, including those that do not belong to the board. Raises NoBoardError if
+    there is no board, a board of another size, or more than one possible arrangement; the message says which.
     """
     if not grids:
         if all(min(plane.cols, plane.rows) < 3 for plane in board.planes):
@@ -157,11 +125,11 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
     front of the camera.
     """
     kept: list[_Candidate] = []
-    for size in sorted({tuple(sorted((plane.cols, plane.rows))) for plane in board.planes}):
-        room = sum(tuple(sorted((plane.cols, plane.rows))) == size for plane in board.planes)
+    sizes = [tuple(sorted((plane.cols, plane.rows))) for plane in board.planes]
+    for size in sorted(set(sizes)):
+        room = sizes.count(size)
         alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
-        if len(alike) > 1:
-            alike.sort(key=lambda c: -c.grid.square)
+        alike.sort(key=lambda c: -c.grid.square)
         if len(alike) > room and alike[room - 1].grid.square < _NEARER * alike[room].grid.square:
             raise NoBoardError(
                 f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "

@@ -17,17 +17,11 @@ _WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by t
 
 @frozen_dataclass
 class CameraFit:
-    """A projective camera fitted to points.
+    """A projective camera fitted to points."""
 
-    Attributes
-    ----------
-    rms : float [px]
-    handed : int
-        1 for a camera, -1 for a mirror image, 0 if undetermined because of too little perspective or because
-        all points lie in one plane.
-    """
-
-    rms: float
+    rms: float  # [px]
+    # 1 for a camera, -1 for a mirror image, 0 if undetermined because of too little perspective or because
+    # all points lie in one plane
     handed: int
 
 
@@ -38,14 +32,9 @@ def is_flat(world: Array) -> bool:
 
 
 def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> CameraFit:
-    """Fit a camera to points by the direct linear transform.
+    """Fit a camera to world points (N, 3) and pixels (N, 2) by the direct linear transform.
 
-    Parameters
-    ----------
-    world : (N, 3) array
-    pixels : (N, 2) array [px]
-    front : (3,) array, optional
-        For points in one plane, its normal that must point away from the camera.
+    `front` (3,) is, for points in one plane, its normal that must point away from the camera.
     """
     plane = _plane_coordinates(world, front) if is_flat(world) else None
     points = world if plane is None else plane
@@ -65,12 +54,7 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
 
 
 def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
-    """Rotation R and translation t with ``second = first R^T + t``; None if no motion fits.
-
-    Parameters
-    ----------
-    first, second : (N, 3) arrays
-    """
+    """R and t with ``second = first R^T + t`` for points (N, 3), R a rotation; None if no motion fits."""
     a, b = first.mean(axis=0), second.mean(axis=0)
     U, _, Vt = np.linalg.svd((first - a).T @ (second - b))
     R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T

@@ -19,11 +19,7 @@ SYMMETRIC_BOARD = (
 class NoBoardError(NeurocalError):
     """The image does not show the board, or not enough of it to locate its points.
 
-    Parameters
-    ----------
-    message : str
-    shown : (cols, rows), optional
-        Number of inner vertices of the board that the image shows instead of the wanted one.
+    `shown` is the number (cols, rows) of inner vertices of the board that the image shows instead.
     """
 
     def __init__(self, message: str, shown: tuple[int, int] | None = None) -> None:

@@ -1,8 +1,12 @@
-"""Placements of a grid on a plane of the board: rotated, mirrored if seen from behind, and shifted."""
+"""Placements of a grid on a plane of the board: rotated, mirrored if seen from behind, and shifted.
+
+Before that, `trimmed` removes outer lines of a grid that are not lines of the board. False vertices occur
+where a corner of the paper lies near the outer squares, and at corners of squares on a fold.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -14,6 +18,46 @@ from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+Side = tuple[slice | int, ...]
+
+_SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
+
+# With these limits tests/test_identity.py removes false lines, and keeps those of larger boards.
+_FEW = 0.34  # a line may be removed if at most this share of its vertices was found
+_FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a camera afterwards
+
+
+def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
+    """Remove outer lines with few vertices from a grid that is too large for every plane.
+
+    The grid stays as it is if it fits, or if removing such lines does not make it fit.
+    """
+    left = grid
+    few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
+    while not _fits(left, planes):
+        shares = [float(left.seen[side].mean()) for side in _SIDES]
+        if min(shares) > few or min(left.shape) <= 3:
+            return grid
+        left = _without(left, _SIDES[shares.index(min(shares))])
+    return left
+
+
+def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
+    size = sorted(grid.shape)
+    return any(
+        size[0] <= min(plane.cols, plane.rows) and size[1] <= max(plane.cols, plane.rows) for plane in planes
+    )
+
+
+def _without(grid: Grid, side: Side) -> Grid:
+    """Remove the line of a side, and lines that are then empty."""
+    pixels = grid.pixels.copy()
+    pixels[side] = np.nan
+    seen = np.isfinite(pixels[..., 0])
+    (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
+    return Grid(pixels[top : bottom + 1, west : east + 1], int(grid.dark + top + west) % 2)
+
+
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 _TURNS: tuple[Matrix, ...] = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
@@ -22,19 +66,10 @@ _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in _TURN
 
 @frozen_dataclass
 class Placement:
-    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``.
+    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``."""
 
-    Attributes
-    ----------
-    plane : int
-        Position among the board's planes.
-    matrix : 2 x 2 ints
-        A rotation by a multiple of 90 degrees, with or without a reflection.
-    offset : 2 ints
-    """
-
-    plane: int
-    matrix: Matrix
+    plane: int  # position among the board's planes
+    matrix: Matrix  # a rotation by a multiple of 90 degrees, with or without a reflection
     offset: tuple[int, int]
 
     def apply(self, grid: ArrayLike) -> Array:
@@ -42,13 +77,7 @@ class Placement:
         return np.asarray(grid) @ np.array(self.matrix).T + np.array(self.offset)
 
     def first_square_is_dark(self, dark: int) -> bool:
-        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark.
-
-        Parameters
-        ----------
-        dark : int
-            That of the grid; see `Grid`.
-        """
+        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark, by `Grid.dark`."""
         centre = (np.array([0.5, 0.5]) - np.array(self.offset)) @ np.array(self.matrix)  # matrix^-1
         return bool((np.floor(centre).sum() + dark) % 2 == 0)
 
@@ -61,25 +90,12 @@ class Placement:
 
 
 def placements(
-    grid: Grid,
-    plane: Plane,
-    index: int,
-    ends: Mapping[tuple[int, int], End],
-    *,
-    mirrored: bool,
+    grid: Grid, plane: Plane, index: int, ends: Mapping[tuple[int, int], End], *, mirrored: bool
 ) -> Iterator[Placement]:
-    """Enumerate the placements of a grid on a plane that agree with the board's ends.
+    """Enumerate the placements of a grid on the plane of this index that agree with the board's ends.
 
-    Parameters
-    ----------
-    grid : Grid
-    plane : Plane
-    index : int
-        Of the plane on its board.
-    ends : dict of End
-        By the directions of the grid's sides; absent sides are unknown.
-    mirrored : bool
-        Whether the plane may be seen from behind.
+    The ends are given by the directions of the grid's sides; absent sides are unknown. The plane may be seen
+    from behind if `mirrored`.
     """
     last = plane.cols - 1, plane.rows - 1
     cols, rows = grid.shape

@@ -23,18 +23,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 @frozen_dataclass
 class Blur:
-    """Kernels of a blur.
+    """Kernels of a blur."""
 
-    Parameters
-    ----------
-    sigma : float [px]
-        Of the Gaussian.
-    parts : int
-        Cells along a pixel's side.
-    """
-
-    sigma: float
-    parts: int
+    sigma: float  # [px] of the Gaussian
+    parts: int  # cells along a pixel's side
 
     @property
     def radius(self) -> int:
@@ -66,18 +58,9 @@ class Blur:
         return _spread(offsets[:, None] - centres, 0.5 / self.parts, sigma)
 
     def convolve(self, level: Array, slope_u: Array | None, slope_v: Array | None) -> Array:
-        """Blur an image whose pixels are uniform or linear inside.
+        """Blur an image (H, W) whose pixels are uniform, or linear inside with slopes (H, W) [1/px].
 
-        Parameters
-        ----------
-        level : (H, W) array
-            Mean of each pixel.
-        slope_u, slope_v : (H, W) arrays, optional [1/px]
-            Slopes within each pixel.
-
-        Returns
-        -------
-        image : (H - 2 radius, W - 2 radius) array
+        Returns (H - 2 radius, W - 2 radius).
         """
         image = _along_v(_along_u(level, self.whole), self.whole)
         if slope_u is not None:
@@ -89,14 +72,9 @@ class Blur:
     def scatter(self, image: Array, row: NDArray[np.intp], column: NDArray[np.intp], cells: Array) -> None:
         """Add the light of the cells of pixels to an image, in place.
 
-        Parameters
-        ----------
-        image : (H, W) array
-            With a border of ``radius`` around the part that is kept.
-        row, column : (N,) int arrays
-            Different pixels, at least ``radius`` from the image's border.
-        cells : (N, parts, parts) array
-            Differences from the pixel's mean, ``[pixel, v, u]``.
+        The image has a border of `radius` around the part that is kept, and the N pixels are different, and
+        at least `radius` from it. `cells` (N, parts, parts) are the differences from the pixel's mean,
+        ``[pixel, v, u]``.
         """
         spread = self.cell @ cells @ self.cell.T
         flat, width = image.reshape(-1), image.shape[1]

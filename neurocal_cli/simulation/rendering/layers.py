@@ -1,4 +1,9 @@
-"""Boards of a scene as layers: their cover of small square cells of the image."""
+"""Layers of a scene: the exact light of small cells of the image.
+
+A layer covers a part of each cell; `Composition` puts the layers on top of each other. A pixel without an
+edge has a uniform level. A pixel with edges is divided into cells, in which the area on each side of a
+straight edge is known; a cell with more than one edge is divided once more.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +12,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
-from neurocal_cli.simulation.rendering.scene import Scene, Target
+from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
 _NEARBY = 2.0
+# Least component of a normal, to avoid division by 0; the error of the area is below 1e-5.
+_LEAST_COMPONENT = 1e-5
+_FINEST = 8  # divisions of the side of a cell with more than one edge
+_PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the corner of a pixel
 
 
 @frozen_dataclass(eq=False)
 class BoardLayer:
     """A target in the frame of the camera.
 
-    Parameters
-    ----------
-    target : Target
-    inverse : (3, 3) array
-        Maps rays (x, y, z) to w (a, b, 1), with w = 1 / depth, and a and b in squares. Rays are slopes (z =
-        1) with depths along the axis, or unit directions with depths along these.
+    The (3, 3) inverse maps rays (x, y, z) to w (a, b, 1), with w = 1 / depth, and a and b in squares. Rays
+    are slopes (z = 1) with depths along the axis, or unit directions with depths along these.
     """
 
     target: Target
@@ -37,10 +42,7 @@ class BoardLayer:
     def of(cls, scene: Scene, target: Target) -> BoardLayer:
         """Make the layer of a target in a scene.
 
-        Raises
-        ------
-        DegenerateGeometryError
-            The camera's centre lies in the target's plane.
+        Raises DegenerateGeometryError if the camera's centre lies in the target's plane.
         """
         matrix = scene.plane_to_camera(target)
         square = target.plane.square
@@ -71,16 +73,7 @@ class BoardLayer:
         return au, av, bu, bv
 
     def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
-        """Cover of the cells around rays, which are flat arrays.
-
-        Parameters
-        ----------
-        rays : Rays of (N,) arrays
-        cell : float [px]
-            Side of the cells.
-        slack : float [px]
-            See `half_plane`.
-        """
+        """Cover of the cells of a side [px] around flat arrays of rays; for `slack` see `half_plane`."""
         a, b, w = self.grid(rays)
         n = len(a)
         alpha, light, depth = np.zeros(n), np.zeros(n), np.full(n, np.inf)
@@ -141,3 +134,110 @@ def _axis(
 def _inward(a: Array, ends: tuple[float, float]) -> Array:
     """Distance from the nearer end, positive between the ends."""
     return np.minimum(a - ends[0], ends[1] - a)
+
+
+def half_plane(
+    distance: Array, normal_u: Array, normal_v: Array, cell: float, slack: float = 0.0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Share of square cells on the positive side of straight edges, and whether the edge crosses the cell.
+
+    `distance` [px] is from the edge to the cell's centre, positive on the positive side. The signs of the
+    unit normals do not matter. Cells with an edge as close as `slack` [px] count as touched, too.
+    """
+    support = (np.abs(normal_u) + np.abs(normal_v)) * (0.5 * cell)
+    touched = np.abs(distance) < support + slack
+    share = (distance > 0).astype(float)
+    if touched.any():
+        share[touched] = _area(distance[touched] / cell, normal_u[touched], normal_v[touched])
+    return share, touched
+
+
+def _area(distance: Array, normal_u: Array, normal_v: Array) -> Array:
+    """Area of the part of the unit square with ``n . x > -distance``, as a second difference of ramps."""
+    p = np.maximum(np.abs(normal_u), _LEAST_COMPONENT)
+    q = np.maximum(np.abs(normal_v), _LEAST_COMPONENT)
+    outer, inner = 0.5 * (p + q), 0.5 * (p - q)
+    total = (
+        _ramp(distance + outer) - _ramp(distance + inner) - _ramp(distance - inner) + _ramp(distance - outer)
+    )
+    return np.clip(total / (p * q), 0.0, 1.0)
+
+
+def _ramp(x: Array) -> Array:
+    positive = np.maximum(x, 0.0)
+    return 0.5 * positive * positive
+
+
+@frozen_dataclass(eq=False)
+class Composition:
+    """The layers of a scene, prepared for rendering."""
+
+    camera: Camera
+    boards: tuple[BoardLayer, ...]
+    occluders: tuple[Occluder, ...]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Composition:
+        """Make the layers of a scene."""
+        boards = tuple(BoardLayer.of(scene, target) for target in scene.targets)
+        return cls(scene.camera, boards, scene.occluders)
+
+    def light(
+        self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
+    ) -> tuple[Array, NDArray[np.int8]]:
+        """Mean reflectance of cells (N,) and the number of edges in each; see `BoardLayer.cover`.
+
+        `behind` (N,) is the reflectance of the background.
+        """
+        covers = [occluder.cover(rays, cell, slack) for occluder in self.occluders]
+        covers += [board.cover(rays, cell, slack) for board in self.boards]
+        edges = np.zeros(len(behind), dtype=np.int8)
+        light, open_share = np.zeros(len(behind)), np.ones(len(behind))
+        if not covers:
+            return behind.copy(), edges
+        for cover in covers:
+            edges += cover.edges
+        alphas, lights = np.stack([c.alpha for c in covers]), np.stack([c.light for c in covers])
+        if len(self.boards) > 1:
+            order = np.argsort([c.depth for c in covers], axis=0, kind="stable")
+            alphas, lights = (np.take_along_axis(x, order, axis=0) for x in (alphas, lights))
+        for alpha, own in zip(alphas, lights, strict=True):
+            # Layers are taken to cover different parts of the cell, so planes leave no gap at their fold.
+            taken = np.minimum(alpha, open_share)
+            light += own * np.divide(taken, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+            open_share -= taken
+        return light + open_share * behind, edges
+
+    def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays]:
+        """Reflectance at the centres of pixels (N,) if they have no edges, and which pixels have edges."""
+        rays = self.camera.rays(u, v)
+        light, edges = self.light(rays, behind, 1.0, _PIXEL_SLACK)
+        return light, edges > 0, rays
+
+    def cells(self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, parts: int) -> Array:
+        """Mean reflectance of parts x parts cells of pixels (N,) with edges; ``[pixel, v, u]``.
+
+        `start` are the slopes (x, y) of the rays of their centres.
+        """
+        n = len(u)
+        light, edges, rays = self._cut(u, v, start, behind, 1.0, parts)
+        crowded = np.flatnonzero(edges > 1)
+        if crowded.size:
+            from_rays = rays.x[crowded], rays.y[crowded]
+            ground = np.repeat(behind, parts * parts)[crowded]
+            finer, _, _ = self._cut(rays.u[crowded], rays.v[crowded], from_rays, ground, 1.0 / parts, _FINEST)
+            light[crowded] = finer.reshape(len(crowded), -1).mean(axis=1)
+        return light.reshape(n, parts, parts)
+
+    def _cut(
+        self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, side: float, parts: int
+    ) -> tuple[Array, NDArray[np.int8], Rays]:
+        """Light of the parts x parts cells of squares with a given side, as flat arrays."""
+        offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * side
+        shape = (len(u), parts, parts)
+        cell_u = np.broadcast_to(u[:, None, None] + offsets, shape).reshape(-1)
+        cell_v = np.broadcast_to(v[:, None, None] + offsets[:, None], shape).reshape(-1)
+        count = parts * parts
+        rays = self.camera.rays(cell_u, cell_v, (np.repeat(start[0], count), np.repeat(start[1], count)))
+        light, edges = self.light(rays, np.repeat(behind, count), side / parts)
+        return light, edges, rays

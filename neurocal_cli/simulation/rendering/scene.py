@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import field
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
@@ -19,7 +20,6 @@ from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import Cover
 
 
 @frozen_dataclass
@@ -39,28 +39,16 @@ class Sides:
 
 @frozen_dataclass
 class Target:
-    """A printed chessboard.
+    """A printed chessboard."""
 
-    Parameters
-    ----------
-    plane : Plane
-        Its inner vertices.
-    black, white : float
-        Reflectances of the ink and of the paper.
-    first_black : bool
-        Whether the square beyond vertex (0, 0), towards growing x and y, is black.
-    reach : Sides [squares]
-        Extent of the pattern beyond the outer vertices; 1 is a whole square, and 1/2 on both planes of a fold
-        makes squares across the fold.
-    margin : Sides [squares]
-        White paper beyond the pattern; 0 if the pattern ends at the paper's edge or at a fold.
-    """
-
-    plane: Plane
-    black: float = 30 / 255
-    white: float = 226 / 255
-    first_black: bool = True
+    plane: Plane  # its inner vertices
+    black: float = 30 / 255  # reflectance of the ink
+    white: float = 226 / 255  # reflectance of the paper
+    first_black: bool = True  # whether the square beyond vertex (0, 0), towards growing x and y, is black
+    # Extent of the pattern beyond the outer vertices; 1 is a whole square, and 1/2 on both planes of a fold
+    # makes squares across the fold.
     reach: Sides = field(default_factory=Sides)
+    # White paper beyond the pattern; 0 if the pattern ends at the paper's edge or at a fold.
     margin: Sides = field(default_factory=lambda: Sides.all(0.5))
 
     def __post_init__(self) -> None:
@@ -82,6 +70,15 @@ class Target:
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 
 
+class Cover(NamedTuple):
+    """Part of each cell that a layer covers."""
+
+    alpha: Array  # covered share of the cell
+    light: Array  # reflectance, integrated over the covered share
+    depth: Array  # [world unit] along the camera's axis; infinite if nothing is covered
+    edges: NDArray[np.int8]  # number of edges in the cell
+
+
 class Occluder(Protocol):
     """An object in front of all boards."""
 
@@ -91,15 +88,9 @@ class Occluder(Protocol):
 
 @frozen_dataclass
 class Background:
-    """Background of the boards, uniform within each pixel before the blur.
+    """Background of the boards, uniform within each pixel before the blur."""
 
-    Parameters
-    ----------
-    level : float
-        Reflectance.
-    """
-
-    level: float = 0.45
+    level: float = 0.45  # reflectance
 
     def image(self, size: tuple[int, int], pad: int) -> Array:
         """Reflectance of the pixels of an image and of a border around it; (H + 2 pad, W + 2 pad) array."""
@@ -125,26 +116,13 @@ class Illumination:
 
 @frozen_dataclass
 class Sensor:
-    """Model of the sensor.
+    """Model of the sensor: signal = gain radiance + offset, and image = signal^(1 / response)."""
 
-    Parameters
-    ----------
-    response : float or "srgb"
-        The image is signal^(1 / response), so 1 is linear; or it follows the sRGB curve.
-    gain, offset : float
-        signal = gain radiance + offset, before the response.
-    read_noise : float [DN of 8 bits, 1/255 of full scale]
-        Standard deviation of Gaussian noise, after the response.
-    full_well : float, optional [electrons]
-        Electrons at full scale; if given, the signal has Poisson noise.
-    bits : 8 or 16
-    """
-
-    response: float | Literal["srgb"] = 1.0
+    response: float | Literal["srgb"] = 1.0  # 1 is linear
     gain: float = 1.0
     offset: float = 0.0
-    read_noise: float = 2.0
-    full_well: float | None = None
+    read_noise: float = 2.0  # [DN of 8 bits, 1/255 of full scale] standard deviation, after the response
+    full_well: float | None = None  # electrons at full scale; if given, the signal has Poisson noise
     bits: Literal[8, 16] = 8
 
     def __post_init__(self) -> None:
@@ -163,39 +141,18 @@ class Sensor:
 
 @frozen_dataclass
 class Scene:
-    """Everything that determines a picture except its noise.
+    """Everything that determines a picture except its noise."""
 
-    Parameters
-    ----------
-    camera : Camera
-        With the image size. Other classes need only `rays`, `project` and `sees`.
-    pose : Pose
-        World to camera.
-    targets : tuple of Target
-        If they overlap in the image, the nearer one hides the other.
-    background : Background
-    occluders : tuple of Occluder
-        The first is in front.
-    illumination : Illumination
-    psf : float [px]
-        Standard deviation of the Gaussian blur, without the pixel's box.
-    sensor : Sensor
-    unit : str
-        Of the world coordinates.
-    circle : callable, optional
-        Applies the image circle of a fisheye to the (height, width) light.
-    """
-
-    camera: Camera
-    pose: Pose
-    targets: tuple[Target, ...] = ()
+    camera: Camera  # with the image size; other classes need only `rays`, `project` and `sees`
+    pose: Pose  # world to camera
+    targets: tuple[Target, ...] = ()  # if they overlap in the image, the nearer one hides the other
     background: Background = field(default_factory=Background)
-    occluders: tuple[Occluder, ...] = ()
+    occluders: tuple[Occluder, ...] = ()  # the first is in front
     illumination: Illumination = field(default_factory=Illumination)
-    psf: float = 0.8
+    psf: float = 0.8  # [px] standard deviation of the Gaussian blur, without the pixel's box
     sensor: Sensor = field(default_factory=Sensor)
-    unit: str = "mm"
-    circle: Callable[[Array], Array] | None = None
+    unit: str = "mm"  # of the world coordinates
+    circle: Callable[[Array], Array] | None = None  # applies the image circle of a fisheye to the light
 
     def __post_init__(self) -> None:
         if not 0 <= self.psf <= 50:

@@ -19,56 +19,26 @@ _STEP = 1e-4  # squares; step of the differences that give directions in the ima
 
 @frozen_dataclass(eq=False)
 class PlaneTruth:
-    """Points of a plane in the picture.
-
-    Attributes
-    ----------
-    plane : Plane
-    vertices : (rows, cols, 2) array [px]
-        Exact positions; NaN if the camera cannot project them.
-    vertex_ids : tuple of rows x cols str
-        Row by row.
-    vertices_visible : (rows, cols) bool array
-        Whether the vertex is in front of the camera, in the image and not hidden, with a clearance.
-    midpoints : (N, 2) array [px]
-        Projections of the mid-points in space, in the order of `Plane.midpoint_grid`.
-    midpoint_ids : tuple of N str
-    midpoints_visible : (N,) bool array
-    edges_visible : (N,) bool array
-        Whether the mid-point, both ends and both quarter points are visible.
-    ends : (N, 2) int array
-        Flat indices of the edge's ends among the vertices.
-    normals : (N, 2) array
-        Unit normals of the edges in the image, towards growing y_axis for ``h``, x_axis for ``v``.
-    lengths : (N,) array [px]
-        Distances between the ends of the edges.
-    polarity : (N,) int array
-        +1 if the square on the normal's side is white, -1 if it is black.
-    """
+    """Points of a plane in the picture: its vertices, and the N mid-points of its edges."""
 
     plane: Plane
-    vertices: Array
-    vertex_ids: tuple[str, ...]
-    vertices_visible: Mask
+    vertices: Array  # (rows, cols, 2) [px] exact positions; NaN if the camera cannot project them
+    vertex_ids: tuple[str, ...]  # row by row
+    vertices_visible: Mask  # in front of the camera, in the image and not hidden, with a clearance
+    # (N, 2) [px] projections of the mid-points in space, in the order of `Plane.midpoint_grid`
     midpoints: Array
     midpoint_ids: tuple[str, ...]
     midpoints_visible: Mask
-    edges_visible: Mask
-    ends: NDArray[np.intp]
-    normals: Array
-    lengths: Array
-    polarity: NDArray[np.int64]
+    edges_visible: Mask  # whether the mid-point, both ends and both quarter points are visible
+    ends: NDArray[np.intp]  # (N, 2) flat indices of the edge's ends among the vertices
+    normals: Array  # (N, 2) unit normals in the image, towards growing y_axis for `h`, x_axis for `v`
+    lengths: Array  # (N,) [px] distances between the ends of the edges
+    polarity: NDArray[np.int64]  # (N,) +1 if the square on the normal's side is white, -1 if it is black
 
 
 @frozen_dataclass(eq=False)
 class Truth:
-    """Ground truth of a picture.
-
-    Attributes
-    ----------
-    planes : tuple of PlaneTruth
-        In the order of the scene's targets.
-    """
+    """Ground truth of a picture, in the order of the scene's targets."""
 
     planes: tuple[PlaneTruth, ...]
 
@@ -76,12 +46,8 @@ class Truth:
 def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
     """Compute the exact positions of all points, and which of them are visible.
 
-    Parameters
-    ----------
-    scene : Scene
-    clearance : float, optional [px]
-        A point is visible if nothing hides its plane within this distance; by default three times the blur
-        including the pixel.
+    A point is visible if nothing hides its plane within the `clearance` [px]; by default three times the blur
+    including the pixel.
     """
     sight = _Sight(scene, 3 * scene.sigma_t if clearance is None else clearance)
     return Truth(tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets))))
