@@ -89,33 +89,14 @@ class Plane:
         return np.cross(self.x_axis, self.y_axis)
 
     def at(self, grid: ArrayLike) -> Array:
-        """World coordinates of grid coordinates, (0, 0) being the first vertex and 1 a square.
-
-        Parameters
-        ----------
-        grid : (..., 2) array
-            Along x_axis and y_axis, in squares.
-
-        Returns
-        -------
-        world : (..., 3) array [world unit]
-        """
+        """World coordinates (..., 3) of places (..., 2) along the axes, in squares from the first vertex."""
         lengths = self.square * np.asarray(grid, dtype=float)
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
 
     def truly_at(self, grid: ArrayLike) -> Array:
-        """True world coordinates: as measured, and interpolated smoothly in between.
+        """True world coordinates (N, 3) of places (N, 2) [squares]: as measured, and smooth in between.
 
         A thin-plate spline through the measured points of the plane.
-
-        Parameters
-        ----------
-        grid : (N, 2) array
-            Along x_axis and y_axis, in squares.
-
-        Returns
-        -------
-        world : (N, 3) array [world unit]
         """
         world = self.at(grid)
         if not self.measured:
@@ -141,13 +122,9 @@ class Plane:
         return tuple(f"{self.prefix}{c}:{r}" for r in range(self.rows) for c in range(self.cols))
 
     def midpoint_grid(self) -> Array:
-        """Grid coordinates of the mid-points, all of ``h`` row by row and then all of ``v``.
+        """Grid coordinates (N, 2) [squares] of the mid-points, all of ``h`` row by row and then all of ``v``.
 
-        Returns
-        -------
-        grid : (N, 2) array [squares]
-            (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``;
-            N = (cols - 1) rows + cols (rows - 1).
+        (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``; N = (cols - 1) rows + cols (rows - 1).
         """
         c, r = np.meshgrid(np.arange(self.cols - 1) + 0.5, np.arange(self.rows))
         along_x = np.stack([c, r], axis=-1).reshape(-1, 2)

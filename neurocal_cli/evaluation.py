@@ -168,13 +168,7 @@ def evaluate_camera(
 
 
 def refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
-    """Refuse points of images of another size than the camera's.
-
-    Raises
-    ------
-    InputError
-        It names both sizes.
-    """
+    """Refuse points of images of another size than the camera's, with an InputError."""
     here, there = points.image_size, calibration.image_size
     if here is not None and there is not None and here != there:
         raise InputError(

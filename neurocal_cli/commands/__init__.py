@@ -46,10 +46,7 @@ _SUMMARIES = {
 class _LazyGroup(click.Group):
     """A group that imports a command's module only when the command is used.
 
-    Parameters
-    ----------
-    summaries : dict
-        Summary of each command for ``--help``; None for a hidden one.
+    `summaries` has the summary of each command for ``--help``; None for a hidden one.
     """
 
     def __init__(self, *args: Any, summaries: Mapping[str, str | None], **kwargs: Any) -> None:

@@ -17,13 +17,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
-    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `given_board`.
-
-    Parameters
-    ----------
-    unit_help, unit_default : str
-        Help and default of ``--unit``.
-    """
+    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `given_board`."""
 
     def add(f: F) -> F:
         for option in reversed(
@@ -53,15 +47,7 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
 def given_board(
     path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
 ) -> Board | None:
-    """Read the board; None if no option describes one.
-
-    Raises
-    ------
-    UsageError
-        A file and numbers are given, or only some of the numbers, or a unit that no file can hold.
-    FormatError
-        The file is not a board file.
-    """
+    """Read the board; None if no option describes one, a UsageError if they contradict each other."""
     from neurocal_cli.board import Board
 
     check_unit(unit)
@@ -84,11 +70,6 @@ def given_board(
 
 
 def check_unit(unit: str | None) -> None:
-    """Refuse a unit that cannot be stored in a file.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a unit that cannot be stored in a file, with a UsageError."""
     if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
         raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")

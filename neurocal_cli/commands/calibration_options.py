@@ -42,12 +42,7 @@ class Estimation:
     target: str
 
     def check(self) -> None:
-        """Refuse options that contradict each other, before any file is read.
-
-        Raises
-        ------
-        UsageError
-        """
+        """Refuse options that contradict each other, before any file is read, with a UsageError."""
         for name, option, type_ in (
             (self.image_center, "--image-center", "2"),
             (self.intrinsics, "--intrinsics", "3"),
@@ -83,12 +78,8 @@ class Estimation:
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
         """Read the given files; return the points and the library's keyword arguments.
 
-        Raises
-        ------
-        InputError
-            The given camera cannot be used with these points.
-        UsageError
-            Type 2 has no image centre.
+        An InputError says that the given camera cannot be used with these points, a UsageError that type 2
+        has no image centre.
         """
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):

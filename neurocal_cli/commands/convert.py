@@ -226,13 +226,7 @@ def _write_points(points: Correspondences, target: str, output: str) -> dict[str
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
-    """Add values that the file lacks.
-
-    Raises
-    ------
-    InputError
-        The file has another value.
-    """
+    """Add values that the file lacks; an InputError if it has another value."""
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")

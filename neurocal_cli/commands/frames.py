@@ -24,11 +24,8 @@ _PAUSE = 0.3  # seconds between two checks; a file that is still being copied gr
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
     """Replace each video by its frames that are worth measuring.
 
-    Yields
-    ------
-    paths : tuple of str
-    folder : str
-        Temporary folder of the frames, with a separator, to be cut from messages; empty without videos.
+    Yields the paths, and the temporary folder of the frames, with a separator, to be cut from messages; empty
+    without videos.
     """
     from neurocal_cli.io.video import is_video
 
@@ -68,12 +65,7 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
 
 
 def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
-    """Leave out boards in images whose size differs from the most common one; none if two sizes tie.
-
-    Parameters
-    ----------
-    outcomes : list of (name, Outcome)
-    """
+    """Leave out boards in images whose size differs from the most common one; none if two sizes tie."""
     sizes = Counter(outcome.detection.image_size for _, outcome in outcomes if outcome.detection is not None)
     counts = [count for _, count in sizes.most_common(2)]
     if len(counts) < 2 or counts[0] == counts[1]:
@@ -95,18 +87,8 @@ def watch_for_images(
 ) -> list[tuple[str, Outcome]]:
     """Detect boards in images as they arrive, until a timeout or an interrupt by the user.
 
-    Parameters
-    ----------
-    find : callable
-        Returns the paths of the present images.
-    options : DetectionOptions
-    seconds : float
-        Time to wait for another image.
-
-    Returns
-    -------
-    outcomes : list of (path, Outcome)
-        In the order in which the images arrived.
+    `find` returns the paths of the present images; `seconds` is the time to wait for another one. Returns
+    paths and outcomes in the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
 

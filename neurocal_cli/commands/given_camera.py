@@ -26,13 +26,7 @@ def given_points(names: str | Sequence[str]) -> Correspondences:
 
 
 def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
-    """Read a known camera; give the points its image size if they have none.
-
-    Raises
-    ------
-    InputError
-        The camera has another image size.
-    """
+    """Read a known camera of the points' image size; give the points its image size if they have none."""
     from neurocal_cli.io.exchange.reading import read_intrinsics
 
     camera = read_intrinsics(path)
@@ -53,10 +47,7 @@ def calibration_or_camera(
 ) -> tuple[Calibration | Camera, Correspondences | None]:
     """Read a calibration or, for use with points, any camera file; both may hold the image size.
 
-    Raises
-    ------
-    FormatError
-        The file is neither; the message says why it is no calibration.
+    If the file is neither, the error says why it is no calibration.
     """
     from neurocal_cli.io.calibration_yaml import read_calibration
 

@@ -75,10 +75,7 @@ def man(ctx: click.Context, directory: str) -> None:
 
 
 def man_pages(root: click.Command) -> dict[str, str]:
-    """File names and texts of the man pages of a command and its subcommands.
-
-    Hidden commands have none.
-    """
+    """File names and texts of the man pages of a command and its subcommands that are not hidden."""
     contexts = list(_walk(click.Context(root, info_name="neurocal", **root.context_settings)))
     names = [_page_name(ctx) for ctx in contexts]
     return {f"{_page_name(ctx)}.1": _page(ctx, names) for ctx in contexts}

@@ -79,13 +79,7 @@ class Command(click.Command):
 
 
 class FiniteNumber(FloatParamType):
-    """A finite number: neither nan nor infinite.
-
-    Parameters
-    ----------
-    positive : bool
-        Whether it must be greater than 0.
-    """
+    """A finite number: neither nan nor infinite, and, if `positive`, greater than 0."""
 
     def __init__(self, positive: bool = False) -> None:
         self._positive = positive
@@ -187,14 +181,7 @@ def typed(*names: str) -> list[str]:
 
 
 def note_unused(why: str, *names: str) -> None:
-    """Say which parameters on the command line change nothing.
-
-    Parameters
-    ----------
-    why : str
-        The rest of the sentence "--name has no effect".
-    *names : str
-    """
+    """Say which parameters on the command line change nothing: "--name has no effect", and `why`."""
     note(f"{option} has no effect {why}" for option in typed(*names))
 
 
@@ -290,12 +277,8 @@ def plot(what: str) -> Callable[[F], F]:
 def check_plot(plot: str | None, output: str | None = None) -> None:
     """Refuse a picture that cannot be drawn, before any work is done.
 
-    Raises
-    ------
-    UsageError
-        The name has no ending of a picture, or is that of the output.
-    NeurocalError
-        matplotlib is not installed.
+    A UsageError says that the name has no ending of a picture, or is that of the output; a NeurocalError,
+    that matplotlib is not installed.
     """
     if plot is None:
         return

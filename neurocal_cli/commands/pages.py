@@ -53,14 +53,7 @@ def check_plots(plots: Plots, output: str | None = None) -> None:
 
 
 def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
-    """Draw and write all pictures.
-
-    Parameters
-    ----------
-    plots : Plots
-    draw : callable
-        Gives a picture of a kind ("png") and of a panel.
-    """
+    """Draw and write all pictures; `draw` gives a picture of a kind ("png") and of a panel."""
     for panel, file in plots:
         write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
 

@@ -9,15 +9,7 @@ from neurocal_cli.errors import NeurocalError, UsageError
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
-    """Refuse outputs that cannot be written, or that are one of the inputs.
-
-    Raises
-    ------
-    UsageError
-        An output is an input, or two outputs are the same file.
-    NeurocalError
-        An output cannot be written.
-    """
+    """Refuse outputs that cannot be written, or that are one of the inputs; see `check_places`."""
     from neurocal_cli.io.outputs import held_back
     from neurocal_cli.io.writing import check_places
 
@@ -28,15 +20,7 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
 
 
 def check_folder(option: str, folder: str) -> None:
-    """Refuse a folder that cannot be made or written to.
-
-    Raises
-    ------
-    UsageError
-        It is standard output or a file.
-    NeurocalError
-        It cannot be made.
-    """
+    """Refuse a folder that is standard output or a file, or cannot be made or written to."""
     if folder == "-":
         raise UsageError(f"{option} writes files, which cannot go to standard output; give a folder")
     if os.path.exists(folder) and not os.path.isdir(folder):
@@ -55,12 +39,7 @@ def check_one_stdin(*names: str | None) -> None:
 
 
 def check_summary(as_json: bool, *outputs: str | None) -> None:
-    """Refuse a summary and a result on one stream.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a summary and a result on one stream, with a UsageError."""
     from neurocal_cli.io.writing import STDOUT_NAMES
 
     if as_json and not STDOUT_NAMES.isdisjoint(outputs):

@@ -180,24 +180,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:
     """Process each item; if there are several, those that fail are reported and left out.
 
-    Parameters
-    ----------
-    items : sequence
-    work : callable
-    what, done : str
-        Words for the items and for what is done to them, for messages.
-
-    Returns
-    -------
-    failed : dict of str by int
-        Reason of each failure, by the item's index.
-
-    Raises
-    ------
-    InputError, FormatError
-        The only item fails.
-    NeurocalError
-        All items fail.
+    `what` and `done` are the words for the items and for what is done to them. Returns the reason of each
+    failure, by the item's index. If the only item fails, its error is raised; if all fail, a NeurocalError.
     """
     failed: dict[int, str] = {}
     with ProgressBar() as progress:

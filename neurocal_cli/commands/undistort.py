@@ -153,13 +153,7 @@ def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alp
 
 
 def _places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
-    """The output folder, if the output is one, and the output file of each input.
-
-    Raises
-    ------
-    UsageError
-        The output cannot hold several files or an image.
-    """
+    """The output folder, if the output is one, and the output file of each input."""
     if not paths:
         return None, []
     folder = _folder(paths, output)
@@ -204,20 +198,9 @@ def _name(path: str) -> str:
 def _check_distinct(
     inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
 ) -> None:
-    """Refuse to overwrite inputs, or to write two results to the same file.
+    """Refuse to overwrite inputs, or to write two results to the same file; the UsageError names the two.
 
-    Parameters
-    ----------
-    inputs : iterable of str
-    outputs, paths : sequences of str of one length
-        Output files, and the inputs from which they are made.
-    others : dict
-        Further output files by their content.
-
-    Raises
-    ------
-    UsageError
-        The message names the two files that collide.
+    `paths` are the inputs from which `outputs` are made, and `others` further output files by their content.
     """
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}

@@ -34,20 +34,10 @@ def residual_map(
     left_out: Array | None = None,
     photograph: bytes | None = None,
 ) -> str:
-    """Draw residuals as enlarged lines from their points, in an empty frame or over the photograph.
+    """Draw residuals (N, 2) [px] as enlarged lines from their pixels, also over a JPEG photograph.
 
-    Parameters
-    ----------
-    pixels, residuals : (N, 2) arrays [px]
-    size : (width, height) [px]
-    scale : float, optional
-        Enlargement of the residuals; by default their `enlargement`.
-    bold : float
-        Factor on the thickness of lines, for small drawings.
-    left_out : (M, 2) array, optional [px]
-        Points to draw as crosses.
-    photograph : bytes, optional
-        The image as a JPEG file.
+    `scale` is the enlargement of the residuals; by default their `enlargement`. `bold` is a factor on the
+    thickness of lines, for small drawings. Points `left_out` (M, 2) become crosses.
     """
     width, height = size
     scale = enlargement(residuals, size) if scale is None else scale
@@ -139,25 +129,10 @@ def error_bars(names: Sequence[str], errors: Sequence[float], overall: float) ->
 
 
 def heat_map(values: Array, size: tuple[float, float], dots: Array, unit: str, label: str) -> str:
-    """Draw values given on a grid that reaches from edge to edge, with interpolation.
+    """Draw positive values (R, C) on a grid from edge to edge, with interpolation; empty if none is finite.
 
-    Parameters
-    ----------
-    values : (R, C) array
-        Positive; nan if unknown. R and C are at least 2.
-    size : (width, height)
-        Of the area, in the unit of the dots.
-    dots : (N, 2) array
-        Places to mark.
-    unit : str
-        Of the values, for the scale below the map.
-    label : str
-        Description for screen readers.
-
-    Returns
-    -------
-    svg : str
-        Empty if no value is finite.
+    nan is unknown, and R and C are at least 2. `size` and the places `dots` (N, 2) to mark have one unit.
+    `unit` is that of the values, for the scale below the map, and `label` is for screen readers.
     """
     logarithms = np.log(np.where(values > 0, values, np.nan))
     seen = logarithms[np.isfinite(logarithms)]

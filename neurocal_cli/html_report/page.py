@@ -74,14 +74,7 @@ large.onclick=()=>large.close();
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """Make a whole page.
-
-    Parameters
-    ----------
-    title : str
-    parts : iterable of str
-        HTML in order.
-    """
+    """Make a whole page of a title and HTML parts in order."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width,initial-scale=1">\n'
@@ -143,21 +136,11 @@ def definitions(entries: Mapping[str, str]) -> str:
 
 @frozen_dataclass
 class Origin:
-    """The run that produced a result, as far as known.
+    """The run that produced a result, as far as known."""
 
-    Attributes
-    ----------
-    files : dict of str by name
-        SHA-256 of the input files; of the result's own file if the run is unknown.
-    command : str, optional
-        The command line.
-    versions : dict of str by name
-        Of the programs that computed the result.
-    """
-
-    files: Mapping[str, str]
-    command: str | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str]  # SHA-256 of the input files, or of the result's own if the run is unknown
+    command: str | None = None  # the command line
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the programs that computed the result
 
 
 def versions() -> dict[str, str]:

@@ -27,15 +27,7 @@ _SETTINGS = 25  # samples along a control
 def calibration_page(
     calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
 ) -> str:
-    """Make the page of a camera.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    origin : Origin
-    photographs : dict of bytes by view, optional
-        The images as JPEG files.
-    """
+    """Make the page of a camera, with the images of views as JPEG files, if given."""
     size = _size(calibration)
     head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
     parts = [

@@ -99,13 +99,7 @@ def _pdf(objects: list[bytes]) -> bytes:
 
 
 def board_png(sheet: Sheet, dpi: float) -> bytes:
-    """Write the sheet as a grey PNG with its resolution.
-
-    Raises
-    ------
-    InputError
-        The picture has more than 200 million pixels.
-    """
+    """Write the sheet as a grey PNG with its resolution; raise an InputError beyond 200 million pixels."""
     pixels = dpi / 25.4  # per millimetre
     width, height = round(sheet.width * pixels), round(sheet.height * pixels)
     if width * height > _MOST_PIXELS:

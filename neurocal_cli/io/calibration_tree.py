@@ -27,18 +27,7 @@ _SAME = 1e-6
 
 
 def calibration_from_field(root: Field) -> Calibration:
-    """Read a whole calibration.
-
-    Parameters
-    ----------
-    root : Field
-        The file, or the part ``left`` or ``right`` of a rig.
-
-    Raises
-    ------
-    FormatError
-        A key is missing or wrong.
-    """
+    """Read a whole calibration from a file, or from the part ``left`` or ``right`` of a rig."""
     block = neurocal_block(root)
     views = read_views(block["views"])
     fit = block["fit"]
@@ -132,13 +121,7 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
 
 
 def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
-    """Read the pose of each view of a neurocal calibration; ``-`` is stdin.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read or has no poses, or they are in another unit than `unit`.
-    """
+    """Read the pose of each view of a neurocal calibration; refuse poses in another unit than `unit`."""
     block = neurocal_block(read_tree(path))
     views, own = read_views(block["views"]), _unit(block)
     if own != unit:

@@ -40,20 +40,9 @@ _MOST_POINTS = 5000
 
 
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
-    """Text of a calibration file.
+    """Text of a calibration file, without dates and paths, so that the same calibration gives the same text.
 
-    The same calibration gives the same text, without dates and paths.
-
-    Parameters
-    ----------
-    cal : Calibration
-    by_rows : bool
-        Whether even long tables have a row for each view and point.
-
-    Raises
-    ------
-    InputError
-        A name cannot be encoded as UTF-8.
+    If `by_rows`, even long tables have a row for each view and point.
     """
     return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
 
@@ -88,13 +77,8 @@ def calibration_lines(
 ) -> Iterator[str]:
     """Lines of the file without its header and without line ends.
 
-    Parameters
-    ----------
-    cal : Calibration
-    rectified : (3, 3) and (3, 4) arrays, optional
-        Rectification and projection matrix of a camera on a rig, as ROS defines them.
-    by_rows : bool
-        See `format_calibration`.
+    `rectified` are the rectification (3, 3) and projection matrix (3, 4) of a camera on a rig, as ROS defines
+    them. See `format_calibration` for `by_rows`.
     """
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
     long = large and not by_rows and have_same_std(cal.views)

@@ -37,21 +37,10 @@ _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 
 
 def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
-    """Read a camera.
+    """Read a camera from the tree of a file.
 
-    Parameters
-    ----------
-    root : Field
-        The whole file.
-    side : str
-        Suffix of the keys of one camera of several, such as ``1`` of M1 and D1.
-    whole : bool
-        Whether the file has only this camera, so that all its keys are checked.
-
-    Raises
-    ------
-    InputError, FormatError
-        There is no valid camera matrix, or the distortion cannot be read.
+    `side` is the suffix of the keys of one camera of several, such as ``1`` of M1 and D1. If the file has
+    only this camera (`whole`), all its keys are checked.
     """
     if "projection" in root and "f" in root:
         raise InputError("is the file of an undistorted panorama; give the camera of the original images")
@@ -67,13 +56,7 @@ def has_matrix(root: Field, side: str = "") -> bool:
 
 
 def boofcv_camera(root: Field) -> Camera:
-    """Read a camera of BoofCV.
-
-    Raises
-    ------
-    InputError, FormatError
-        The distortion model is unknown.
-    """
+    """Read a camera of BoofCV."""
     pinhole = root["pinhole"]
     model = root.get("model", "").text()
     omni = model == "omnidirectional_universal"
@@ -102,14 +85,7 @@ def boofcv_camera(root: Field) -> Camera:
 
 
 def matrix_data(field: Field, length: int) -> Array:
-    """Read a matrix in row order: as rows, cols and data, as nested lists or as one list.
-
-    Parameters
-    ----------
-    field : Field
-    length : int
-        Required number of entries, 9 for a 3 x 3 matrix; -1 allows any.
-    """
+    """Read a matrix in row order: rows, cols and data, nested lists or a list; any `length` if it is -1."""
     if isinstance(field.value, dict):
         data = field["data"].array(-1)
         rows, cols = field["rows"].integer(), field["cols"].integer()

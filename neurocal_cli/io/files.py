@@ -38,23 +38,7 @@ def repeatable_stdin() -> Iterator[None]:
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Read a whole file, or stdin for ``-``.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    data : bytes
-    source : str
-        Name for messages; ``<stdin>`` for stdin.
-
-    Raises
-    ------
-    FormatError
-        The file is missing, is a folder, or may not be read.
-    """
+    """Read a whole file, or stdin for ``-``, and its name for messages."""
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
@@ -149,22 +133,9 @@ def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
 
 
 def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
-    """Decode UTF-8, with or without a byte order mark.
+    """Decode UTF-8, with or without a byte order mark; `source` is the name for messages.
 
-    Parameters
-    ----------
-    data : bytes
-    source : str
-        Name for messages.
-    kind : str
-        Expected kind of file, for the message about a binary file.
-    instead : str
-        Appended to that message.
-
-    Raises
-    ------
-    FormatError
-        The data are UTF-16 or UTF-32 text, binary, or not UTF-8.
+    The message about a binary file names the expected `kind` of file, and ends with `instead`.
     """
     if data.isascii() and b"\0" not in data:
         return data.decode("ascii")

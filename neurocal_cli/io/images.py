@@ -42,21 +42,11 @@ _ONE_AT_A_TIME = threading.Lock()  # a process has only one stderr
 
 @frozen_dataclass(eq=False)
 class Image:
-    """A grey image.
+    """A grey image."""
 
-    Attributes
-    ----------
-    grey : (height, width) uint8 or uint16 array [DN]
-        From colours as in OpenCV: 0.299 R + 0.587 G + 0.114 B.
-    source : str
-        Name for messages.
-    notes : tuple of str
-        Changes of the pixels that a user may not expect.
-    """
-
-    grey: Pixels
-    source: str = "image"
-    notes: tuple[str, ...] = ()
+    grey: Pixels  # (height, width) [DN]; of colours 0.299 R + 0.587 G + 0.114 B, as in OpenCV
+    source: str = "image"  # name for messages
+    notes: tuple[str, ...] = ()  # changes of the pixels that a user may not expect
 
     @property
     def size(self) -> tuple[int, int]:
@@ -84,17 +74,7 @@ def read_image(path: str | Path) -> Image:
 
 
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
-    """Read an image with its colours; otherwise like `read_image`.
-
-    Returns
-    -------
-    pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
-        Colours in the order red, green, blue; transparency is dropped.
-    source : str
-        Name for messages.
-    notes : tuple of str
-        Changes of the pixels that a user may not expect.
-    """
+    """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
     data, source = read_bytes(path)
     pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return _reversed(pixels), source, notes
@@ -126,18 +106,7 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Encode a picture as PNG.
-
-    Parameters
-    ----------
-    picture : (height, width) or (height, width, 3) uint8 array
-        Colours in the order red, green, blue.
-
-    Raises
-    ------
-    InputError
-        The picture cannot be written as PNG.
-    """
+    """Encode a grey (height, width) or colour (height, width, 3; R, G, B) picture as PNG."""
     return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
 
 
@@ -166,21 +135,10 @@ def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
 
 
 def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Encode a picture as an image file.
+    """Encode a grey or colour (R, G, B) picture as an image file with this extension.
 
-    Parameters
-    ----------
-    pixels : (height, width) or (height, width, 3) uint8 or uint16 array
-        Colours in the order red, green, blue.
-    ending : str
-        Extension of the file: .png, .tif and so on.
-    quality : int
-        Of a JPEG file, up to 100.
-
-    Raises
-    ------
-    InputError
-        This kind of file cannot hold such a picture.
+    `quality` is that of JPEG, up to 100. An InputError says that this kind of file cannot hold such a
+    picture.
     """
     if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
         raise InputError(

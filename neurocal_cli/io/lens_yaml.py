@@ -32,13 +32,7 @@ _MOST_UNITS = 1000
 
 
 def format_lens(lens: ZoomLens) -> str:
-    """Text of a lens file.
-
-    Raises
-    ------
-    InputError
-        A unit or reason cannot be encoded as UTF-8.
-    """
+    """Text of a lens file."""
     lines = [f"{_BLOCK}:"]
     parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
     for part in (*parts, target_lines(lens.target, long=False), _coupling_lines(lens)):

@@ -28,22 +28,8 @@ _MOST_BYTES = 500_000_000  # unpacked
 def read_variables(data: bytes, source: str) -> dict[str, Any]:
     """Read the variables of a file.
 
-    Parameters
-    ----------
-    data : bytes
-    source : str
-        Name for messages.
-
-    Returns
-    -------
-    dict
-        Arrays of numbers, strings, lists for cells, dictionaries for structs. Objects of MATLAB's classes are
-        left out, because only MATLAB can read them.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged.
+    They are arrays of numbers, strings, lists for cells, and dictionaries for structs. Objects of MATLAB's
+    classes are left out, because only MATLAB can read them.
     """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:

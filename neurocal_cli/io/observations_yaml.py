@@ -109,22 +109,7 @@ def read_observations(
     image_center: tuple[float, float] | None,
     none: bool,
 ) -> Correspondences:
-    """Read the block ``observations`` in either form.
-
-    Parameters
-    ----------
-    observations : Field
-    unit : str
-    image_size : (width, height) or None [px]
-    image_center : (u0, v0) or None [px]
-    none : bool
-        Whether the block may be empty.
-
-    Raises
-    ------
-    FormatError
-        The table does not have the written form.
-    """
+    """Read the block ``observations`` in either form; it may be empty if `none`."""
     if "places" in observations:
         columns, stands = _long_columns(observations), f"{observations.path}.views"
     else:

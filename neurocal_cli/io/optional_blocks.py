@@ -35,13 +35,7 @@ def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
 
 
 def read_verdict(field: Field) -> Verdict:
-    """Read the block ``verdict`` back.
-
-    Raises
-    ------
-    FormatError
-        A key is missing or wrong.
-    """
+    """Read the block ``verdict`` back."""
     return Verdict(
         field["word"].text(),
         tuple(field["reasons"].texts()),
@@ -75,13 +69,7 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
 
 
 def read_rejected(field: Field, unit: str) -> Rejected:
-    """Read the block ``rejected`` back.
-
-    Raises
-    ------
-    FormatError
-        The table does not have the written form.
-    """
+    """Read the block ``rejected`` back."""
     if field.value is None:
         return Rejected()
     views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
@@ -133,13 +121,7 @@ def _bends_lines(bends: Bends, long: bool) -> Iterator[str]:
 
 
 def read_target(field: Field) -> Target:
-    """Read the block ``target`` back.
-
-    Raises
-    ------
-    FormatError
-        The table does not have the written form.
-    """
+    """Read the block ``target`` back."""
     columns = read_table(field, frozenset(("point",)))
     stated = _STATED if set(_STATED) <= set(columns) else ()
     if set(columns) - {"point", *stated} != {"plane", *_TARGET}:

@@ -70,13 +70,7 @@ def write_points(points: Correspondences, path: str | Path) -> None:
 
 
 def format_points(points: Correspondences) -> str:
-    """Points as the text of a CSV file.
-
-    Raises
-    ------
-    InputError
-        A label is empty or has a line break, so it cannot be written to CSV.
-    """
+    """Points as the text of a CSV file; an InputError if a label is empty or has a line break."""
     labels = {}
     if points.view is not None:
         quoted = [_quoted(label, "view") for label in points.view_names]

@@ -18,20 +18,7 @@ SETTINGS = ("zoom", "focus")
 
 
 def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
-    """Join the tables of several files.
-
-    Parameters
-    ----------
-    tables : list of Table
-        At least one.
-    notes : list of str
-        Remarks about ignored columns are appended.
-
-    Raises
-    ------
-    FormatError, InputError
-        The tables contradict each other or themselves.
-    """
+    """Join the tables of one or several files, and append remarks about ignored columns to `notes`."""
     for table in tables:
         table.note_unknown(notes)
     _check_settings(tables, notes)

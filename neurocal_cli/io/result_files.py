@@ -26,27 +26,11 @@ if TYPE_CHECKING:
 def write_result(
     result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:
-    """Write a calibration or a rig, whole or not at all; ``-`` is stdout.
+    """Write a calibration or a rig, whole or not at all.
 
-    Parameters
-    ----------
-    result : Calibration or Rig
-    path : str or Path
-        ``.json`` gives JSON, ``.xml`` gives XML; all other extensions give YAML.
-    lean : bool
-        Whether points, poses and the record of the network are left out.
-    alpha : float, optional
-        Of a rig's rectification, see `rectify`.
-
-    Returns
-    -------
-    losses : tuple of str
-        What the file cannot represent exactly, such as skew in XML.
-
-    Raises
-    ------
-    InputError
-        An XML file is wanted, but OpenCV does not have the camera's distortion model.
+    The extension ``.json`` gives JSON, ``.xml`` gives XML; all others give YAML. A `lean` file lacks points,
+    poses and the record of the network. `alpha` is that of a rig's rectification, see `rectify`. Returns what
+    the file cannot represent exactly, such as skew in XML.
     """
     if lean:
         result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)

@@ -31,16 +31,7 @@ _SAME = 1e-6
 
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
-    """Text of a rig file; the same rig gives the same text.
-
-    Parameters
-    ----------
-    rig : Rig
-    alpha : float, optional
-        Of the rectification, see `rectify`.
-    by_rows : bool
-        Whether even long tables have a row for each view and point.
-    """
+    """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
     return "\n".join([*HEADER, *_rig_lines(rig, rectify(rig, alpha), by_rows), ""])
 
 
@@ -55,13 +46,7 @@ def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
 
 
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
-    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres.
-
-    Raises
-    ------
-    InputError
-        The unit is not a known length, or the images have no common known size.
-    """
+    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
     if rig.unit not in METRES:
         raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
     rectified = rectify(rig, alpha)

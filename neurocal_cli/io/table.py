@@ -43,28 +43,14 @@ _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
 
 @frozen_dataclass(eq=False)
 class Table:
-    """Columns of one file, or of a part of it.
+    """Columns of one file, or of a part of it."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the file for messages.
-    numbers : dict of (N,) arrays by column name
-    labels : dict of (N,) str arrays by column name
-    lines : (N,) int array
-        Line number of each row.
-    metadata : Metadata
-        From the lines that begin with ``#``.
-    unknown : tuple of str
-        Names of ignored columns.
-    """
-
-    source: str
-    numbers: dict[str, Array]
-    labels: dict[str, NDArray[Any]]
-    lines: NDArray[np.int64]
-    metadata: Metadata
-    unknown: tuple[str, ...]
+    source: str  # name of the file, for messages
+    numbers: dict[str, Array]  # (N,) arrays by column name
+    labels: dict[str, NDArray[Any]]  # (N,) arrays of str
+    lines: NDArray[np.int64]  # line number of each row
+    metadata: Metadata  # from the lines that begin with #
+    unknown: tuple[str, ...]  # names of ignored columns
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -86,20 +72,7 @@ class Table:
 
 
 def read_table(path: str | Path, schema: Schema) -> Table:
-    """Read one file.
-
-    Parameters
-    ----------
-    path : str or Path
-        ``-`` is stdin.
-    schema : Schema
-        Known columns.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or a line of it is wrong; the message names the line.
-    """
+    """Read one file."""
     return parse_table(*read_bytes(path), schema)
 
 
@@ -116,18 +89,8 @@ def parse_table(data: bytes, source: str, schema: Schema) -> Table:
 def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Iterator[Table]:
     """Read a file that need not fit into memory, as tables with some of its rows each; see `read_table`.
 
-    Parameters
-    ----------
-    path : str or Path
-        ``-`` is stdin.
-    schema : Schema
-    block : int
-        Bytes to read at a time; the lines above the header must fit into them.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or a line of it is wrong; earlier blocks have been yielded by then.
+    It reads `block` bytes at a time, into which the lines above the header must fit. Before an error in a
+    line, earlier blocks have been yielded.
     """
     source = "<stdin>" if str(path) == "-" else one_line(path)
     layout, rows = None, False
@@ -166,14 +129,7 @@ def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Tabl
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:
     r"""Read the rows below a header by NumPy; None if NumPy may read them wrongly.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file, ``\n`` line ends.
-    source : str
-        Name for messages.
-    schema : Schema
-    layout : Layout
+    `data` is the whole file with ``\n`` line ends.
     """
     if not _is_plain(data, schema, layout):
         return None
@@ -228,13 +184,7 @@ def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
 
 
 def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) -> Table:
-    """Read the rows below a header, in any form that the format allows; see `read_in_bulk`.
-
-    Raises
-    ------
-    FormatError
-        A line is wrong; the message names the first one.
-    """
+    """Read the rows below a header, in any form that the format allows; errors name the first wrong line."""
     places = [(name, k) for k, name in enumerate(layout.names) if name in schema.known]
     columns: dict[str, list[Any]] = {name: [] for name, _ in places}
     lines: list[int] = []

@@ -30,27 +30,14 @@ _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 @frozen_dataclass
 class Schema:
-    """Columns of a kind of table.
+    """Columns of a kind of table."""
 
-    Attributes
-    ----------
-    kind : str
-        Name of the rows, in the plural.
-    required, optional : tuple of str
-    labels : frozenset of str
-        The columns that contain text; all others contain numbers.
-    instead : str
-        Advice for files of another kind, for messages.
-    headerless : tuple of str
-        Columns of a file without a header; if empty, the header is required.
-    """
-
-    kind: str
+    kind: str  # name of the rows, in the plural
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
-    labels: frozenset[str] = frozenset()
-    headerless: tuple[str, ...] = ()
-    instead: str = ""
+    labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
+    headerless: tuple[str, ...] = ()  # columns of a file without a header; if empty, the header is required
+    instead: str = ""  # advice for files of another kind
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -60,23 +47,13 @@ class Schema:
 
 @dataclass
 class Metadata:
-    """Metadata from the ``#`` lines of a file, collected line by line.
+    """Metadata from the ``#`` lines of a file, collected line by line."""
 
-    Attributes
-    ----------
-    image_size : (width, height), optional [px]
-    image_center : (u0, v0), optional [px]
-    unit : str, optional
-    distances : tuple of Distance, optional
-    misspelt : list of str
-        Remarks about lines that are nearly metadata.
-    """
-
-    image_size: tuple[int, int] | None = None
-    image_center: tuple[float, float] | None = None
+    image_size: tuple[int, int] | None = None  # px
+    image_center: tuple[float, float] | None = None  # px
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
-    misspelt: list[str] = field(default_factory=list)
+    misspelt: list[str] = field(default_factory=list)  # remarks about lines that are nearly metadata
 
     def take(self, line: str, source: str, number: int) -> None:
         """Read a ``# key: value`` line; other comments are ignored."""
@@ -140,26 +117,12 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
 
 @frozen_dataclass
 class Layout:
-    """Position of a table's rows, and how to split them.
+    """Position of a table's rows, and how to split them."""
 
-    Attributes
-    ----------
-    separator : str or None
-        None for blanks.
-    names : tuple of str
-        Names of the columns, in the file's order.
-    offset : int
-        Offset of the first byte below the header.
-    line : int
-        Number of the last line above that byte.
-    metadata : Metadata
-        From the lines above.
-    """
-
-    separator: str | None
-    names: tuple[str, ...]
-    offset: int
-    line: int
+    separator: str | None  # None for blanks
+    names: tuple[str, ...]  # of the columns, in the file's order
+    offset: int  # of the first byte below the header
+    line: int  # number of the last line above that byte
     metadata: Metadata = field(default_factory=Metadata)
 
     def unknown(self, schema: Schema) -> tuple[str, ...]:
@@ -168,18 +131,7 @@ class Layout:
 
 
 def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
-    r"""Read the metadata and the header at the top of a file.
-
-    Parameters
-    ----------
-    data : bytes
-        UTF-8 with ``\\n`` line ends.
-
-    Raises
-    ------
-    FormatError
-        The file is empty, a column is missing or appears twice, or metadata are malformed.
-    """
+    """Read the metadata and the header at the top of a file."""
     metadata = Metadata()
     comments: list[str] = []
     for number, start, end, line in _lines(data):
@@ -209,11 +161,6 @@ def split_fields(line: str, separator: str | None, source: str, number: int) -> 
     Blanks around a field are dropped unless they are inside quotes; ``""`` in quotes is a quote. The csv
     module is not used, because it would continue an unclosed quote in the next line, and keep blanks after a
     quote.
-
-    Raises
-    ------
-    FormatError
-        A quote is not closed.
     """
     line = line.strip(" \t") if separator != "\t" else line.strip(" ")
     if '"' not in line:

@@ -67,13 +67,7 @@ def table_lines(
 
 
 def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
-    """Read either form of a table as columns, each a list of values.
-
-    Raises
-    ------
-    FormatError
-        Rows or columns have different lengths.
-    """
+    """Read either form of a table as columns, each a list of values."""
     if isinstance(field["columns"].value, dict):
         table = read_columns(field["columns"], labels)
     else:
@@ -88,13 +82,7 @@ def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
 
 
 def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
-    """Read a table back: numbers (None for null), and text in the columns called `labels`.
-
-    Raises
-    ------
-    FormatError
-        A value is not a column, or columns have different lengths.
-    """
+    """Read a table back: numbers (None for null), and text in the columns called `labels`."""
     columns: dict[str, list[Any]] = {
         name: column.texts() if name in labels else read_numbers(list(column.items()))
         for name, column in field.entries().items()
@@ -115,13 +103,7 @@ def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:
-    """Read the numbers of texts, None for null; they may be infinite.
-
-    Raises
-    ------
-    FormatError
-        A text contains anything but numbers.
-    """
+    """Read the numbers of texts, None for null; they may be infinite."""
     for entry in texts:
         if not _NUMBERS(entry.text()):
             entry.fail("numbers with commas between them")
@@ -138,13 +120,7 @@ def packed_text(values: NDArray[Any]) -> str:
 
 
 def read_packed(entry: Field) -> list[float]:
-    """Read the numbers of `packed_text`; they may be infinite.
-
-    Raises
-    ------
-    FormatError
-        The text has other characters, or too few.
-    """
+    """Read the numbers of `packed_text`; they may be infinite."""
     codes = np.frombuffer(entry.text().encode("utf-32-le", "surrogatepass"), dtype="<u4")
     if len(codes) % 4 or np.any(codes >> 16 != _PRIVATE >> 16):
         entry.fail("packed numbers, four characters from U+F0000 on for each")
@@ -160,13 +136,7 @@ def join_ranges(numbers: NDArray[np.int64]) -> str:
 
 
 def read_ranges(field: Field, below: int) -> list[int]:
-    """Read ranges back.
-
-    Raises
-    ------
-    FormatError
-        The text has another form, or a number is not below the limit.
-    """
+    """Read ranges of whole numbers below a limit back."""
     text = field.text()
     if not _RANGES(text):
         field.fail("whole numbers and ranges such as 0-92")
@@ -180,15 +150,7 @@ def read_ranges(field: Field, below: int) -> list[int]:
 
 
 def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterator[str]:
-    """Lines of a key whose value has an entry for each name.
-
-    Parameters
-    ----------
-    key : str
-    names : iterable of str
-    values : iterable of str
-        As YAML flow text.
-    """
+    """Lines of a key whose value has an entry for each name; `values` are YAML flow texts."""
     names = list(names)
     pairs = zip(names, values, strict=True)
     if not names:
@@ -202,13 +164,7 @@ def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterat
 
 
 def read_named(field: Field) -> dict[str, Field]:
-    """Read either form back.
-
-    Raises
-    ------
-    FormatError
-        The value has neither form, or a name appears twice.
-    """
+    """Read either form back; no name may appear twice."""
     if isinstance(field.value, dict):
         return field.entries()
     found: dict[str, Field] = {}

@@ -18,18 +18,7 @@ _NARROWEST = 120
 def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
     """Find the image of each view: the file with its name, without folder and extension.
 
-    Parameters
-    ----------
-    views : tuple of str
-    word : str
-        A folder or a pattern, see `image_paths.find_images`.
-
-    Raises
-    ------
-    InputError
-        No view has an image there.
-    FormatError
-        The folder cannot be read or is empty.
+    `word` is a folder or a pattern, see `find_images`. An InputError says that no view has an image there.
     """
     paths = find_images([word])
     found = dict(zip(view_names(paths), paths, strict=True))
@@ -43,20 +32,9 @@ def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
 
 
 def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
-    """Encode images as small JPEG files with a limit on their total size.
+    """Encode images, by name, as small JPEG files with a limit on their total size.
 
-    Parameters
-    ----------
-    images : dict of paths by name
-    size : (width, height) or None [px]
-        Required size of all images.
-    most_bytes : int
-        Exceeded only if images of the least width take more.
-
-    Raises
-    ------
-    FormatError
-        An image cannot be read, or has another size.
+    All must have the `size` [px] if it is known. Only images of the least width may exceed the limit.
     """
     small: dict[str, NDArray[np.uint8]] = {}
     for name, path in images.items():

@@ -19,17 +19,7 @@ _NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 
 class Field:
-    """A value in a tree, with its path.
-
-    Parameters
-    ----------
-    value : object
-        As returned by `yaml_tree.parse_yaml` or a JSON parser.
-    source : str
-        Name of the file.
-    path : str
-        Keys from the root, separated by dots.
-    """
+    """A value in a tree of a file, with its path: the keys from the root, separated by dots."""
 
     __slots__ = ("path", "source", "value")
 
@@ -131,11 +121,7 @@ class Field:
     def array(self, *shape: int, unknown: bool = False) -> Array:
         """Value as an array, from nested lists of finite numbers; -1 in the shape allows any length.
 
-        Parameters
-        ----------
-        *shape : int
-        unknown : bool
-            Whether null is allowed for unknown numbers; it becomes NaN.
+        If `unknown`, null is allowed for unknown numbers and becomes NaN.
         """
         words = " x ".join("n" if s < 0 else str(s) for s in shape)
         expected = f"{words} finite numbers{' or null' * unknown}"

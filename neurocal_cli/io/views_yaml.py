@@ -82,13 +82,7 @@ def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[l
 
 
 def read_views(field: Field) -> dict[str, ViewResult]:
-    """Read the block ``views`` in either form.
-
-    Raises
-    ------
-    FormatError
-        A key is missing or wrong.
-    """
+    """Read the block ``views`` in either form."""
     if isinstance(field.value, dict):
         return _from_columns(field)
     views: dict[str, ViewResult] = {}

@@ -25,24 +25,13 @@ STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write a whole file or, on any failure, nothing.
+    """Write a whole file or, on any failure, nothing; text is written as UTF-8.
 
     The content is written to a temporary file in the same folder, which then replaces the file. An existing
     file keeps its permissions. A symbolic link is kept, and its target is replaced. Pipes and devices are
-    written directly; ``-`` is stdout. While a command holds its outputs back (`outputs.all_or_none`), the
-    file is replaced at the end of the command.
-
-    Parameters
-    ----------
-    path : str or Path
-    content : str or bytes
-        Text is written as UTF-8.
-
-    Raises
-    ------
-    NeurocalError
-        The file cannot be written. If the reader closes a pipe, the BrokenPipeError is passed on, because
-        commands then end quietly.
+    written directly. While a command holds its outputs back (`outputs.all_or_none`), the file is replaced at
+    the end of the command. If the reader closes a pipe, the BrokenPipeError is passed on, because commands
+    then end quietly.
     """
     data, outputs = _encode(content), held_back()
     if outputs is not None and str(path) in STDOUT_NAMES:
@@ -82,11 +71,6 @@ def make_folder(folder: str) -> None:
     """Make a folder for outputs, and the folders that it is in; it may exist.
 
     While a command holds its outputs back, new folders are removed again if it fails.
-
-    Raises
-    ------
-    NeurocalError
-        It cannot be made.
     """
     try:
         (held_back() or Outputs()).make_folder(folder)
@@ -97,19 +81,10 @@ def make_folder(folder: str) -> None:
 
 
 def check_places(*paths: str | None) -> None:
-    """Refuse outputs that cannot be written, before any work is done.
+    """Refuse outputs that cannot be written, before any work is done; None is left out.
 
-    Parameters
-    ----------
-    paths : str or None
-        None is left out.
-
-    Raises
-    ------
-    UsageError
-        An output is an input of the command (`Outputs.protect`), or two outputs are the same file or stdout.
-    NeurocalError
-        A folder does not exist or may not be written to.
+    A UsageError says that an output is an input of the command (`Outputs.protect`), or that two outputs are
+    the same file or stdout.
     """
     outputs, taken = held_back(), set[str]()
     for path in paths:

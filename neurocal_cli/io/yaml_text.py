@@ -70,13 +70,7 @@ def text(value: str) -> str:
 
 
 def quoted(value: str) -> str:
-    """Write text in double quotes, on one line, valid as YAML and as JSON.
-
-    Raises
-    ------
-    InputError
-        The text contains half of a surrogate pair, which UTF-8 cannot encode.
-    """
+    """Write text in double quotes, on one line, valid as YAML and JSON; InputError if UTF-8 cannot."""
     quoted = _encode(value)
     if quoted.isascii() and "\x7f" not in quoted:
         return quoted

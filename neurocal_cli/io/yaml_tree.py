@@ -58,16 +58,7 @@ def read_yaml(path: str | Path) -> tuple[Any, str]:
 def parse_yaml(text: str, source: str) -> Any:
     """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None.
 
-    Parameters
-    ----------
-    text : str
-    source : str
-        Name for messages.
-
-    Raises
-    ------
-    FormatError
-        The text is not YAML, or has aliases, duplicate keys or more than one document.
+    Aliases, duplicate keys and several documents are refused.
     """
     if source == "<stdin>" and not text.strip():
         raise FormatError("is empty; check the command before it", source)

@@ -34,17 +34,7 @@ _LEVELS = 12
 
 @frozen_dataclass
 class Subject:
-    """A camera, points and their errors.
-
-    Attributes
-    ----------
-    camera : Camera
-    points : Correspondences
-    evaluation : CameraEvaluation
-        Of the camera on these points.
-    calibration : Calibration or None
-        The calibration of the camera, if known.
-    """
+    """A camera, points, the camera's errors on them, and its calibration if known."""
 
     camera: Camera
     points: Correspondences

@@ -27,24 +27,9 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw the residuals, coverage, uncertainty, poses and learning curve of a camera.
+    """Draw all panels of a camera on one page, or one of `plots.CAMERA_PANELS`, as png, pdf or svg.
 
-    Parameters
-    ----------
-    subject : Subject
-    kind : {"png", "pdf", "svg"}
-    panel : str, optional
-        One of `plots.CAMERA_PANELS`; by default all on one page.
-
-    Returns
-    -------
-    picture : bytes
-        The same subject gives the same bytes.
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
+    The same subject gives the same bytes. A NeurocalError says that matplotlib is not installed.
     """
     panels = panels_of(subject)
     if panel is not None:
@@ -53,13 +38,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw both cameras of a rig side by side; see `draw_camera`.
-
-    Parameters
-    ----------
-    panel : str, optional
-        One of `plots.RIG_PANELS`, for both cameras.
-    """
+    """Draw both cameras of a rig side by side, or one of `plots.RIG_PANELS` for both; see `draw_camera`."""
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
         f"{side} {name}": _with_side(side, draw)
@@ -93,15 +72,9 @@ def _with_side(side: str, draw: Draw) -> Draw:
 def draw_points_in_space(
     evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
-    """Draw the errors of triangulated points; see `draw_camera`.
+    """Draw the errors of triangulated points, or one of `plots.SPACE_PANELS`; see `draw_camera`.
 
-    Parameters
-    ----------
-    evaluation : StereoEvaluation
-    rig : Rig or None
-        Both cameras, if known, for the panel of poses.
-    panel : str, optional
-        One of `plots.SPACE_PANELS`.
+    The panel of poses needs the rig.
     """
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     unit = plain(evaluation.unit)

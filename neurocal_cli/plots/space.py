@@ -25,15 +25,9 @@ _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 def draw_poses(
     axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
 ) -> None:
-    """Draw the targets relative to the camera, coloured by their errors.
+    """Draw the targets relative to the camera, coloured by their errors, on axes with ``projection="3d"``.
 
-    Parameters
-    ----------
-    axes : Axes
-        With ``projection="3d"``.
-    calibration : Calibration or None
-    others : sequence of (Camera, Pose)
-        Other cameras on the rig, with their poses from the frame of the first camera to theirs.
+    `others` are other cameras on the rig, with their poses from the frame of the first camera to theirs.
     """
     space: Any = axes
     style(axes, "Poses")

@@ -59,54 +59,27 @@ class Text:
 
 @frozen_dataclass(eq=False)
 class Sheet:
-    """What is printed.
-
-    Attributes
-    ----------
-    width, height : float [mm]
-        Of the paper; the origin is its top-left corner, y is downwards.
-    squares : (N, 4, 2) array [mm]
-        Corners of the black squares and parts of squares.
-    lines, texts : tuples
-    laid : list of Laid
-        The planes on the sheet, in the board's unit, before they were scaled and moved.
-    scale : float
-        Millimetres of a unit of the board.
-    origin : (2,) array [mm]
-        Where the origin of `laid` is on the paper.
-    """
+    """What is printed, in mm; the origin is the paper's top-left corner, y is downwards."""
 
     width: float
     height: float
-    squares: Array
+    squares: Array  # (N, 4, 2) corners of the black squares and parts of squares
     lines: tuple[Line, ...]
     texts: tuple[Text, ...]
-    laid: tuple[Laid, ...]
-    scale: float
-    origin: Array
+    laid: tuple[Laid, ...]  # the planes in the board's unit, before they were scaled and moved
+    scale: float  # mm of a unit of the board
+    origin: Array  # (2,) where the origin of `laid` is on the paper
 
 
 def millimetres(unit: str) -> float:
-    """Millimetres of one unit.
-
-    Raises
-    ------
-    InputError
-        A unit that is no length we know.
-    """
+    """Millimetres of one unit."""
     if unit not in _MILLIMETRES:
         raise InputError(f"the unit {unit[:20]!r} is no known length; use one of {', '.join(_MILLIMETRES)}")
     return _MILLIMETRES[unit]
 
 
 def paper_size(name: str) -> tuple[float, float]:
-    """Width and height of a paper by its name, or of ``420x297`` [mm].
-
-    Raises
-    ------
-    UsageError
-        No such paper.
-    """
+    """Width and height of a paper by its name, or of ``420x297`` [mm]; UsageError if there is none."""
     for known, size in PAPERS.items():
         if name.lower() == known.lower():
             return size
@@ -121,12 +94,8 @@ def paper_size(name: str) -> tuple[float, float]:
 def default_board(paper: tuple[float, float]) -> Board:
     """A board of 9 x 6 inner vertices whose squares are as large as fits on a paper, in whole mm.
 
-    Of 10 x 7 squares, so that it does not look the same after a turn of 180 degrees.
-
-    Raises
-    ------
-    InputError
-        Paper too small for squares of 5 mm.
+    Of 10 x 7 squares, so that it does not look the same after a turn of 180 degrees. An InputError says that
+    the paper is too small for squares of 5 mm.
     """
     room = _room(max(paper), min(paper))
     square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
@@ -136,17 +105,9 @@ def default_board(paper: tuple[float, float]) -> Board:
 
 
 def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
-    """Lay a board out on paper, upright or lying, whichever it fits.
+    """Lay a board out on paper (width, height) [mm], upright or lying, whichever it fits.
 
-    Parameters
-    ----------
-    board : Board
-    paper : (width, height) [mm]
-
-    Raises
-    ------
-    InputError
-        A board larger than the paper, an unknown unit, planes that cannot be laid flat.
+    An InputError names a board larger than the paper, an unknown unit, or planes that cannot be laid flat.
     """
     scale = millimetres(board.unit)
     laid, folds = unfolded(board)

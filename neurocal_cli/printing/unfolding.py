@@ -20,23 +20,12 @@ _REACH = 1.0  # squares of the pattern beyond the outer vertices, one whole
 
 @frozen_dataclass(eq=False)
 class Laid:
-    """A plane on the sheet.
-
-    Attributes
-    ----------
-    plane : Plane
-    origin : (2,) array
-        Vertex (0, 0).
-    axes : (2, 2) array
-        Rows: x_axis and y_axis on the sheet, unit vectors.
-    reach : (2, 2) array [squares]
-        How far the pattern extends beyond the outer vertices, ``[axis, low or high]``.
-    """
+    """A plane on the sheet."""
 
     plane: Plane
-    origin: Array
-    axes: Array
-    reach: Array
+    origin: Array  # (2,) vertex (0, 0)
+    axes: Array  # (2, 2) rows: x_axis and y_axis on the sheet, unit vectors
+    reach: Array  # (2, 2) [squares] of the pattern beyond the outer vertices, [axis, low or high]
 
     def at(self, grid: Array) -> Array:
         """Places on the sheet of grid coordinates (..., 2) [squares]."""
@@ -67,24 +56,11 @@ class _Map:
 
 
 def unfolded(board: Board) -> tuple[list[Laid], list[Array]]:
-    """Lay the planes of a board flat.
+    """Lay the planes of a board flat: one, or several that meet in lines beside them.
 
-    Parameters
-    ----------
-    board : Board
-        Of one plane, or of planes that meet in lines beside them, as the faces of a corner.
-
-    Returns
-    -------
-    laid : list of Laid
-        In the order of the planes.
-    folds : list of (2, 2) arrays
-        Ends of the lines along which the sheet is folded, from end to end of the pattern.
-
-    Raises
-    ------
-    InputError
-        Planes that do not meet in such a line, or that would lie on each other on the sheet.
+    Returns them in the order of the planes, and the ends (2, 2) of the lines along which the sheet is folded,
+    from end to end of the pattern. An InputError names planes that do not meet in such a line, or that would
+    lie on each other on the sheet.
     """
     planes = board.planes
     maps, folds = [_first_map(planes)], []

@@ -24,47 +24,23 @@ _Adaptation = tuple[Camera, NearestCamera | None, str]  # None and "" if there i
 
 @frozen_dataclass(eq=False)
 class AdaptedCameras:
-    """Cameras adapted to a format.
-
-    Attributes
-    ----------
-    cameras : CameraSet
-    losses : tuple of str
-        Changes of the cameras and the resulting shifts of pixels, for warnings.
-    remarks : tuple of str
-        Data that are not in the file, for notes.
-    moved : tuple of Distance or None
-        Shifts of the pixels of each camera, as numbers.
-    """
+    """Cameras adapted to a format."""
 
     cameras: CameraSet
-    losses: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    moved: tuple[Distance | None, ...] = ()
+    losses: tuple[str, ...] = ()  # changes of the cameras and the shifts of pixels, for warnings
+    remarks: tuple[str, ...] = ()  # data that are not in the file, for notes
+    moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
 
 
 def adapt_cameras(
     cameras: CameraSet, target: Format, force: bool, model: str | None = None
 ) -> AdaptedCameras:
-    """Adapt cameras to a format, and to a distortion model if one is given.
+    """Adapt cameras to a format, and to a distortion model (one of `MODELS`) if one is given.
 
     If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
-    nearest camera without skew moves pixels less than ignoring the skew.
-
-    Parameters
-    ----------
-    cameras : CameraSet
-    target : Format
-    force : bool
-        Whether the nearest camera of another distortion model is accepted.
-    model : str, optional
-        One of `MODELS`: the cameras are replaced by the nearest ones with this distortion model.
-
-    Raises
-    ------
-    InputError
-        The format cannot represent the distortion model (unless forced), the number of cameras, or an unknown
-        unit or image size.
+    nearest camera without skew moves pixels less than ignoring the skew. An InputError says that the format
+    cannot represent the distortion model (unless `force` accepts the nearest one of another model), the
+    number of cameras, or an unknown unit or image size.
     """
     if len(cameras.cameras) > target.most_cameras:
         raise InputError(

@@ -17,29 +17,14 @@ METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.
 
 @frozen_dataclass(eq=False)
 class CameraSet:
-    """One camera, or several that are fixed to each other.
-
-    Attributes
-    ----------
-    cameras : tuple of Camera
-    relative : tuple of Pose
-        From the first camera to each further one: ``X_k = R X_0 + t``; one less than the cameras.
-    poses : dict of Pose by view
-        From the world to the first camera.
-    unit : str, optional
-        Of the translations; None if the file does not state it.
-    origin : Calibration or Rig, optional
-        The whole contents of a neurocal file.
-    program : str
-        Name of the program that wrote the file, for messages.
-    """
+    """One camera, or several that are fixed to each other."""
 
     cameras: tuple[Camera, ...]
-    relative: tuple[Pose, ...] = ()
-    poses: Mapping[str, Pose] = field(default_factory=dict)
-    unit: str | None = None
-    origin: Calibration | Rig | None = None
-    program: str = "OpenCV"
+    relative: tuple[Pose, ...] = ()  # from the first camera to each further one, X_k = R X_0 + t
+    poses: Mapping[str, Pose] = field(default_factory=dict)  # of views, from the world to the first camera
+    unit: str | None = None  # of the translations; None if the file does not state it
+    origin: Calibration | Rig | None = None  # the whole contents of a neurocal file
+    program: str = "OpenCV"  # that wrote the file, for messages
 
     def __post_init__(self) -> None:
         if len(self.relative) != len(self.cameras) - 1:
@@ -54,13 +39,7 @@ class CameraSet:
         return bool(self.relative or self.poses)
 
     def in_metres(self) -> CameraSet:
-        """Convert the translations to metres.
-
-        Raises
-        ------
-        InputError
-            The unit is unknown or not a length.
-        """
+        """Convert the translations to metres; raise an InputError if the unit is unknown or not a length."""
         if not self.has_lengths:
             return self
         if self.unit not in METRES:
@@ -82,31 +61,15 @@ class CameraSet:
 class Format:
     """Capabilities of a file format, and the function that writes it.
 
-    Attributes
-    ----------
-    program : str
-        Name for messages.
-    models : tuple of str
-        Our names of its distortion models, the simplest first.
-    skew : bool
-        Whether its programs support skew.
-    poses : bool
-        Whether it contains the poses of views.
-    most_cameras : int
-    metres : bool
-        Whether lengths are in metres.
-    needs_size : bool
-        Whether the image size must be known.
-    text : callable
-        Returns the contents of the files by name; "" is the name of a single file. The arguments are the
-        cameras, which must fit the format, and the extension of the output, such as ".xml".
+    `text` takes cameras that fit the format, and the extension of the output, such as ".xml". It returns the
+    contents of the files by name; "" is the name of a single file.
     """
 
-    program: str
-    models: tuple[str, ...]
-    skew: bool
-    poses: bool
+    program: str  # name for messages
+    models: tuple[str, ...]  # our names of its distortion models, the simplest first
+    skew: bool  # whether its programs support skew
+    poses: bool  # whether it contains the poses of views
     most_cameras: int
-    metres: bool
-    needs_size: bool
+    metres: bool  # whether lengths are in metres
+    needs_size: bool  # whether the image size must be known
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]]

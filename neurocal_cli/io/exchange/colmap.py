@@ -55,13 +55,7 @@ def is_folder(name: str) -> bool:
 
 
 def read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model with their relative poses and the poses of the images.
-
-    Raises
-    ------
-    FormatError
-        The folder is not a text model.
-    """
+    """Read the cameras of a model with their relative poses and the poses of the images."""
     path = os.path.join(folder, "cameras.txt")
     if not os.path.exists(path):
         if os.path.exists(os.path.join(folder, "cameras.bin")):
@@ -78,13 +72,7 @@ def read_folder(folder: str) -> CameraSet:
 
 
 def parse(text: str, source: str) -> CameraSet:
-    """Read ``cameras.txt`` with one camera.
-
-    Raises
-    ------
-    FormatError, InputError
-        A line is not a camera, its model is unknown, or there are several cameras.
-    """
+    """Read ``cameras.txt`` with one camera."""
     return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
 
 

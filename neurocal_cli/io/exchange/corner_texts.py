@@ -18,20 +18,9 @@ from neurocal_cli.points import Correspondences
 
 
 def corner_text(points: Correspondences, target: str, ending: str) -> str | bytes:
-    """Write points for a program.
+    """Write points for ``neurocal, opencv, matlab, json, npz`` or ``mrcal``; `ending` is such as ".xml".
 
-    Parameters
-    ----------
-    points : Correspondences
-    target : str
-        ``neurocal, opencv, matlab, json, npz`` or ``mrcal``.
-    ending : str
-        Extension of the output, such as ".xml".
-
-    Raises
-    ------
-    InputError
-        The program reads no files of points, or cannot represent these points.
+    An InputError says that the program reads no files of points, or cannot represent these points.
     """
     if target == "neurocal":
         return format_points(points)

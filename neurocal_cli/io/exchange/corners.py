@@ -50,28 +50,11 @@ _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 def read_corners(
     paths: Sequence[str | Path], board: Board | None, notes: list[str], unit: str | None = None
 ) -> Correspondences | None:
-    """Read points from files of any program.
+    """Read points from files of any program; None if the first file has no points.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        One file; or a file of board points and then a file for each view. ``-`` is stdin, which has to be
-        repeatable (`repeatable_stdin`).
-    board : Board, optional
-        Gives the board points if the files do not.
-    notes : list of str
-        Remarks about ignored columns are appended.
-    unit : str, optional
-        Of the board points in a file.
-
-    Returns
-    -------
-    Correspondences, or None if the first file has no points.
-
-    Raises
-    ------
-    FormatError
-        A file cannot be read, or its corners are not those of the board.
+    The files are one, or board points and then a file for each view; stdin has to be repeatable
+    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not. Remarks
+    about ignored columns are appended to `notes`.
     """
     names = [str(path) for path in paths]
     data, source = read_bytes(names[0])
@@ -123,17 +106,9 @@ def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspon
 def _corners(
     root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
 ) -> Correspondences:
-    """Read the points of a dictionary.
+    """Read the points of a dictionary whose first pixel has the coordinate `first`.
 
-    Parameters
-    ----------
-    root : Field
-    board : Board, optional
-    unit : str, optional
-    first : float
-        Coordinate of the first pixel.
-    down : bool
-        Whether corners without board points run along the columns of the board, one after the other.
+    Without board points, `down` tells that the corners run along the columns of the board.
     """
     field = next(root[name] for name in _IMAGE if name in root)
     pixels = _stack(field, 2) - first

@@ -42,13 +42,7 @@ def is_part(root: Field) -> bool:
 
 
 def from_tree(root: Field) -> CameraSet:
-    """Read one camera or two.
-
-    Raises
-    ------
-    InputError, FormatError
-        A key is missing or wrong.
-    """
+    """Read one camera or two."""
     unit = root.read("unit", Field.text)
     sides = _sides(root)
     if sides is None:
@@ -63,13 +57,7 @@ def from_tree(root: Field) -> CameraSet:
 
 
 def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """Read the arrays of an ``.npz`` file as nested lists.
-
-    Raises
-    ------
-    FormatError
-        The data are not such a file, or contain Python objects.
-    """
+    """Read the arrays of an ``.npz`` file as nested lists; Python objects are refused."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:

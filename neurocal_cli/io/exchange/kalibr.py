@@ -44,13 +44,7 @@ def is_tree(root: Field) -> bool:
 
 
 def from_tree(root: Field) -> CameraSet:
-    """Read a chain of cameras.
-
-    Raises
-    ------
-    InputError, FormatError
-        The camera model or distortion model is unknown, or a key is missing.
-    """
+    """Read a chain of cameras."""
     if "cam0" not in root:
         return CameraSet((_camera(root, "camera"),), unit="m", program="Kalibr")
     cameras, relative = [_camera(root["cam0"], "cam0")], [Pose(np.eye(3), np.zeros(3))]

@@ -27,13 +27,7 @@ _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 
 def read_mat(data: bytes, source: str) -> CameraSet:
-    """Read a ``.mat`` file of up to version 7.
-
-    Raises
-    ------
-    FormatError, InputError
-        The file is damaged, or has no camera outside objects of MATLAB's classes, which only MATLAB can read.
-    """
+    """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
     tree = read_variables(data, source)
     for name in _STRUCTS:
         if isinstance(tree.get(name), dict):

@@ -37,13 +37,7 @@ def is_text(text: str) -> bool:
 
 
 def parse(text: str, source: str) -> CameraSet:
-    """Read a camera model.
-
-    Raises
-    ------
-    FormatError, InputError
-        The text is malformed, or the lens model is unknown.
-    """
+    """Read a camera model."""
     try:
         tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:

@@ -33,21 +33,12 @@ _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \
 
 
 def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
-    """Read the cameras of a file, or of two files that belong together.
+    """Read the cameras of a file of a known program, or of two files that belong together.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder
-        that holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left
-        and the right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. ``-`` is stdin.
-    whole : bool
-        Whether all of a neurocal file is read; otherwise its poses and points are ignored.
-
-    Raises
-    ------
-    FormatError
-        A file cannot be read, is of an unknown kind, or has a camera that neurocal cannot represent.
+    One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder that
+    holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left and the
+    right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. Poses and points of a neurocal
+    file are read only if `whole`.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
@@ -64,18 +55,7 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
 
 
 def read_intrinsics(path: str | Path) -> Camera:
-    """Read a camera without its poses.
-
-    Parameters
-    ----------
-    path : str or Path
-        A neurocal calibration or the file of another program, see `read_cameras`; ``-`` is stdin.
-
-    Raises
-    ------
-    FormatError
-        There is no valid camera matrix, or more than one camera.
-    """
+    """Read a single camera without its poses, from any file of `read_cameras`."""
     found = read_cameras([path], whole=False)
     if len(found.cameras) > 1:
         source = "<stdin>" if str(path) == "-" else one_line(path)
