@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
 from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.file_storage import read_tree
@@ -31,11 +32,12 @@ def calibration_from_field(root: Field) -> Calibration:
     block = neurocal_block(root)
     views = read_views(block["views"])
     fit = block["fit"]
-    points = _points(root, block, set(views), fit["n_points"].integer() == 0)
-    if fit["n_points"].integer() != len(points):
+    n_points = fit["n_points"].integer()
+    points = _points(root, block, set(views), n_points == 0)
+    if n_points != len(points):
         root.refuse(
-            f"fit.n_points is {fit['n_points'].integer()}, but there are {len(points)} observations: the "
-            "file is incomplete; calibrate again"
+            f"fit.n_points is {n_points}, but there are {len(points)} observations: the file is incomplete; "
+            "calibrate again"
         )
     rejected = read_rejected(block.get("rejected"), points.unit)
     if fit["n_rejected"].integer() != len(rejected):
@@ -89,11 +91,9 @@ def neurocal_block(root: Field) -> Field:
             )
         root.refuse("has no neurocal block; give a file that calibrate wrote")
     block = root["neurocal"]
-    if block["format"].integer() not in FORMATS:
-        root.refuse(
-            f"{block.path}.format is {block['format'].integer()}, not {' or '.join(map(str, FORMATS))}; "
-            "update neurocal"
-        )
+    form = block["format"].integer()
+    if form not in FORMATS:
+        root.refuse(f"{block.path}.format is {form}, not {' or '.join(map(str, FORMATS))}; update neurocal")
     return block
 
 
@@ -101,14 +101,9 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     """Read the intrinsic parameters of a neurocal file, their standard deviations, and the fixed names."""
     parameters = neurocal_block(root)["parameters"]
     values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
-    std = {}
-    fixed = set()
-    for name, parameter in parameters.entries().items():
-        entry = parameter.entries()
-        if "std" in entry:
-            std[name] = entry["std"].number_or_nan()
-        if parameter.get("fixed", False).boolean():
-            fixed.add(name)
+    entries = parameters.entries()
+    std = {name: entry["std"].number_or_nan() for name, entry in entries.items() if "std" in entry.entries()}
+    fixed = frozenset(name for name, entry in entries.items() if entry.get("fixed", False).boolean())
     try:
         intrinsics = Intrinsics(*values)
     except InputError as error:
@@ -117,7 +112,7 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
         K = root["camera_matrix"]["data"].array(9).reshape(3, 3)
         if np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
             root.refuse(f"camera_matrix and {parameters.path} disagree; correct the one that was edited")
-    return intrinsics, std, frozenset(fixed)
+    return intrinsics, std, fixed
 
 
 def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
@@ -125,9 +120,7 @@ def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
     block = neurocal_block(read_tree(path))
     views, own = read_views(block["views"]), _unit(block)
     if own != unit:
-        raise FormatError(
-            f"its poses are in {own}, but the points in {unit}; give both in one unit", block.source
-        )
+        block.refuse(f"its poses are in {own}, but the points in {unit}; give both in one unit")
     return {name: view.pose for name, view in views.items()}
 
 
@@ -163,19 +156,15 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
 
 
 def _network(field: Field) -> NetworkRecord:
+    numbers: dict[str, Any] = {name: field[name].integer() for name in NETWORK_COUNTS}
+    numbers |= {name: field[name].number_or_nan() for name in NETWORK_ERRORS}
     return NetworkRecord(
         W=field["W"].array(3, 3),
         V=_matrices(field["V"], 3, 4),
         S1=field["S1"].array(3, 3),
         S2=_matrices(field["S2"], 4, 4),
-        starts=field["starts"].integer(),
-        agreed=field["agreed"].integer(),
-        iterations=field["iterations"].integer(),
-        refine_iterations=field["refine_iterations"].integer(),
-        loss=field["loss"].number_or_nan(),
-        rmse_before=field["rmse_before"].number_or_nan(),
-        rmse_after=field["rmse_after"].number_or_nan(),
         curve=tuple(field["curve"].array(-1, unknown=True).tolist()),
+        **numbers,
     )
 
 
@@ -205,8 +194,7 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
     unit = _unit(block)
     center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
     points = read_observations(observations, unit, image_size(root), center, none)
-    strange = set() if points.view is None else set(points.view_names) - views
-    if strange:
+    if strange := set() if points.view is None else set(points.view_names) - views:
         root.refuse(
             f"{observations.path}: the view {min(strange)[:60]!r} is not in {block.path}.views; "
             "calibrate again or correct its name"

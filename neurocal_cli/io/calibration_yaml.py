@@ -11,6 +11,7 @@ see `text_columns`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +26,7 @@ from neurocal_cli.io.observations_yaml import observation_lines
 from neurocal_cli.io.optional_blocks import rejected_lines, target_lines, verdict_lines
 from neurocal_cli.io.text_columns import column_lines, named_lines
 from neurocal_cli.io.views_yaml import have_same_std, view_lines
-from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import block, boolean, flow, flows, list_lines, mapping, number, quoted, text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,6 +36,8 @@ FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in
 # OpenCV 4 opens no YAML file without these two lines; 1.1 is the version that PyYAML and ROS read.
 HEADER = ("%YAML 1.1", "---")
 
+NETWORK_COUNTS = ("starts", "agreed", "iterations", "refine_iterations")
+NETWORK_ERRORS = ("loss", "rmse_before", "rmse_after")
 _MOST_VIEWS = 100
 _MOST_POINTS = 5000
 
@@ -83,20 +86,20 @@ def calibration_lines(
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
     long = large and not by_rows and have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
-    yield "neurocal:"
-    for lines in (
-        _record_lines(cal, long),
-        _parameter_lines(cal),
-        view_lines(cal.views, cal.K, long),
-        _network_lines(cal.network, long),
-        verdict_lines(cal.verdict),
-        rejected_lines(cal.rejected, long),
-        target_lines(cal.target, long),
-    ):
-        yield from (f"  {line}" for line in lines)
-    if cal.straight_lines is not None:
-        yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
-    yield from (f"  {line}" for line in observation_lines(cal.points, long))
+    yield from block(
+        "neurocal",
+        chain(
+            _record_lines(cal, long),
+            _parameter_lines(cal),
+            view_lines(cal.views, cal.K, long),
+            ["network: null"] if cal.network is None else block("network", _network_lines(cal.network, long)),
+            verdict_lines(cal.verdict),
+            rejected_lines(cal.rejected, long),
+            target_lines(cal.target, long),
+            _straight_lines(cal.straight_lines),
+            observation_lines(cal.points, long),
+        ),
+    )
 
 
 def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
@@ -106,7 +109,7 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
     yield f"method: {text(cal.method)}"
     yield f"trainer: {text(cal.trainer)}"
     yield f"seed: {cal.seed}"
-    yield f"converged: {str(bool(cal.converged)).lower()}"
+    yield f"converged: {boolean(cal.converged)}"
     yield f"stop_reason: {text(str.__str__(cal.stop_reason))}"
     yield f"unit: {text(cal.unit)}"
     yield f"distortion: {text(cal.distortion_model)}"
@@ -142,37 +145,32 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
     yield from list_lines("warnings", map(quoted, cal.warnings))
 
 
-def _network_lines(network: NetworkRecord | None, long: bool) -> Iterator[str]:
-    if network is None:
-        yield "network: null"
-        return
-    yield "network:"
+def _network_lines(network: NetworkRecord, long: bool) -> Iterator[str]:
     yield from _matrix_lines("V", network.V, long)
-    yield f"  W: {flow(network.W)}"
-    yield f"  S1: {flow(network.S1)}"
+    yield f"W: {flow(network.W)}"
+    yield f"S1: {flow(network.S1)}"
     yield from _matrix_lines("S2", network.S2, long)
-    for name in ("starts", "agreed", "iterations", "refine_iterations"):
-        yield f"  {name}: {int(getattr(network, name))}"
-    for name in ("loss", "rmse_before", "rmse_after"):
-        yield f"  {name}: {number(getattr(network, name))}"
-    yield f"  curve: {flow(np.array(network.curve, dtype=float))}"
+    for name in NETWORK_COUNTS:
+        yield f"{name}: {int(getattr(network, name))}"
+    for name in NETWORK_ERRORS:
+        yield f"{name}: {number(getattr(network, name))}"
+    yield f"curve: {flow(np.array(network.curve, dtype=float))}"
 
 
-def _straight_lines(found: StraightLines) -> str:
-    return mapping(
-        n_lines=str(found.n_lines),
-        n_points=str(found.n_points),
-        center=flow(np.array(found.centre)),
-        rms_before_px=number(found.rms_before),
-        rms_after_px=number(found.rms_after),
-    )
+def _straight_lines(found: StraightLines | None) -> Iterator[str]:
+    if found is not None:
+        yield "straight_lines: " + mapping(
+            n_lines=str(found.n_lines),
+            n_points=str(found.n_points),
+            center=flow(np.array(found.centre)),
+            rms_before_px=number(found.rms_before),
+            rms_after_px=number(found.rms_after),
+        )
 
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> Iterator[str]:
     stack = np.array(list(matrices.values()))
-    if long:
-        yield f"  {name}:"
-        columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
-        yield from (f"    {line}" for line in column_lines(columns))
-    else:
-        yield from (f"  {line}" for line in named_lines(name, matrices, flows(stack)))
+    if not long:
+        return named_lines(name, matrices, flows(stack))
+    columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
+    return block(name, column_lines(columns))

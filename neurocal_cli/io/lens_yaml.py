@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from neurocal_cli.io.optional_blocks import read_target, target_lines
 from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import block, boolean, flow, list_lines, mapping, number, quoted, text, words
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
@@ -33,11 +34,12 @@ _MOST_UNITS = 1000
 
 def format_lens(lens: ZoomLens) -> str:
     """Text of a lens file."""
-    lines = [f"{_BLOCK}:"]
-    parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
-    for part in (*parts, target_lines(lens.target, long=False), _coupling_lines(lens)):
-        lines += [f"  {line}" for line in part]
-    return "\n".join([*lines, ""])
+    parts = [_record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)]
+    parts.append(target_lines(lens.target, long=False))
+    if lens.target_coupling is not None:
+        coupling = lens.target_coupling.reshape(len(lens.settings), -1)
+        parts.append(iter([f"target_coupling: {flow(coupling)}"]))
+    return "\n".join([*block(_BLOCK, chain.from_iterable(parts)), ""])
 
 
 def write_lens(lens: ZoomLens, path: str | Path) -> None:
@@ -67,26 +69,18 @@ def lens_from_field(root: Field) -> ZoomLens:
         return _lens(root[_BLOCK])
 
 
-def _bool(value: bool) -> str:
-    return "true" if value else "false"
-
-
-def _words(names: tuple[str, ...]) -> str:
-    return f"[{', '.join(map(text, names))}]"
-
-
 def _record_lines(lens: ZoomLens) -> Iterator[str]:
     width, height = lens.image_size or (0, 0)
     yield f"format: {_FORMAT}"
     yield f"version: {text(__version__)}"
-    yield f"controls: {_words(lens.controls)}"
-    yield f"parameters: {_words(lens.names)}"
+    yield f"controls: {words(lens.controls)}"
+    yield f"parameters: {words(lens.names)}"
     yield f"distortion: {text(lens.model)}"
     yield f"camera: {'known' if lens.known else 'still' if lens.still else 'moving'}"
-    yield f"skew: {_bool(lens.free_theta)}"
+    yield f"skew: {boolean(lens.free_theta)}"
     yield f"training: {text(lens.training)}"
     yield f"seed: {lens.seed}"
-    yield f"converged: {_bool(lens.converged)}"
+    yield f"converged: {boolean(lens.converged)}"
     yield f"unit: {text(lens.unit)}"
     yield f"image_width: {width}"
     yield f"image_height: {height}"
@@ -105,11 +99,6 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
     yield from list_lines("warnings", map(quoted, lens.warnings))
 
 
-def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
-    if lens.target_coupling is not None:
-        yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
-
-
 def _coupling(field: Field, S: int, size: int) -> Array:
     flat = field.array(S, -1)
     if flat.shape[1] % size:
@@ -120,8 +109,7 @@ def _coupling(field: Field, S: int, size: int) -> Array:
 def _setting_lines(lens: ZoomLens) -> Iterator[str]:
     columns = dict(zip(lens.controls, lens.settings.T, strict=True))
     columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
-    yield "settings:"
-    yield from (f"  {line}" for line in table_lines(columns, long=False, indent=2))
+    yield from block("settings", table_lines(columns, long=False, indent=2))
 
 
 def _member_lines(lens: ZoomLens) -> Iterator[str]:

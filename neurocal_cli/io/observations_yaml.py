@@ -30,7 +30,7 @@ from neurocal_cli.io.text_columns import (
     read_ranges,
 )
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, number, quoted
+from neurocal_cli.io.yaml_text import flow, indented, number, quoted
 from neurocal_cli.points import Correspondences
 
 _MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
@@ -50,7 +50,7 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     if len(points) == 0:
         yield "  rows: []"
     elif long:
-        yield from (f"  {line}" for line in _long_lines(points, np.hstack(blocks)))
+        yield from indented(_long_lines(points, np.hstack(blocks)))
     else:
         yield "  rows:"
         yield from _rows(points, np.hstack([points.world, *blocks]))
@@ -72,7 +72,7 @@ def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
     labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
     coordinates = {name: points.world[first, k] for k, name in enumerate(PLACE)}
     yield "places:  # each place of the target once; its columns"
-    yield from (f"  {line}" for line in column_lines({**labels, **coordinates}))
+    yield from indented(column_lines({**labels, **coordinates}))
     words = [number_words(column) for column in values.T]
     characters = sum(len(word) + 1 for column in words for word in column)
     packed = characters > _MOST_CHARACTERS

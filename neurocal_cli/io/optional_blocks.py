@@ -13,7 +13,7 @@ from neurocal_cli.calibration import Rejected, Verdict
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.text_columns import named_lines, numbers_of, read_named, read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import boolean, indented, mapping, number, quoted, text
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 
@@ -49,13 +49,10 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
     if not len(rejected) and not rejected.views:
         return
     yield "rejected:"
-    yield from (
-        f"  {line}" for line in named_lines("views", rejected.views, map(quoted, rejected.views.values()))
-    )
+    yield from indented(named_lines("views", rejected.views, map(quoted, rejected.views.values())))
     points = rejected.points
     if points is None:
-        yield "  columns: []"
-        yield "  rows: []"
+        yield from ("  columns: []", "  rows: []")
         return
     columns: dict[str, NDArray[Any] | list[str]] = {}
     if points.lines is not None:
@@ -65,7 +62,7 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
         columns["point"] = [str(label) for label in points.point]
     numbers = np.column_stack([points.world, points.pixels, rejected.error_px])
     columns |= {name: numbers[:, k] for k, name in enumerate(_REJECTED)}
-    yield from (f"  {line}" for line in table_lines(columns, long))
+    yield from indented(table_lines(columns, long))
 
 
 def read_rejected(field: Field, unit: str) -> Rejected:
@@ -97,7 +94,7 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     if target is None:
         return
     yield "target:"
-    yield f"  flat: {str(target.flat).lower()}"
+    yield f"  flat: {boolean(target.flat)}"
     yield f"  evidence: {number(target.evidence)}"
     yield f"  sizes: {mapping(**{name: number(size) for name, size in target.sizes.items()})}"
     columns: dict[str, NDArray[Any] | list[str]] = {}
@@ -108,16 +105,16 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     columns |= {name: numbers[:, k] for k, name in enumerate(_TARGET)}
     if target.stated is not None:
         columns |= {name: target.stated[:, k] for k, name in enumerate(_STATED)}
-    yield from (f"  {line}" for line in table_lines(columns, long, indent=2))
+    yield from indented(table_lines(columns, long, indent=2))
     if target.bends is not None:
-        yield from (f"  {line}" for line in _bends_lines(target.bends, long))
+        yield from indented(_bends_lines(target.bends, long))
 
 
 def _bends_lines(bends: Bends, long: bool) -> Iterator[str]:
     yield "bends:  # of each view, from the points above"
     yield f"  size: {number(bends.size)}"
     columns = dict(zip(_SHAPES, bends.coefficients.T, strict=True))
-    yield from (f"  {line}" for line in table_lines({"view": list(bends.names), **columns}, long, indent=2))
+    yield from indented(table_lines({"view": list(bends.names), **columns}, long, indent=2))
 
 
 def read_target(field: Field) -> Target:

@@ -20,12 +20,12 @@ from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.optional_blocks import read_verdict, verdict_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
+from neurocal_cli.io.views_yaml import POSE_GROUPS
+from neurocal_cli.io.yaml_text import block, boolean, flow, list_lines, mapping, number, quoted, text, words
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
 FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
-_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 # E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
 _SAME = 1e-6
 
@@ -65,11 +65,9 @@ def _rig_lines(rig: Rig, rectified: Rectification | None, by_rows: bool) -> Iter
     matrices: tuple[tuple[Array, Array] | None, ...] = (None, None)
     if rectified is not None:
         matrices = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
-    for name, camera, pair in zip(("left", "right"), (rig.left, rig.right), matrices, strict=True):
-        yield f"{name}:"
-        yield from (f"  {line}" for line in calibration_lines(camera, pair, by_rows))
-    yield "stereo:"
-    yield from (f"  {line}" for line in _stereo_lines(rig, rectified))
+    yield from block("left", calibration_lines(rig.left, matrices[0], by_rows))
+    yield from block("right", calibration_lines(rig.right, matrices[1], by_rows))
+    yield from block("stereo", _stereo_lines(rig, rectified))
 
 
 def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
@@ -80,26 +78,26 @@ def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
     yield f"baseline: {number(rig.baseline)}"
     yield f"baseline_std: {number(rig.std['baseline'])}"
     values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
-    for group, members in _GROUPS:
+    for group, members in POSE_GROUPS:
         entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
         yield f"{group}: {mapping(**entries)}"
-    parameters = f"[{', '.join(POSE_NAMES)}]"
-    yield f"covariance: {mapping(names=parameters, data=flow(rig.covariance))}"
+    yield f"covariance: {mapping(names=words(POSE_NAMES), data=flow(rig.covariance))}"
     yield f"rmse_px: {number(rig.rmse_px)}"
     yield f"max_px: {number(rig.max_px)}"
-    yield f"converged: {str(bool(rig.converged)).lower()}"
+    yield f"converged: {boolean(rig.converged)}"
     yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
     yield f"iterations: {rig.iterations}"
     if rectified is not None:
-        yield "rectification:"
-        for key in ("R1", "R2", "P1", "P2", "Q"):
-            yield f"  {key}: {flow(getattr(rectified, key))}"
-    names = {pair: f"{quoted(pair[0])}, {quoted(pair[1])}" for pair in (*rig.pairs, *rig.left_out)}
-    yield from list_lines("pairs", [f"[{names[pair]}]" for pair in rig.pairs])
-    left_out = [f"[{names[pair]}, {quoted(reason)}]" for pair, reason in rig.left_out.items()]
-    yield from list_lines("left_out", left_out)
+        matrices = {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
+        yield from block("rectification", (f"{key}: {flow(matrix)}" for key, matrix in matrices.items()))
+    yield from list_lines("pairs", map(_quoted, rig.pairs))
+    yield from list_lines("left_out", (_quoted((*pair, reason)) for pair, reason in rig.left_out.items()))
     yield from list_lines("warnings", map(quoted, rig.warnings))
     yield from verdict_lines(rig.verdict)
+
+
+def _quoted(names: tuple[str, ...]) -> str:
+    return f"[{', '.join(map(quoted, names))}]"
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -153,7 +151,7 @@ def rig_from_field(root: Field) -> Rig:
 
 
 def _std(block: Field) -> dict[str, float]:
-    std = {name: block[group][name]["std"].number_or_nan() for group, names in _GROUPS for name in names}
+    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
     return std | {"baseline": block["baseline_std"].number_or_nan()}
 
 
@@ -166,7 +164,7 @@ def _names(entry: Field, count: int) -> tuple[str, ...]:
 
 def _check_consistent(rig: Rig, block: Field) -> None:
     """Refuse a file with contradicting values, of which one was edited."""
-    values = [block[g][n]["value"].number() for g, names in _GROUPS for n in names]
+    values = [block[g][n]["value"].number() for g, names in POSE_GROUPS for n in names]
     stated = (
         ("E", block["E"].array(3, 3), rig.E),
         ("F", block["F"].array(3, 3), rig.F),

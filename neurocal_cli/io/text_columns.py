@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flows, quoted, text
+from neurocal_cli.io.yaml_text import block, flows, indented, quoted, text
 
 LONGEST = 160  # numbers in a text, each with at most 24 characters
 
@@ -54,8 +54,7 @@ def table_lines(
 ) -> Iterator[str]:
     """Lines of a table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
     if long:
-        yield "columns:"
-        yield from (f"  {line}" for line in column_lines(columns))
+        yield from block("columns", column_lines(columns))
         return
     cells = [
         number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
@@ -63,7 +62,7 @@ def table_lines(
     ]
     yield f"columns: [{', '.join(columns)}]"
     yield "rows:"
-    yield from (f"{' ' * indent}- [{', '.join(row)}]" for row in zip(*cells, strict=True))
+    yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
 
 
 def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
@@ -156,11 +155,9 @@ def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterat
     if not names:
         yield f"{key}: {{}}"
     elif all(_KEY(name) and text(name) == name for name in names):
-        yield f"{key}:"
-        yield from (f"  {name}: {value}" for name, value in pairs)
+        yield from block(key, (f"{name}: {value}" for name, value in pairs))
     else:
-        yield f"{key}:"
-        yield from (f"  - [{quoted(name)}, {value}]" for name, value in pairs)
+        yield from block(key, (f"- [{quoted(name)}, {value}]" for name, value in pairs))
 
 
 def read_named(field: Field) -> dict[str, Field]:

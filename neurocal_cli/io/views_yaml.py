@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,11 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.io.text_columns import as_fields, column_lines, numbers_of, read_columns
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flows, text
+from neurocal_cli.io.yaml_text import block, flows, text
 
+POSE_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 _NAME = "name"
+_R = [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
 
 # The angles reproduce R except for the last bits; a larger difference means that one was edited.
 _SAME = 1e-6
@@ -33,15 +35,13 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
     R, t = np.stack([v.pose.R for v in views.values()]), np.stack([v.pose.t for v in views.values()])
     pose = np.hstack([rotation_to_euler(R), t])
     error = np.array([view.rmse_px for view in views.values()], dtype=float)
-    yield "views:"
     if long:
-        yield from (f"  {line}" for line in column_lines(_columns(views, pose, error, R)))
+        yield from block("views", column_lines(_columns(views, pose, error, R)))
         return
+    yield "views:"
     P = K @ np.concatenate([R, t[:, :, None]], axis=2)
-    estimates = _estimates(pose, [view.std for view in views.values()])
-    for (name, view), entries, matrix, rmse, rotation in zip(
-        views.items(), estimates, flows(P), flows(error), flows(R), strict=True
-    ):
+    columns = _estimates(pose, views.values()), flows(P), flows(error), flows(R)
+    for (name, view), entries, matrix, rmse, rotation in zip(views.items(), *columns, strict=True):
         yield f"  - name: {text(name)}"
         yield f"    rotation: {{{', '.join(entries[:3])}}}"
         yield f"    translation: {{{', '.join(entries[3:])}}}"
@@ -63,21 +63,17 @@ def _columns(
     columns["rmse_px"] = error
     columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
     columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
-    return columns | {f"R{row}{col}": R[:, row - 1, col - 1] for row in (1, 2, 3) for col in (1, 2, 3)}
+    return columns | dict(zip(_R, R.reshape(-1, 9).T, strict=True))
 
 
-def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[list[str]]:
-    """Entries ``R_x: {value: ..., std: ...}`` of each view's pose; values (V, 6)."""
-    width = len(POSE_NAMES)
-    value = flows(values.ravel())
-    std = flows(np.array([[std.get(name, np.nan) for name in POSE_NAMES] for std in stds]).ravel())
-    for k, known in enumerate(stds):
-        row = zip(
-            POSE_NAMES, value[k * width : (k + 1) * width], std[k * width : (k + 1) * width], strict=True
-        )
+def _estimates(pose: Array, views: Collection[ViewResult]) -> Iterator[list[str]]:
+    """Entries ``R_x: {value: ..., std: ...}`` of each view's pose; pose (V, 6)."""
+    std = np.array([[view.std.get(name, np.nan) for name in POSE_NAMES] for view in views])
+    for view, values, errors in zip(views, flows(pose), flows(std), strict=True):
+        parts = zip(POSE_NAMES, values[1:-1].split(", "), errors[1:-1].split(", "), strict=True)
         yield [
-            f"{name}: {{value: {v}, std: {s}}}" if name in known else f"{name}: {{value: {v}}}"
-            for name, v, s in row
+            f"{name}: {{value: {value}, std: {error}}}" if name in view.std else f"{name}: {{value: {value}}}"
+            for name, value, error in parts
         ]
 
 
@@ -98,14 +94,12 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
     table = read_columns(field, frozenset((_NAME,)))
     columns = as_fields(table, field)
     known = [name for name in POSE_NAMES if f"std_{name}" in columns]
-    wanted = [_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed"]
-    wanted += [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
-    for name in wanted:
+    for name in (_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed", *_R):
         field[name]  # raises an error that names the missing column
     if len(set(table[_NAME])) < len(table[_NAME]):
         field[_NAME].fail("names that differ")
-    pose = np.column_stack(list(numbers_of(columns, POSE_NAMES)))
-    R = np.column_stack(list(numbers_of(columns, wanted[-9:]))).reshape(-1, 3, 3)
+    pose = numbers_of(columns, POSE_NAMES).T
+    R = numbers_of(columns, _R).T.reshape(-1, 3, 3)
     std = numbers_of(columns, [f"std_{name}" for name in known], unknown=True).T
     if np.abs(R - np.stack([euler_to_rotation(*angles) for angles in pose[:, :3]])).max() > _SAME:
         field.refuse(f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited")
@@ -124,10 +118,9 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
 def _view(entry: Field) -> ViewResult:
     values: list[float] = []
     std: dict[str, float] = {}
-    for group, names in (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:])):
-        field = entry[group]
+    for group, names in POSE_GROUPS:
         for name in names:
-            estimate = field[name]
+            estimate = entry[group][name]
             values.append(estimate["value"].number())
             if "std" in estimate.value:
                 std[name] = estimate["std"].number_or_nan()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,27 @@ def list_lines(key: str, entries: Iterable[str]) -> list[str]:
     """Lines of a key whose value is a list of entries, already as text."""
     lines = [f"  - {entry}" for entry in entries]
     return [f"{key}:", *lines] if lines else [f"{key}: []"]
+
+
+def indented(lines: Iterable[str], by: int = 2) -> Iterator[str]:
+    """Lines with some blanks before each."""
+    return (f"{' ' * by}{line}" for line in lines)
+
+
+def block(key: str, lines: Iterable[str]) -> Iterator[str]:
+    """Lines of a key whose value are these lines."""
+    yield f"{key}:"
+    yield from indented(lines)
+
+
+def boolean(value: bool) -> str:
+    """Write true or false."""
+    return "true" if value else "false"
+
+
+def words(names: Iterable[str]) -> str:
+    """Write names as a flow sequence, each like `text`."""
+    return f"[{', '.join(map(text, names))}]"
 
 
 def mapping(**entries: str) -> str:
