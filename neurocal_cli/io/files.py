@@ -118,12 +118,12 @@ def reading_failures(source: str) -> Iterator[None]:
 
 
 @contextmanager
-def value_failures(source: str, where: str = "") -> Iterator[None]:
+def value_failures(source: str, where: str = "", line: int | None = None) -> Iterator[None]:
     """Turn errors about values into messages that name the file and the place in it."""
     try:
         yield
     except InputError as error:
-        raise FormatError(f"{where}{error}", source) from error
+        raise FormatError(f"{where}{error}", source, line) from error
 
 
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:

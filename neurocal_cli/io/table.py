@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.errors import FormatError
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import decode, one_line, read_blocks, read_bytes
@@ -65,7 +65,7 @@ class Table:
 
     def note_unknown(self, notes: list[str]) -> None:
         """Append remarks that name the ignored columns and misspelt metadata."""
-        notes += self.metadata.misspelt
+        notes += [f"{self.source}:{remark}" for remark in self.metadata.misspelt]
         if self.unknown:
             names = ", ".join(repr(name[:40]) for name in self.unknown)
             notes.append(f"{self.source}: column{'s' * (len(self.unknown) > 1)} not used: {names}")
@@ -188,59 +188,55 @@ def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) 
     places = [(name, k) for k, name in enumerate(layout.names) if name in schema.known]
     columns: dict[str, list[Any]] = {name: [] for name, _ in places}
     lines: list[int] = []
-    for number, fields in _rows(data, source, layout):
-        for name, k in places:
-            value = _label if name in schema.labels else _number
-            columns[name].append(value(fields[k], name, source, number))
-        lines.append(number)
+    text = data[layout.offset :].decode("utf-8")
+    number = layout.line
+    try:
+        for number, line in enumerate(text.split("\n"), start=layout.line + 1):
+            if fields := _fields(line, number, layout):
+                for name, k in places:
+                    value = _label if name in schema.labels else _number
+                    columns[name].append(value(fields[k], name))
+                lines.append(number)
+    except InputError as error:
+        raise FormatError(str(error), source, number) from error
     labels = {name: np.array(columns.pop(name), dtype=np.str_) for name in schema.labels & columns.keys()}
     numbers = {name: np.array(column, dtype=float) for name, column in columns.items()}
-    line = np.array(lines, dtype=np.int64)
-    return Table(source, numbers, labels, line, layout.metadata, layout.unknown(schema))
+    rows = np.array(lines, dtype=np.int64)
+    return Table(source, numbers, labels, rows, layout.metadata, layout.unknown(schema))
 
 
-def _rows(data: bytes, source: str, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """Iterate over line number and fields of each row; metadata lines among them are read."""
-    expected = len(layout.names)
-    text = data[layout.offset :].decode("utf-8")
-    for number, line in enumerate(text.split("\n"), start=layout.line + 1):
-        line = line.strip(" \t") if layout.separator != "\t" else line.strip(" ")
-        if not line.strip("\t"):
-            continue
-        if line.startswith("#"):
-            layout.metadata.take(line, source, number)
-            continue
-        fields = split_fields(line, layout.separator, source, number)
-        if len(fields) != expected:
-            advice = decimal_commas(len(fields), expected, layout.separator) or "complete or remove the row"
-            raise FormatError(
-                f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
-                f"{advice}",
-                source,
-                number,
-            )
-        yield number, fields
+def _fields(line: str, number: int, layout: Layout) -> list[str]:
+    """Fields of a row; none of a blank line, or of metadata, which are read."""
+    line = line.strip(" \t") if layout.separator != "\t" else line.strip(" ")
+    if not line.strip("\t"):
+        return []
+    if line.startswith("#"):
+        layout.metadata.take(line, number)
+        return []
+    fields, expected = split_fields(line, layout.separator), len(layout.names)
+    if len(fields) != expected:
+        advice = decimal_commas(len(fields), expected, layout.separator) or "complete or remove the row"
+        raise InputError(
+            f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
+            f"{advice}"
+        )
+    return fields
 
 
-def _label(text: str, name: str, source: str, line: int) -> str:
+def _label(text: str, name: str) -> str:
     if not text:
-        raise FormatError(f"{name} is empty; fill it in or leave the column out", source, line)
+        raise InputError(f"{name} is empty; fill it in or leave the column out")
     return text
 
 
-def _number(text: str, name: str, source: str, line: int) -> float:
-    if is_number(text):
-        value = float(text)
-        if math.isfinite(value):
-            return value
-    raise FormatError(_complaint(text, name), source, line)
-
-
-def _complaint(text: str, name: str) -> str:
+def _number(text: str, name: str) -> float:
+    if is_number(text) and math.isfinite(value := float(text)):
+        return value
     if not text:
-        return f"{name} is empty; fill it in or remove the row"
+        raise InputError(f"{name} is empty; fill it in or remove the row")
     if is_decimal_comma(text):
-        return f"{name} is {text[:40]!r}, with a decimal comma; write {text[:40].replace(',', '.')}"
+        point = text[:40].replace(",", ".")
+        raise InputError(f"{name} is {text[:40]!r}, with a decimal comma; write {point}")
     if is_number(text) or text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
-        return f"{name} is {text[:40]}, but must be a finite number; correct or remove the row"
-    return f"{name} is {text[:40]!r}, not a number; correct or remove the row"
+        raise InputError(f"{name} is {text[:40]}, but must be a finite number; correct or remove the row")
+    raise InputError(f"{name} is {text[:40]!r}, not a number; correct or remove the row")
