@@ -185,10 +185,7 @@ _OPTIONS = [
     ),
     *_FILES,
     options.count(
-        "--image-size",
-        "W H",
-        "Width and height of the images in pixels.",
-        without="image_size in POINTS",
+        "--image-size", "W H", "Width and height of the images in pixels.", without="image_size in POINTS"
     ),
     options.choice(
         "--method",

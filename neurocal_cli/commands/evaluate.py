@@ -156,11 +156,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
 @plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
-    cameras: tuple[str, ...],
-    points: tuple[str, str] | None,
-    method: str,
-    plots: Plots,
-    as_json: bool,
+    cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, plots: Plots, as_json: bool
 ) -> None:
     """Measure the triangulation error of two calibrated cameras.
 

@@ -149,12 +149,7 @@ def flag(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F]
 
 
 def _option(
-    names: str | tuple[str, ...],
-    help: str,
-    without: str | None,
-    *,
-    to: str | None = None,
-    **attributes: Any,
+    names: str | tuple[str, ...], help: str, without: str | None, *, to: str | None = None, **attributes: Any
 ) -> Callable[[F], F]:
     """An option whose value is passed to the parameter `to` of the command; default: its own name."""
     if without is not None:

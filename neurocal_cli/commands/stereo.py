@@ -161,12 +161,7 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
             )
         return estimation
     return replace(
-        estimation,
-        type="3",
-        intrinsics=intrinsics,
-        image_center=None,
-        no_skew=False,
-        distortion="none",
+        estimation, type="3", intrinsics=intrinsics, image_center=None, no_skew=False, distortion="none"
     )
 
 

@@ -40,9 +40,7 @@ def calibration_page(
 
 
 def rig_page(
-    rig: Rig,
-    origin: Origin,
-    photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None,
+    rig: Rig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
 ) -> str:
     """Make the page of a rig; see `calibration_page`."""
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"

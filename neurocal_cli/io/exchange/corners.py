@@ -210,8 +210,7 @@ def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> 
     stack = np.asarray(tree[field], dtype=float)
     if stack.ndim == 4:  # M x 2 x P x cameras
         raise FormatError(
-            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart",
-            source,
+            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart", source
         )
     if stack.ndim == 3:  # M x 2 x P
         root.value[field] = np.moveaxis(stack, 2, 0).tolist()

@@ -119,8 +119,5 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
     # mrcal's poses are relative to one world.
     first, second = (part.poses[mrcal.REFERENCE] for part in (left, right))
     return replace(
-        left,
-        cameras=(left.cameras[0], right.cameras[0]),
-        relative=(after(second, inverse(first)),),
-        poses={},
+        left, cameras=(left.cameras[0], right.cameras[0]), relative=(after(second, inverse(first)),), poses={}
     )
