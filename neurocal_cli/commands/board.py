@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.preparation import check_outputs
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -75,7 +74,7 @@ def board(
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
     beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
-    check_outputs((output, beside), (board,))
+    preparation.check_outputs((output, beside), (board,))
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)

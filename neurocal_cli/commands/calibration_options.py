@@ -7,8 +7,7 @@ from dataclasses import fields, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.given_camera import given_camera
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -100,7 +99,7 @@ class Estimation:
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
-            points, arguments["intrinsics"] = given_camera(self.intrinsics, points)
+            points, arguments["intrinsics"] = preparation.given_camera(self.intrinsics, points)
         elif self.extrinsics is not None:
             from neurocal_cli.io.calibration_tree import read_extrinsics
 

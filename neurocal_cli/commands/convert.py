@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.board_options import board_options, check_unit, given_board
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
@@ -122,11 +121,11 @@ def convert(
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
           -o corners.npz
     """  # noqa: D301 - as in the group
-    check_one_stdin(*files, board)
-    check_summary(as_json, output)
+    preparation.check_one_stdin(*files, board)
+    preparation.check_summary(as_json, output)
     check_unit(unit)
     folder = os.path.isdir(output) or output.endswith(os.sep)
-    check_outputs((None if folder else output,), (*files, board))
+    preparation.check_outputs((None if folder else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.io.files import repeatable_stdin

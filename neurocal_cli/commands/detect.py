@@ -10,16 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
-from neurocal_cli.commands.preparation import (
-    check_folder,
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
@@ -139,11 +132,11 @@ def detect(
           --cache found --frames 30 -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
     """  # noqa: D301 - as in the group
-    check_one_stdin(*images, board)
-    check_summary(as_json, output)
+    preparation.check_one_stdin(*images, board)
+    preparation.check_summary(as_json, output)
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
-    compute_in_one_thread()
+    preparation.compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:
         raise UsageError(
@@ -180,7 +173,7 @@ def _wanted(
     kind = cast("Points", points)
     known = None
     if cache is not None:
-        check_folder("--cache", cache)
+        preparation.check_folder("--cache", cache)
         known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
@@ -201,7 +194,7 @@ def _examined(
 
     given = find_images(words)
     view_names(given)  # no name twice
-    check_outputs((output,), (*given, board_file))
+    preparation.check_outputs((output,), (*given, board_file))
     with videos_as_frames(given, frames) as (paths, folder):
         names = view_names(paths)
         note(_mixed_sizes(paths))
@@ -223,11 +216,11 @@ def _watched(
 
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
-    check_outputs((output,), (board_file,))
+    preparation.check_outputs((output,), (board_file,))
     outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
-    check_outputs((output,), tuple(path for path, _ in outcomes))
+    preparation.check_outputs((output,), tuple(path for path, _ in outcomes))
     names = view_names([path for path, _ in outcomes])
     return [(name, outcome) for name, (_, outcome) in zip(names, outcomes, strict=True)]
 
@@ -262,7 +255,7 @@ def _mixed_orientations(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def _check_overlay(folder: str, paths: Sequence[str]) -> None:
-    check_folder("--overlay", folder)
+    preparation.check_folder("--overlay", folder)
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 

@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
 from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
@@ -77,10 +75,10 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
           --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    check_one_stdin(calibration, points)
+    preparation.check_one_stdin(calibration, points)
     check_plots(plots)
-    check_outputs((file for _, file in plots), (calibration, points))
-    given = None if points is None else given_points([points])
+    preparation.check_outputs((file for _, file in plots), (calibration, points))
+    given = None if points is None else preparation.given_points([points])
     evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
         from neurocal_cli.plots.camera_panels import Subject
@@ -106,7 +104,7 @@ def _evaluate_camera(
     from neurocal_cli.verdict.assessment import assess
     from neurocal_cli.verdict.given_points import judged_by_points
 
-    camera, points = calibration_or_camera(name, points)
+    camera, points = preparation.calibration_or_camera(name, points)
     evaluation = evaluate_camera(camera, points)
     if not isinstance(camera, Calibration):
         return evaluation, None, camera
@@ -195,9 +193,9 @@ def stereo(
         raise UsageError(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
-    check_one_stdin(*cameras, *(points or ()))
+    preparation.check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
-    check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
     evaluation, rig = _evaluate_stereo(cameras, _read_points(points), method)
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
@@ -253,7 +251,7 @@ def _with_poses(name: str, points: Correspondences) -> Calibration:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.methods import calibrate
 
-    camera, seen = calibration_or_camera(name, points, "; the poses are fitted")
+    camera, seen = preparation.calibration_or_camera(name, points, "; the poses are fitted")
     if isinstance(camera, Calibration):
         if camera.views:
             return camera

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_folder, check_one_stdin, check_outputs
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
@@ -84,11 +83,11 @@ def rectify(
           "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
-    check_one_stdin(rig, *files)
+    preparation.check_one_stdin(rig, *files)
     options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
-    check_folder("-o", output)
+    preparation.check_folder("-o", output)
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
@@ -130,7 +129,7 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
     """Refuse to overwrite inputs."""
-    check_outputs((), (*sides[0], *sides[1]))
+    preparation.check_outputs((), (*sides[0], *sides[1]))
     for side, paths in zip(_SIDES, sides, strict=True):
         folder = os.path.realpath(os.path.join(output, side))
         if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_outputs
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 
@@ -57,7 +56,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     """  # noqa: D301 - as in the group
     if len(images) > 2:
         raise UsageError("--images is for one folder, or for the left and the right one of a rig")
-    check_outputs((output,), (result,))
+    preparation.check_outputs((output,), (result,))
     import hashlib
 
     from neurocal_cli.io.file_storage import parse_tree

@@ -8,14 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
-from neurocal_cli.commands.preparation import (
-    check_folder,
-    check_one_stdin,
-    check_outputs,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -155,15 +149,15 @@ def simulate(
           --sigma 0.2 --trials 2 --random-starts 2 --save simulated --images --jobs 1
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
-    check_one_stdin(camera, board)
+    preparation.check_one_stdin(camera, board)
     if rates:
         options.note_unused("with --rates", "sigma", "trials", "methods", "random_starts")
     else:
         options.note_unused("without --rates", "data_sets")
     _check(rates, save, images, (camera, board, views))
     options.check_plot(plot, "-")
-    check_outputs((plot,), (camera, board))
-    compute_in_one_thread()
+    preparation.check_outputs((plot,), (camera, board))
+    preparation.compute_in_one_thread()
 
     from neurocal_cli.processes import usable_cores
 
@@ -207,7 +201,7 @@ def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...
     if rates and (save is not None or any(part is not None for part in scene)):
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
-        check_folder("--save", save)
+        preparation.check_folder("--save", save)
 
 
 def _scene(

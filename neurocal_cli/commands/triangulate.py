@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -84,9 +83,9 @@ def triangulate(
         )
     if sigma is not None and sigma > _LARGEST_SIGMA:
         raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
-    check_one_stdin(*inputs)
-    check_summary(as_json, output)
-    check_outputs((output,), inputs)
+    preparation.check_one_stdin(*inputs)
+    preparation.check_summary(as_json, output)
+    preparation.check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.io.writing import write_chunks

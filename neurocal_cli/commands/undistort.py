@@ -9,8 +9,7 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import is_terminal, print_summary, say
 from neurocal_cli.errors import UsageError
 
@@ -102,13 +101,13 @@ def undistort(
       neurocal undistort fisheye.yaml --to cylinder --fov 140 --size 800 480 \\
           --maps maps.npz
     """  # noqa: D301 - as in the group
-    check_one_stdin(camera, *files)
+    preparation.check_one_stdin(camera, *files)
     _check_view(shape, fov, size, alpha)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     if not files and options.typed("output"):
         raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
-    check_summary(as_json, new_camera, maps, output if files else None)
+    preparation.check_summary(as_json, new_camera, maps, output if files else None)
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.exchange.reading import read_intrinsics
@@ -119,7 +118,7 @@ def undistort(
         options.note_unused("without images", "interpolation")
     folder, outputs = _places_of(paths, output)
     _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
-    check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
+    preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
     work = Undistorting(original, view, interpolation, folder)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import chain
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -27,9 +27,6 @@ from neurocal_cli.io.optional_blocks import rejected_lines, target_lines, verdic
 from neurocal_cli.io.text_columns import column_lines, named_lines
 from neurocal_cli.io.views_yaml import have_same_std, view_lines
 from neurocal_cli.io.yaml_text import block, boolean, flow, flows, list_lines, mapping, number, quoted, text
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
 

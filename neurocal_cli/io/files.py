@@ -8,13 +8,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.io.outputs import held_back
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16

@@ -20,8 +20,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.reading import read_intrinsics
 from neurocal_cli.io.files import read_bytes
-from neurocal_cli.io.points_csv import POINTS, format_points
-from neurocal_cli.io.points_join import correspondences
+from neurocal_cli.io.points_csv import POINTS, correspondences, format_points
 from neurocal_cli.io.table import Table, parse_table
 from neurocal_cli.io.table_header import Schema
 from neurocal_cli.io.writing import write_whole

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration import Calibration, Rejected
@@ -18,8 +19,6 @@ from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from neurocal_cli.stereo.rig import Rig
 
 

@@ -13,7 +13,8 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +33,6 @@ from neurocal_cli.io.table_header import (
     is_number,
     split_fields,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _BLOCK = 1 << 22  # bytes of a stream read at a time, some ten thousand rows
 # Printable ASCII without quotes, with tabs and line ends: characters that both readers treat alike.

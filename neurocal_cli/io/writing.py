@@ -11,14 +11,12 @@ import stat
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
 from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_name
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
 STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})

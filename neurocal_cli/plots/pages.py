@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.plots.camera_panels import Subject, panels_of
+from neurocal_cli.plots.camera_panels import Subject, draw_poses, panels_of
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
-from neurocal_cli.plots.space import draw_poses
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 
