@@ -94,8 +94,10 @@ def section(title: str, *parts: str) -> str:
 
 
 def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
-    """Make a table of rows, the first of which are the headings."""
+    """Make a table of rows, the first of which are the headings; empty without others."""
     head, *body = rows
+    if not body:
+        return ""
     sort = ' class="sort"' if sortable else ""
     texts = [any(len(row[k]) > _LONG for row in body) for k in range(len(head))]
     cells = "".join(

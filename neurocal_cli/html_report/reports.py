@@ -9,6 +9,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import InputError
+from neurocal_cli.evaluation import predict
 from neurocal_cli.geometry import Array
 from neurocal_cli.html_report.drawings import enlargement, error_bars, heat_map, residual_map, scatter
 from neurocal_cli.html_report.page import Origin, definitions, figure, page, section, table, verdict_block
@@ -28,10 +29,14 @@ def calibration_page(
     calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
 ) -> str:
     """Make the page of a camera, with the images of views as JPEG files, if given."""
-    size = _size(calibration)
-    head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+    size = calibration.image_size
+    head = (
+        f"images of {'unknown size' if size is None else f'{size[0]} x {size[1]} px'}, "
+        f"{len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+        f"{calibration.distortion_model}"
+    )
     parts = [
-        f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
+        f'<p class="soft">{escape(head)}</p>',
         verdict_block(calibration.verdict),
         *_camera_parts(calibration, photographs or {}),
         _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
@@ -55,8 +60,8 @@ def rig_page(
         verdict_block(rig.verdict),
         section("The right camera relative to the left one", table(rig_rows(rig))),
         section("Both cameras", table(camera_rows(rig))),
-        section("Pairs", table(pairs, sortable=True) if len(pairs) > 1 else ""),
-        section("Pairs left out", table(left_out) if len(left_out) > 1 else ""),
+        section("Pairs", table(pairs, sortable=True)),
+        section("Pairs left out", table(left_out)),
         _warnings(rig.warnings),
     ]
     sides = ("Left camera", rig.left), ("Right camera", rig.right)
@@ -167,11 +172,8 @@ def _residuals(calibration: Calibration) -> Array:
     points = calibration.points
     if not len(points):
         return np.zeros((0, 2))
-    views = [calibration.views[name].pose for name in points.view_names]
-    R, t = np.stack([pose.R for pose in views]), np.stack([pose.t for pose in views])
-    k = points.view_index
-    X = np.einsum("nij,nj->ni", R[k], points.world) + t[k]
-    return np.asarray(np.nan_to_num(calibration.camera.project(X)[0] - points.pixels))
+    poses = [calibration.views[name].pose for name in points.view_names]
+    return np.asarray(np.nan_to_num(predict(calibration.camera, poses, points)[0] - points.pixels))
 
 
 def _view_parts(
@@ -232,21 +234,12 @@ def _rejected(calibration: Calibration) -> str:
                 [printable(name), printable(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
             )
     views = [["view", "reason"], *([printable(name), why] for name, why in rejected.views.items())]
-    return section(
-        "Left out",
-        table(views) if len(views) > 1 else "",
-        table(rows, sortable=True) if len(rows) > 1 else "",
-    )
+    return section("Left out", table(views), table(rows, sortable=True))
 
 
 def _warnings(warnings: tuple[str, ...]) -> str:
     entries = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
     return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
-
-
-def _size(calibration: Calibration) -> str:
-    size = calibration.image_size
-    return "images of unknown size" if size is None else f"images of {size[0]} x {size[1]} px"
 
 
 def _options(calibration: Calibration) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -54,6 +54,10 @@ class Field:
             self.fail("a mapping (key: value)")
         found = self.value.get(key)
         return Field(default if found is None else found, self.source, self._below(key))
+
+    def first(self, keys: Iterable[str]) -> Field | None:
+        """Value of the first of these keys that is there and not null; None without any."""
+        return next((self[key] for key in keys if key in self), None)
 
     def read(self, key: str, reader: Callable[[Field], T]) -> T | None:
         """Apply a function to the value of a key; None if the key is missing or null."""

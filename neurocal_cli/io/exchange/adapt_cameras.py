@@ -112,14 +112,11 @@ def _adapted(camera: Camera, target: Format, force: bool, points: Array | None) 
         near = nearest_camera(camera, model, False, points)
         if near.over_image.max_px < _NO_SKEW:
             return _straightened(near.camera), None, ""
-        return (
-            _straightened(near.camera),
-            near,
-            (
-                f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
-                f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
-            ),
+        what = (
+            f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
+            f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
         )
+        return _straightened(near.camera), near, what
     nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
     # Prefer a simpler model if it is nearly as good.

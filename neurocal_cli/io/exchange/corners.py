@@ -116,7 +116,8 @@ def _corners(
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
     if "view_names" in root:
         names = root["view_names"].names(views)
-    world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
+    places = root.first(_WORLD)
+    world = None if places is None else _stack(places, 3)
     stated = root["unit"].text() if "unit" in root else unit
     ids = root.read("points", Field.texts)
     if world is None:

@@ -38,7 +38,7 @@ def is_part(root: Field) -> bool:
     if not isinstance(root.value, dict):
         return False
     cameras = _sides(root) is not None
-    return cameras != any(key in root for key in _TRANSLATIONS) and (cameras or not has_matrix(root))
+    return cameras != (root.first(_TRANSLATIONS) is not None) and (cameras or not has_matrix(root))
 
 
 def from_tree(root: Field) -> CameraSet:
@@ -48,8 +48,7 @@ def from_tree(root: Field) -> CameraSet:
     if sides is None:
         return CameraSet((camera_from_tree(root),), (), _poses(root), unit)
     cameras = tuple(camera_from_tree(root, side, whole=False) for side in sides)
-    R = next((root[key] for key in _ROTATIONS if key in root), None)
-    t = next((root[key] for key in _TRANSLATIONS if key in root), None)
+    R, t = root.first(_ROTATIONS), root.first(_TRANSLATIONS)
     if R is None or t is None:
         raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))

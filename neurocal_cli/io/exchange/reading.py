@@ -86,22 +86,17 @@ def _opened(name: str) -> CameraSet | Field:
 def _cameras(opened: CameraSet | Field, whole: bool) -> CameraSet:
     if isinstance(opened, CameraSet):
         return opened
-    with value_failures(opened.source):
-        return _from_tree(opened, whole)
-
-
-def _from_tree(root: Field, whole: bool) -> CameraSet:
-    if not isinstance(root.value, dict):
-        raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
-    if "neurocal" in root or ("left" in root and "right" in root):
-        return neurocal.from_tree(root, whole)
-    if kalibr.is_tree(root):
-        return kalibr.from_tree(root)
-    if "pinhole" in root:
-        return CameraSet((boofcv_camera(root),), program="BoofCV")
-    if ros.is_tree(root):
-        return ros.from_tree(root)
-    return dictionary.from_tree(root)
+    root = opened
+    with value_failures(root.source):
+        if not isinstance(root.value, dict):
+            raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
+        if "neurocal" in root or ("left" in root and "right" in root):
+            return neurocal.from_tree(root, whole)
+        if kalibr.is_tree(root):
+            return kalibr.from_tree(root)
+        if "pinhole" in root:
+            return CameraSet((boofcv_camera(root),), program="BoofCV")
+        return ros.from_tree(root) if ros.is_tree(root) else dictionary.from_tree(root)
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:
