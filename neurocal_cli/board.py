@@ -26,38 +26,20 @@ _MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing err
 
 @frozen_dataclass
 class Plane:
-    """One flat chessboard.
+    """One flat chessboard; an InputError about a value out of range begins with its name.
 
-    Parameters
-    ----------
-    name : str
-        Prefix of the point ids; may be empty for the only plane of a board.
-    cols, rows : int
-        Inner vertices along x_axis and y_axis.
-    square : float [world unit]
-        Side of a square.
-    origin : 3 floats [world unit]
-        Vertex (0, 0).
-    x_axis, y_axis : 3 floats
-        Unit vectors, perpendicular to each other.
-    measured : tuple of 5 floats each
-        Places (c, r) in squares, and the measured X, Y, Z of the point there; none: all points are at their
-        nominal positions.
-
-    Raises
-    ------
-    InputError
-        A value out of range; the message begins with its name.
+    `name` is the prefix of the point ids, and may be empty for the only plane of a board. Points that are not
+    `measured` are at their nominal positions.
     """
 
     name: str
-    cols: int
-    rows: int
-    square: float
-    origin: Triple = (0.0, 0.0, 0.0)
+    cols: int  # inner vertices along x_axis
+    rows: int  # and along y_axis
+    square: float  # side of a square [world unit]
+    origin: Triple = (0.0, 0.0, 0.0)  # vertex (0, 0) [world unit]
     x_axis: Triple = (1.0, 0.0, 0.0)
-    y_axis: Triple = (0.0, 1.0, 0.0)
-    measured: tuple[tuple[float, ...], ...] = ()
+    y_axis: Triple = (0.0, 1.0, 0.0)  # unit vectors, perpendicular to each other
+    measured: tuple[tuple[float, ...], ...] = ()  # c, r [squares] and X, Y, Z of points
 
     def __post_init__(self) -> None:
         _check_name(self.name)

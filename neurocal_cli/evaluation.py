@@ -31,67 +31,33 @@ _FEWEST = 4  # fewest points that determine a pose
 
 @frozen_dataclass
 class ViewEvaluation:
-    """One view's error.
-
-    Attributes
-    ----------
-    n_points : int
-    n_behind : int
-        Points on or behind the focal plane; all averages leave them out.
-    rmse_px, max_px : float [px]
-        nan if no point lies in front of the camera.
-    fitted : bool
-        Whether the pose was estimated from these points.
-    """
+    """One view's error; nan [px] if no point lies in front of the camera."""
 
     n_points: int
-    n_behind: int
+    n_behind: int  # points on or behind the focal plane; all averages leave them out
     rmse_px: float
     max_px: float
-    fitted: bool
+    fitted: bool  # whether the pose was estimated from these points
 
 
 @frozen_dataclass(eq=False)
 class CameraEvaluation:
-    """A camera's error over all the points.
+    """A camera's error over all the points; averages leave out points on or behind the focal plane."""
 
-    Attributes
-    ----------
-    residuals : (N, 2) array [px]
-        Predicted minus observed; nan for points on or behind the focal plane, which all averages leave out.
-    n_points, n_behind : int
-    rmse_px : float [px]
-        ``sqrt(mean(du^2 + dv^2))``.
-    max_px : float [px]
-        Longest residual.
-    rms_u, rms_v : float [px]
-        Of each axis; their squares add up to that of `rmse_px`.
-    bias_u, bias_v : float [px]
-        Mean residual.
-    views : dict of ViewEvaluation by view name
-    warnings : tuple of str
-    renamed : tuple of str
-        Fitted views that have the name of a view of the calibration, but show another image.
-    fit : Calibration or None
-        The fitted views, with the camera given.
-    on_target : bool
-        Whether the estimated target of the calibration replaced the given world coordinates.
-    """
-
-    residuals: Array
+    residuals: Array  # (N, 2) predicted minus observed [px]; nan for points that are left out
     n_points: int
     n_behind: int
-    rmse_px: float
-    max_px: float
+    rmse_px: float  # sqrt(mean(du^2 + dv^2))
+    max_px: float  # longest residual
     rms_u: float
-    rms_v: float
+    rms_v: float  # of each axis [px]; their squares add up to that of rmse_px
     bias_u: float
-    bias_v: float
+    bias_v: float  # mean residual of each axis [px]
     views: Mapping[str, ViewEvaluation]
     warnings: tuple[str, ...] = ()
-    renamed: tuple[str, ...] = ()
-    fit: Calibration | None = None
-    on_target: bool = False
+    renamed: tuple[str, ...] = ()  # fitted views with the name of a calibrated view, of another image
+    fit: Calibration | None = None  # the fitted views, with the camera given
+    on_target: bool = False  # whether the estimated target replaced the given world points
 
     @property
     def fitted_views(self) -> tuple[str, ...]:

@@ -75,11 +75,7 @@ class Estimation:
                 )
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
-        """Read the given files; return the points and the library's keyword arguments.
-
-        An InputError says that the given camera cannot be used with these points, a UsageError that type 2
-        has no image centre.
-        """
+        """Read the given files; return the points and the library's keyword arguments."""
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
                 note([f"--image-size is used instead of the image_size in {points.source}"])

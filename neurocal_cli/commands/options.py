@@ -270,11 +270,7 @@ def plot(what: str) -> Callable[[F], F]:
 
 
 def check_plot(plot: str | None, output: str | None = None) -> None:
-    """Refuse a picture that cannot be drawn, before any work is done.
-
-    A UsageError says that the name has no ending of a picture, or is that of the output; a NeurocalError,
-    that matplotlib is not installed.
-    """
+    """Refuse a picture that cannot be drawn, before any work is done."""
     if plot is None:
         return
     if not plot.lower().endswith(_PICTURES):

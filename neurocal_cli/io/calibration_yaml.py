@@ -40,10 +40,7 @@ _MOST_POINTS = 5000
 
 
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
-    """Text of a calibration file, without dates and paths, so that the same calibration gives the same text.
-
-    If `by_rows`, even long tables have a row for each view and point.
-    """
+    """Text of a calibration file, without dates and paths; if `by_rows`, long tables have rows, too."""
     return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
 
 

@@ -125,10 +125,7 @@ def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Tabl
 
 
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:
-    r"""Read the rows below a header by NumPy; None if NumPy may read them wrongly.
-
-    `data` is the whole file with ``\n`` line ends.
-    """
+    """Read the rows below a header by NumPy; None if NumPy may read them wrongly."""
     if not _is_plain(data, schema, layout):
         return None
     n_lines = data.count(b"\n", layout.offset) + (not data.endswith(b"\n"))

@@ -66,10 +66,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
 
 
 def make_folder(folder: str) -> None:
-    """Make a folder for outputs, and the folders that it is in; it may exist.
-
-    While a command holds its outputs back, new folders are removed again if it fails.
-    """
+    """Make a folder for outputs and those that it is in, unless they exist; see `Outputs.make_folder`."""
     try:
         (held_back() or Outputs()).make_folder(folder)
     except (OSError, ValueError) as error:

@@ -71,10 +71,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 def draw_points_in_space(
     evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
-    """Draw the errors of triangulated points, or one of `plots.SPACE_PANELS`; see `draw_camera`.
-
-    The panel of poses needs the rig.
-    """
+    """Draw the errors of triangulated points, or one of `plots.SPACE_PANELS`; see `draw_camera`."""
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     unit = plain(evaluation.unit)
     errors = found.errors[np.isfinite(found.errors[:, 0])]

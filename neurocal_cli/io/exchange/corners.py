@@ -61,7 +61,7 @@ def read_corners(
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
         return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
     if data.startswith(b"PK\x03\x04"):
-        return _dictionary(Field(arrays_of(data, source), source), board, unit)
+        return _corners(Field(arrays_of(data, source), source), board, unit)
     if data.startswith(b"MATLAB 5.0 MAT-file"):
         return _matlab(data, source, board, unit)
     if b"\0" in data:
@@ -86,7 +86,7 @@ def read_corners(
         return points
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
     if named or text.lstrip()[:1] in ("{", "<", "%"):
-        return _dictionary(parse_tree(text, source), board, unit)
+        return _corners(parse_tree(text, source), board, unit)
     return None
 
 
@@ -97,20 +97,16 @@ def _npy(data: bytes, source: str) -> Any:
         raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
 
 
-def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspondences | None:
-    if not isinstance(root.value, dict) or not any(name in root for name in _IMAGE):
-        return None
-    return _corners(root, board, unit)
-
-
 def _corners(
     root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
-) -> Correspondences:
-    """Read the points of a dictionary whose first pixel has the coordinate `first`.
+) -> Correspondences | None:
+    """Read the points of a dictionary, if it has any; `first` is the coordinate of its first pixel.
 
     Without board points, `down` tells that the corners run along the columns of the board.
     """
-    field = next(root[name] for name in _IMAGE if name in root)
+    field = root.first(_IMAGE)
+    if field is None:
+        return None
     pixels = _stack(field, 2) - first
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
@@ -200,11 +196,11 @@ def _assembled(
 
 def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
     tree = read_variables(data, source)
-    if not any(name in tree for name in _IMAGE):
+    field = next((name for name in _IMAGE if name in tree), None)
+    if field is None:
         return None
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
     root = Field(plain, source)
-    field = next(name for name in _IMAGE if name in tree)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
         root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
     root.value.setdefault("unit", unit_of(tree))
