@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -13,27 +14,21 @@ from neurocal_cli.errors import UsageError
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
 
+NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `given_board`."""
+    count = partial(options.count, without="none", least=2, most=1000)
 
     def add(f: F) -> F:
         for option in reversed(
             (
                 options.path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
-                options.count(
-                    "--cols",
-                    "C",
-                    "Number of inner vertices in a row of the board.",
-                    without="none",
-                    least=2,
-                    most=1000,
-                ),
-                options.count(
-                    "--rows", "R", "Number of rows of inner vertices.", without="none", least=2, most=1000
-                ),
+                count("--cols", "C", "Number of inner vertices in a row of the board."),
+                count("--rows", "R", "Number of rows of inner vertices."),
                 options.number("--square", "S", "Side length of a square.", without="none", positive=True),
                 click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
             )
@@ -63,9 +58,7 @@ def given_board(
     if numbers == (None, None, None) and unit is None:
         return None
     if cols is None or rows is None or square is None:
-        raise UsageError(
-            "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
-        )
+        raise UsageError(NO_SIZE)
     return Board.single(cols, rows, square, "mm" if unit is None else unit)
 
 

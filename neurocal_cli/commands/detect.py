@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.board_options import NO_SIZE, board_options, given_board
 from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
@@ -29,6 +29,7 @@ from neurocal_cli.errors import NeurocalError, UsageError
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
+    from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.measuring import Points
 
 _SECOND = 2  # images of another size that are no longer a single stray one
@@ -139,9 +140,7 @@ def detect(
     preparation.compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:
-        raise UsageError(
-            "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
-        )
+        raise UsageError(NO_SIZE)
     note([_rescaled(target)] if target.distances else [])
     target = target.as_measured()
     wanted = _wanted(target, points, gamma, overlay, cache)
@@ -150,8 +149,9 @@ def detect(
     else:
         outcomes = _watched(images, wanted, board, output, watch)
     outcomes = of_one_size(outcomes)
-    _report(outcomes, target, as_json)
-    _write(outcomes, target, overlay, output)
+    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+    _report(outcomes, found, target, as_json)
+    _write(outcomes, found, target, overlay, output)
 
 
 def _rescaled(board: Board) -> str:
@@ -187,8 +187,8 @@ def _examined(
     overlay: str | None,
     jobs: int | None,
     frames: int,
-) -> list[tuple[str, Outcome]]:
-    """Outcomes of all images, with the names of their views."""
+) -> dict[str, Outcome]:
+    """Outcomes of all images, by the names of their views."""
     from neurocal_cli.detection.batch import default_jobs, detect_files
     from neurocal_cli.io.image_paths import find_images, view_names
 
@@ -205,13 +205,13 @@ def _examined(
             for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
                 outcomes.append(replace(outcome, problem=outcome.problem.removeprefix(folder)))
                 progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
-    return list(zip(names, outcomes, strict=True))
+    return dict(zip(names, outcomes, strict=True))
 
 
 def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
-) -> list[tuple[str, Outcome]]:
-    """Outcomes of the images that have arrived, with the names of their views."""
+) -> dict[str, Outcome]:
+    """Outcomes of the images that have arrived, by the names of their views."""
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if "-" in words:
@@ -220,9 +220,8 @@ def _watched(
     outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
-    preparation.check_outputs((output,), tuple(path for path, _ in outcomes))
-    names = view_names([path for path, _ in outcomes])
-    return [(name, outcome) for name, (_, outcome) in zip(names, outcomes, strict=True)]
+    preparation.check_outputs((output,), outcomes)
+    return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
 
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
@@ -236,7 +235,7 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
 
 
-def _mixed_orientations(outcomes: Sequence[Outcome]) -> list[str]:
+def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     """Warn of images that were turned differently: each way of turning has its own image centre."""
     from neurocal_cli.io.images import BY_EXIF
 
@@ -260,46 +259,39 @@ def _check_overlay(folder: str, paths: Sequence[str]) -> None:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
-def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
+def _report(
+    outcomes: Mapping[str, Outcome], found: Mapping[str, Detection], board: Board, as_json: bool
+) -> None:
     """Report failed images with the reason, and remarks common to several images once."""
-    single = len(outcomes) == 1
-    for _, outcome in outcomes:
-        if outcome.problem and not single:
-            complain(outcome.problem)
+    problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
+    for problem in problems.values() if len(outcomes) > 1 else ():
+        complain(problem)
     remarks: dict[str, list[str]] = {}
-    for name, outcome in outcomes:
+    for name, outcome in outcomes.items():
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
     note(f"{some_of(names)}: {text}" for text, names in remarks.items())
-    found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
-    warn(dict.fromkeys(text for detection in found for text in detection.warnings))
-    warn(_mixed_orientations([outcome for _, outcome in outcomes]))
-    warn(_another_board([_shown(outcome) for _, outcome in outcomes], board))
+    warn(dict.fromkeys(text for detection in found.values() for text in detection.warnings))
+    warn(_mixed_orientations(outcomes.values()))
+    warn(_another_board([_shown(outcome) for outcome in outcomes.values()], board))
+    if not found and len(outcomes) == 1:
+        raise NeurocalError(*problems.values())
     if not found:
-        raise NeurocalError(
-            outcomes[0][1].problem
-            if single
-            else f"none of the {len(outcomes)} images shows the board; {refer_to('reasons')}"
-        )
-    if as_json:
-        print_summary(_summary(outcomes))
-        return
-    say(
-        f"board detected in {len(found)} of {len(outcomes)} images: "
-        f"{sum(len(detection.ids) for detection in found)} points, "
-        f"{sum(detection.rejected for detection in found)} rejected"
-    )
-
-
-def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
-    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
-    return {
+        raise NeurocalError(f"none of the {len(outcomes)} images shows the board; {refer_to('reasons')}")
+    summary: dict[str, Any] = {
         "n_images": len(outcomes),
         "n_points": sum(len(detection.ids) for detection in found.values()),
         "n_rejected": sum(detection.rejected for detection in found.values()),
         "views": {name: len(detection.ids) for name, detection in found.items()},
-        "without_board": {name: one_line(outcome.problem) for name, outcome in outcomes if outcome.problem},
+        "without_board": {name: one_line(problem) for name, problem in problems.items()},
     }
+    if as_json:
+        print_summary(summary)
+    else:
+        say(
+            f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
+            f"{summary['n_rejected']} rejected"
+        )
 
 
 def _shown(outcome: Outcome) -> tuple[int, int] | None:
@@ -325,16 +317,21 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
     ]
 
 
-def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:
+def _write(
+    outcomes: Mapping[str, Outcome],
+    found: Mapping[str, Detection],
+    board: Board,
+    overlay: str | None,
+    output: str,
+) -> None:
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.io.points_csv import format_points
     from neurocal_cli.io.writing import make_folder, write_whole
 
-    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
     text = format_points(replace(gather(found, board.unit), distances=board.distances))
     if overlay is not None:
         make_folder(overlay)
-        for name, outcome in outcomes:
+        for name, outcome in outcomes.items():
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
     write_whole(output, text)

@@ -64,31 +64,29 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
     return saved
 
 
-def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
+def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
     """Leave out boards in images whose size differs from the most common one; none if two sizes tie."""
-    sizes = Counter(outcome.detection.image_size for _, outcome in outcomes if outcome.detection is not None)
-    counts = [count for _, count in sizes.most_common(2)]
-    if len(counts) < 2 or counts[0] == counts[1]:
+    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+    sizes = Counter(detection.image_size for detection in found.values()).most_common(2)
+    if len(sizes) < 2 or sizes[0][1] == sizes[1][1]:
         return outcomes
-    most = sizes.most_common(1)[0][0]
-    kept = []
-    for name, outcome in outcomes:
-        found = outcome.detection
-        if found is not None and found.image_size != most:
-            both = "{} x {} px and most have {} x {}".format(*found.image_size, *most)
+    most = sizes[0][0]
+    kept = dict(outcomes)
+    for name, detection in found.items():
+        if detection.image_size != most:
+            both = "{} x {} px and most have {} x {}".format(*detection.image_size, *most)
             problem = f"{name}: the image has {both}; run detect for each camera separately"
-            outcome = replace(outcome, detection=None, overlay=None, problem=problem)
-        kept.append((name, outcome))
+            kept[name] = replace(outcomes[name], detection=None, overlay=None, problem=problem)
     return kept
 
 
 def watch_for_images(
     find: Callable[[], Sequence[str]], options: DetectionOptions, seconds: float
-) -> list[tuple[str, Outcome]]:
+) -> dict[str, Outcome]:
     """Detect boards in images as they arrive, until a timeout or an interrupt by the user.
 
-    `find` returns the paths of the present images; `seconds` is the time to wait for another one. Returns
-    paths and outcomes in the order in which the images arrived.
+    `find` returns the paths of the present images; `seconds` is the time to wait for another one. Returns the
+    outcomes by path, in the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
 
@@ -104,7 +102,7 @@ def watch_for_images(
             time.sleep(_PAUSE)
     except KeyboardInterrupt:
         say("watching ends")
-    return list(outcomes.items())
+    return outcomes
 
 
 def _whole(
@@ -131,7 +129,7 @@ def _whole(
 
 
 def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) -> None:
-    alike = dict(of_one_size(list(outcomes.items())))
+    alike = of_one_size(outcomes)
     outcome = alike[path]
     if outcome.detection is None:
         complain(outcome.problem)

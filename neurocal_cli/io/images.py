@@ -135,7 +135,7 @@ def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
 
 
 def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Encode a grey or colour (R, G, B) picture as a file with this extension; `quality` is JPEG's, up to 100."""
+    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is of JPEG (100)."""
     if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
         raise InputError(
             f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"

@@ -105,7 +105,7 @@ def default_board(paper: tuple[float, float]) -> Board:
 
 
 def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
-    """Lay a board out on paper (width, height) [mm], upright or lying; an InputError if it fits neither way."""
+    """Lay a board out on paper (width, height) [mm], upright or lying; an InputError if neither fits."""
     scale = millimetres(board.unit)
     laid, folds = unfolded(board)
     outlines = scale * np.concatenate([one.outline for one in laid])
