@@ -179,35 +179,37 @@ def _write_cameras(
 def _read(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | CameraSet:
-    points = _points(files, board, unit, size)
+    """The points of the files or, if they hold none, the cameras; with values that the files lack."""
+    from neurocal_cli.io.exchange.colmap import is_folder
+    from neurocal_cli.io.exchange.corners import read_corners
+
+    notes: list[str] = []
+    points = None if is_folder(files[0]) else read_corners(files, board, notes, unit)
+    note(notes)
     if points is not None:
-        return points
+        if size is not None and points.image_size not in (None, size):
+            raise InputError("the image size of the file is another; leave out --image-size")
+        return points if size is None else replace(points, image_size=size)
     if board is not None:
         raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
     if len(files) > 2:
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
     from neurocal_cli.io.exchange.reading import read_cameras
 
-    return _completed(read_cameras(files), unit, size)
-
-
-def _points(
-    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
-) -> Correspondences | None:
-    """The points of the files; None if the files hold cameras."""
-    from neurocal_cli.io.exchange.colmap import is_folder
-    from neurocal_cli.io.exchange.corners import read_corners
-
-    if is_folder(files[0]):
-        return None
-    notes: list[str] = []
-    points = read_corners(files, board, notes, unit)
-    note(notes)
-    if points is not None and size is not None:
-        if points.image_size not in (None, size):
-            raise InputError("the image size of the file is another; leave out --image-size")
-        points = replace(points, image_size=size)
-    return points
+    cameras = read_cameras(files)
+    if unit is not None:
+        if cameras.unit not in (None, unit) and cameras.has_lengths:
+            raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
+        cameras = replace(cameras, unit=unit)
+    if size is not None:
+        for camera in cameras.cameras:
+            if camera.image_size not in (None, size):
+                stated = f"{camera.image_size[0]} {camera.image_size[1]}" if camera.image_size else ""
+                raise InputError(f"the image size of the file is {stated}; leave out --image-size")
+        if any(camera.image_size is None for camera in cameras.cameras):
+            sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
+            cameras = replace(cameras, cameras=sized, origin=None)
+    return cameras
 
 
 def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
@@ -220,25 +222,8 @@ def _write_points(points: Correspondences, target: str, output: str) -> dict[str
     note(remarks)
     warn(losses)
     write_whole(output, text)
-    told = {"to": target, "n_points": len(points), "n_views": points.n_views}
-    return {**told, "warnings": [*losses, *remarks]}
-
-
-def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
-    """Add values that the file lacks; an InputError if it has another value."""
-    if unit is not None:
-        if cameras.unit not in (None, unit) and cameras.has_lengths:
-            raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
-        cameras = replace(cameras, unit=unit)
-    if size is not None:
-        for camera in cameras.cameras:
-            if camera.image_size not in (None, size):
-                stated = f"{camera.image_size[0]} {camera.image_size[1]}" if camera.image_size else ""
-                raise InputError(f"the image size of the file is {stated}; leave out --image-size")
-        sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
-        if any(camera.image_size is None for camera in cameras.cameras):
-            cameras = replace(cameras, cameras=sized, origin=None)
-    return cameras
+    warnings = [*losses, *remarks]
+    return {"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": warnings}
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -95,8 +96,10 @@ def rectify(
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
     _check_folders(sides, output)
+    from neurocal_cli.stereo.rectified_pair import rectified_pair
+
     found = _read_rig(rig)
-    work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
+    work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
@@ -155,33 +158,40 @@ class _Work:
     """A rig, its rectified cameras, and the folders of the results."""
 
     rig: Rig
-    alpha: float | None
+    pair: RectifiedPair
     interpolation: str
     output: str
     side_by_side: bool
     as_json: bool
-    pair: RectifiedPair = field(init=False)
-    remappings: list[Remapping] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
     own_rows: RowError | None = None
 
-    def __post_init__(self) -> None:
-        from neurocal_cli.stereo.rectified_pair import rectified_pair
+    @property
+    def along(self) -> str:
+        """What corresponds in both images."""
+        return "rows" if self.pair.axis == 0 else "columns"
 
-        self.pair = rectified_pair(self.rig, self.alpha)
-        self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
+    @cached_property
+    def remappings(self) -> list[Remapping]:
+        """Tables of both cameras' images, made only for images or for files of tables."""
+        from neurocal_cli.distortion.remapping import Remapping
+
+        sides = zip(self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True)
+        return [
+            Remapping(original, new, cast("tuple[int, int]", new.image_size), self.interpolation, R)
+            for original, new, R in sides
+        ]
 
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import row_error_of_rig
 
+        self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
         if error is not None:
-            along = self.summary["along"]
-            self._tell(
-                f"{along} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms"
-            )
+            points = f"the rig's own {error.n_points} points"
+            self._tell(f"{self.along} of {points} differ by {error.rms_px:.3g} px rms")
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         verdict = self.rig.verdict
         if verdict is not None and verdict.word == "poor":
@@ -215,7 +225,7 @@ class _Work:
             "max_px": number_or_none(error.max_px),
         }
         self._tell(
-            f"{self.summary['along']} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
+            f"{self.along} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
             f"rms, {error.max_px:.3g} px at most"
         )
         if self.own_rows and error.median_px > max(_MISFIT * self.own_rows.median_px, _NO_MISFIT):
@@ -238,7 +248,7 @@ class _Work:
         from neurocal_cli.stereo.pair_picture import pair_picture
 
         pictures = []
-        for remapping, path in zip(self._remappings(), pair, strict=True):
+        for remapping, path in zip(self.remappings, pair, strict=True):
             pixels, source, notes = read_picture(path)
             note(f"{source}: {text}" for text in notes)
             try:
@@ -253,23 +263,12 @@ class _Work:
             shown = names[0] if names[0] == names[1] else "-".join(names)
             self._write(os.path.join("pairs", f"{shown}.png"), encode_png(drawn))
 
-    def _remappings(self) -> list[Remapping]:
-        from neurocal_cli.distortion.remapping import Remapping
-
-        if not self.remappings:
-            for original, new, R in zip(
-                self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True
-            ):
-                assert new.image_size is not None
-                self.remappings.append(Remapping(original, new, new.image_size, self.interpolation, R))
-        return self.remappings
-
     def write_maps(self) -> None:
         """Write the tables and matrices."""
         from neurocal_cli.io.exchange.dictionary import npz_bytes
 
         tree = {}
-        for side, remapping in zip(_SIDES, self._remappings(), strict=True):
+        for side, remapping in zip(_SIDES, self.remappings, strict=True):
             tree[f"{side}_u"], tree[f"{side}_v"] = remapping.tables()
         matrices = self.pair.matrices
         tree |= {key: getattr(matrices, key) for key in ("R1", "R2", "P1", "P2", "Q")}

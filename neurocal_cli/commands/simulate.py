@@ -154,7 +154,12 @@ def simulate(
         options.note_unused("with --rates", "sigma", "trials", "methods", "random_starts")
     else:
         options.note_unused("without --rates", "data_sets")
-    _check(rates, save, images, (camera, board, views))
+    if images and save is None:
+        raise UsageError("--images needs a place to write to; give --save DIR")
+    if rates and (save, camera, board, views) != (None,) * 4:
+        raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
+    if save is not None:
+        preparation.check_folder("--save", save)
     options.check_plot(plot, "-")
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
@@ -193,15 +198,6 @@ def simulate(
         print_summary(found)
     else:
         click.echo(text_of(*simulation_tables(study, starts, paper)))
-
-
-def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...]) -> None:
-    if images and save is None:
-        raise UsageError("--images needs a place to write to; give --save DIR")
-    if rates and (save is not None or any(part is not None for part in scene)):
-        raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
-    if save is not None:
-        preparation.check_folder("--save", save)
 
 
 def _scene(
