@@ -202,18 +202,12 @@ def _measure(
     n_points = np.bincount(index, minlength=n_views)
     n_seen = np.bincount(index[in_front], minlength=n_views)
     sums = np.bincount(index[in_front], weights=squares, minlength=n_views)
-    largest = np.full(n_views, -1.0)
-    np.maximum.at(largest, index[in_front], squares)
-    views = {
-        name: ViewEvaluation(
-            n_points=int(n_points[k]),
-            n_behind=int(n_points[k] - n_seen[k]),
-            rmse_px=float(np.sqrt(sums[k] / n_seen[k])) if n_seen[k] else np.nan,
-            max_px=float(np.sqrt(largest[k])) if n_seen[k] else np.nan,
-            fitted=bool(fitted[k]),
-        )
-        for k, name in enumerate(points.view_names)
-    }
+    largest = np.full(n_views, np.nan)
+    np.fmax.at(largest, index[in_front], squares)
+    with np.errstate(invalid="ignore"):  # nan where no point is in front
+        columns = n_points, n_points - n_seen, np.sqrt(sums / n_seen), np.sqrt(largest), fitted
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    views = {name: ViewEvaluation(*row) for name, row in zip(points.view_names, rows, strict=True)}
     bias, power = _moments(residuals[in_front])
     return CameraEvaluation(
         residuals=residuals,

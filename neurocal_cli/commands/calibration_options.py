@@ -42,15 +42,13 @@ class Estimation:
 
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read, with a UsageError."""
-        for name, option, type_ in (
+        for given, option, type_ in (
             (self.image_center, "--image-center", "2"),
             (self.intrinsics, "--intrinsics", "3"),
             (self.extrinsics, "--extrinsics", "4"),
         ):
-            if name is not None and self.type != type_:
-                raise UsageError(
-                    f"{option} needs --type {type_}, but the type is {self.type}; give --type {type_}"
-                )
+            if given is not None:
+                self._require("type", type_, option)
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
@@ -68,11 +66,14 @@ class Estimation:
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
         for name, option in _BACKPROP_ONLY.items():
-            if getattr(self, name) is not None and self.trainer != "backprop":
-                raise UsageError(
-                    f"{option} needs --trainer backprop, but the trainer is {self.trainer}; give --trainer "
-                    "backprop"
-                )
+            if getattr(self, name) is not None:
+                self._require("trainer", "backprop", option)
+
+    def _require(self, name: str, wanted: str, option: str) -> None:
+        """Refuse an option that needs another value of the option with this name."""
+        if (given := getattr(self, name)) != wanted:
+            need = f"--{name} {wanted}"
+            raise UsageError(f"{option} needs {need}, but the {name} is {given}; give {need}")
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
         """Read the given files; return the points and the library's keyword arguments."""

@@ -123,14 +123,9 @@ def _other(data: bytes) -> str | None:
 
 
 def _png(data: bytes) -> Header:
-    width = height = 0
-    orientation = 1
-    for kind, body in _png_chunks(data):
-        if kind == b"IHDR":
-            width, height = struct.unpack_from(">II", body)
-        elif kind == b"eXIf":
-            orientation = _exif_orientation(body)
-    return Header("PNG", width, height, orientation)
+    chunks = dict(_png_chunks(data))
+    width, height = struct.unpack_from(">II", chunks.get(b"IHDR", bytes(8)))
+    return Header("PNG", width, height, _exif_orientation(chunks.get(b"eXIf", b"")))
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:

@@ -192,12 +192,9 @@ def _plain(value: Any) -> str:
 def _check_settings(tables: list[Table], notes: list[str]) -> None:
     """Refuse points at several zoom or focus settings, because a calibration has one setting."""
     for name in SETTINGS:
-        setting: float | None = None
-        for table in tables:
-            column = table.numbers.get(name)
-            if column is None:
-                continue
-            setting = float(column[0]) if setting is None else setting
+        given = [(table, table.numbers[name]) for table in tables if name in table.numbers]
+        for table, column in given:
+            setting = given[0][1][0]
             differs = column != setting
             if differs.any():
                 row = int(np.argmax(differs))
@@ -206,7 +203,8 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
                     "but a calibration has one setting of zoom and focus; give one setting, or use "
                     "`neurocal lens fit`"
                 )
-        if setting is not None:
+        if given:
+            setting = given[0][1][0]
             notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
 
 
@@ -252,5 +250,5 @@ def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
     blocks = [_together(table, names) for table in tables]
     if all(block is None for block in blocks):
         return None
-    zeros = [np.zeros((len(table), len(names))) for table in tables]
-    return _joined([zero if block is None else block for zero, block in zip(zeros, blocks, strict=True)])
+    known = zip(tables, blocks, strict=True)
+    return _joined([np.zeros((len(table), len(names))) if one is None else one for table, one in known])

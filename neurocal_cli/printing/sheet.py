@@ -37,21 +37,21 @@ _LONGEST = 200.0  # ruler [mm]
 _COLS, _ROWS = 9, 6  # of the board that is made without being asked for: one count is odd, one even
 
 
-@frozen_dataclass
+@frozen_dataclass(eq=False)
 class Line:
-    """A thin line; ends in mm."""
+    """A thin line; ends (2,) in mm."""
 
-    start: tuple[float, float]
-    end: tuple[float, float]
+    start: Array
+    end: Array
     width: float = 0.2
     dashed: bool = False
 
 
-@frozen_dataclass
+@frozen_dataclass(eq=False)
 class Text:
-    """A text whose base line begins, or whose middle is, at a place in mm."""
+    """A text whose base line begins, or whose middle is, at a place (2,) in mm."""
 
-    place: tuple[float, float]
+    place: Array
     content: str
     size: float = 3.0
     middle: bool = False
@@ -126,7 +126,7 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
     lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
     rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
-    text = Text((_EDGE + _RULER + _QUIET, height - _EDGE), _caption(board), 2.8)
+    text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), _caption(board), 2.8)
     return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
 
 
@@ -152,7 +152,7 @@ def _beside(start: Array, end: Array) -> list[Line]:
     """Dashes of a fold: 4 mm at either end, beside the pattern, where they change none of its edges."""
     along = (end - start) / np.linalg.norm(end - start)
     return [
-        Line(_pair(place + 0.7 * way), _pair(place + (_QUIET - 0.5) * way), dashed=True)
+        Line(place + 0.7 * way, place + (_QUIET - 0.5) * way, dashed=True)
         for place, way in ((start, -along), (end, along))
     ]
 
@@ -165,16 +165,16 @@ def _rulers(corner: Array, size: Array, height: float) -> tuple[list[Line], list
     for axis, start in ((0, np.array([corner[0], below])), (1, np.array([beside, corner[1]]))):
         length = _TICK * np.floor(min(_LONGEST, float(size[axis])) / _TICK)
         along, across = np.eye(2)[axis], np.eye(2)[1 - axis]
-        lines.append(Line(_pair(start), _pair(start + length * along)))
+        lines.append(Line(start, start + length * along))
         for mark in np.arange(0.0, length + 1, _TICK):
             tall = 2.5 if mark % (5 * _TICK) == 0 else 1.5
             place = start + mark * along
-            lines.append(Line(_pair(place), _pair(place + tall * across)))
+            lines.append(Line(place, place + tall * across))
             if mark % (5 * _TICK) == 0:
                 shift = np.array([0.0, 5.5]) if axis == 0 else np.array([3.2, 0.9])
                 last = axis == 0 and mark + 5 * _TICK > length
                 shown = f"{mark:.0f}{' mm' if last else ''}"
-                texts.append(Text(_pair(place + shift), shown, 2.5, middle=axis == 0))
+                texts.append(Text(place + shift, shown, 2.5, middle=axis == 0))
     return lines, texts
 
 
@@ -185,7 +185,3 @@ def _caption(board: Board) -> str:
         for plane in board.planes
     )
     return f"{sizes}. Print at 100 %, then measure the rulers."
-
-
-def _pair(point: Array) -> tuple[float, float]:
-    return float(point[0]), float(point[1])

@@ -88,21 +88,18 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 def _model(camera: Camera, pose: Pose) -> str:
     a, _, b, u0, v0 = camera.entries
     width, height = camera.image_size or (0, 0)
-    values = [a, b, u0, v0, *camera.distortion.coefficients.tolist()]
+    values = map(number, [a, b, u0, v0, *camera.distortion.coefficients.tolist()])
+    placed = map(number, [*to_vector(pose.R), *pose.t])
     return (
         "{\n"
         f"    'lensmodel':  'LENSMODEL_{_NAMES[camera.distortion.model]}',\n"
         "    # fx, fy, cx, cy, and the coefficients of the distortion\n"
-        f"    'intrinsics': [ {_list(values)} ],\n"
+        f"    'intrinsics': [ {', '.join(values)} ],\n"
         "    # rotation vector and translation from the world to the camera\n"
-        f"    'extrinsics': [ {_list([*to_vector(pose.R), *pose.t])} ],\n"
+        f"    'extrinsics': [ {', '.join(placed)} ],\n"
         f"    'imagersize': [ {width}, {height} ],\n"
         "}\n"
     )
-
-
-def _list(values: list[float]) -> str:
-    return ", ".join(number(value) for value in values)
 
 
 FORMAT = Format("mrcal", tuple(_NAMES), False, False, 99, False, True, _text)
