@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -20,7 +19,7 @@ _ENDINGS = (".svg", ".pdf", ".png")
 
 
 @click.command(cls=options.Command)
-@board_options("Unit of --square. A board file names its own unit.")
+@options.board("Unit of --square. A board file names its own unit.")
 @click.option(
     "--paper",
     metavar="NAME|WxH",
@@ -78,7 +77,7 @@ def board(
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
-    target = given_board(board, cols, rows, square, unit)
+    target = preparation.given_board(board, cols, rows, square, unit)
     if target is None:
         target = default_board(size)
     sheet = on_paper(target, size)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.board_options import board_options, check_unit, given_board
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
     "If the format does not have the distortion model, write the nearest camera that it has.",
     without="refuse",
 )
-@board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
+@options.board("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
 @options.count(
     "--image-size",
     "W H",
@@ -123,10 +122,11 @@ def convert(
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(*files, board)
     preparation.check_summary(as_json, output)
-    check_unit(unit)
+    preparation.check_unit(unit)
     folder = os.path.isdir(output) or output.endswith(os.sep)
     preparation.check_outputs((None if folder else output,), (*files, board))
-    target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
+    of_board = None if square is None and board is None else unit
+    target_board = preparation.given_board(board, cols, rows, square, of_board)
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.io.files import repeatable_stdin
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.board_options import NO_SIZE, board_options, given_board
 from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
@@ -44,7 +43,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     nargs=-1,
     required=True,
 )
-@board_options("Unit of --square. A board file names its own unit.")
+@options.board("Unit of --square. A board file names its own unit.")
 @options.choice(
     "--points",
     "midpoints edges vertices",
@@ -138,9 +137,9 @@ def detect(
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
-    target = given_board(board, cols, rows, square, unit)
+    target = preparation.given_board(board, cols, rows, square, unit)
     if target is None:
-        raise UsageError(NO_SIZE)
+        raise UsageError(preparation.NO_SIZE)
     note([_rescaled(target)] if target.distances else [])
     target = target.as_measured()
     wanted = _wanted(target, points, gamma, overlay, cache)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import click
@@ -195,6 +196,25 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
+
+
+def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
+    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `preparation.given_board`."""
+    size = partial(count, without="none", least=2, most=1000)
+    added = (
+        path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+        size("--cols", "C", "Number of inner vertices in a row of the board."),
+        size("--rows", "R", "Number of rows of inner vertices."),
+        number("--square", "S", "Side length of a square.", without="none", positive=True),
+        click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
+    )
+
+    def add(f: F) -> F:
+        for option in reversed(added):
+            f = option(f)
+        return f
+
+    return add
 
 
 camera_name = click.option(

@@ -1,4 +1,4 @@
-"""What a command does before its work: it checks inputs and outputs, and reads points and known cameras."""
+"""What commands do before their work: check inputs and outputs, and read points, boards and known cameras."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
+
+NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
@@ -112,3 +115,32 @@ def calibration_or_camera(
         why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
         note([f"only the intrinsic parameters and the distortion are used{besides}: {why}"])
     return camera, points
+
+
+def given_board(
+    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
+) -> Board | None:
+    """Read the board; None if no option describes one, a UsageError if they contradict each other."""
+    from neurocal_cli.board import Board
+
+    check_unit(unit)
+    numbers = (cols, rows, square)
+    if path is not None:
+        if numbers != (None, None, None) or unit is not None:
+            raise UsageError(
+                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+            )
+        from neurocal_cli.io.board_yaml import read_board
+
+        return read_board(path)
+    if numbers == (None, None, None) and unit is None:
+        return None
+    if cols is None or rows is None or square is None:
+        raise UsageError(NO_SIZE)
+    return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+
+def check_unit(unit: str | None) -> None:
+    """Refuse a unit that cannot be stored in a file, with a UsageError."""
+    if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+        raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")

@@ -106,7 +106,8 @@ def _versions(root: Field) -> dict[str, str]:
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
     """Thumbnails of the views' photographs, for the page."""
-    from neurocal_cli.io.thumbnails import photographs_of, thumbnails
+    from neurocal_cli.io.image_paths import photographs_of
+    from neurocal_cli.io.images import thumbnails
 
     views = calibration.points.view_names
     images = photographs_of(views, word)

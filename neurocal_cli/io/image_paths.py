@@ -63,6 +63,22 @@ def view_names(paths: Iterable[str]) -> tuple[str, ...]:
     return names
 
 
+def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
+    """Find the image of each view: the file with its name, without folder and extension.
+
+    `word` is a folder or a pattern, see `find_images`. An InputError says that no view has an image there.
+    """
+    paths = find_images([word])
+    found = dict(zip(view_names(paths), paths, strict=True))
+    images = {view: found[view] for view in views if view in found}
+    if not images:
+        raise InputError(
+            f"{word}: no image has the name of a view, such as {views[0] if views else 'none'!s}; give the "
+            "folder of the images that were calibrated from"
+        )
+    return images
+
+
 def _in_folder(folder: str) -> list[str]:
     try:
         names = sorted(os.listdir(folder), key=natural_order)
