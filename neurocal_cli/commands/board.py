@@ -104,13 +104,11 @@ def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> N
     if alike and len(target.planes) == 1:
         cols, rows = alike[0].cols, alike[0].rows
         warn(
-            [
-                f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
-                f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
-            ]
+            f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
+            f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
         )
     if any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
-        warn(["neurocal detect needs at least 3 x 3 inner vertices"])
+        warn("neurocal detect needs at least 3 x 3 inner vertices")
     if as_json:
         keys = ("name", "cols", "rows", "square")
         planes = [{key: getattr(plane, key) for key in keys} for plane in target.planes]

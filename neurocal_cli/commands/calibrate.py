@@ -93,6 +93,6 @@ def calibrate(
         from neurocal_cli.plots.pages import draw_camera
 
         write_plots(plots, partial(draw_camera, Subject.of(calibration)))
-    warn(write_result(calibration, output, lean=lean))
+    warn(*write_result(calibration, output, lean=lean))
     write_page(html, calibration, *inputs)
     conclude(calibration, as_json, calibration_json, calibration_report)

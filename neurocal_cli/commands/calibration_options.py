@@ -79,7 +79,7 @@ class Estimation:
         """Read the given files; return the points and the library's keyword arguments."""
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
-                note([f"--image-size is used instead of the image_size in {points.source}"])
+                note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {
             "type": int(self.type),
@@ -126,10 +126,8 @@ class Estimation:
         width, height = points.image_size
         center = (width - 1) / 2, (height - 1) / 2
         warn(
-            [
-                "no image centre is given, so the middle of the image, "
-                f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
-            ]
+            "no image centre is given, so the middle of the image, "
+            f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
         )
         return center
 

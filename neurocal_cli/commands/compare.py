@@ -91,7 +91,7 @@ def compare(
 
     with ProgressBar() as progress:
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
-    note(found.notes)
+    note(*found.notes)
     if as_json:
         print_summary(comparison_json(found))
     else:

@@ -156,8 +156,8 @@ def _write_cameras(
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
     _write(contents, output, target)
-    note(adapted.remarks)
-    warn(adapted.losses)
+    note(*adapted.remarks)
+    warn(*adapted.losses)
     written = [
         {
             "name": camera.name,
@@ -185,7 +185,7 @@ def _read(
 
     notes: list[str] = []
     points = None if is_folder(files[0]) else read_corners(files, board, notes, unit)
-    note(notes)
+    note(*notes)
     if points is not None:
         if size is not None and points.image_size not in (None, size):
             raise InputError("the image size of the file is another; leave out --image-size")
@@ -219,8 +219,8 @@ def _write_points(points: Correspondences, target: str, output: str) -> dict[str
 
     text = corner_text(points, target, os.path.splitext(output)[1].lower())
     losses, remarks = points_lost(points, target)
-    note(remarks)
-    warn(losses)
+    note(*remarks)
+    warn(*losses)
     write_whole(output, text)
     warnings = [*losses, *remarks]
     return {"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": warnings}

@@ -140,7 +140,8 @@ def detect(
     target = preparation.given_board(board, cols, rows, square, unit)
     if target is None:
         raise UsageError(preparation.NO_SIZE)
-    note([_rescaled(target)] if target.distances else [])
+    if target.distances:
+        note(_rescaled(target))
     target = target.as_measured()
     wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
@@ -196,7 +197,7 @@ def _examined(
     preparation.check_outputs((output,), (*given, board_file))
     with videos_as_frames(given, frames) as (paths, folder):
         names = view_names(paths)
-        note(_mixed_sizes(paths))
+        note(*_mixed_sizes(paths))
         if overlay is not None:
             _check_overlay(overlay, paths)
         outcomes = []
@@ -269,10 +270,10 @@ def _report(
     for name, outcome in outcomes.items():
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(f"{some_of(names)}: {text}" for text, names in remarks.items())
-    warn(dict.fromkeys(text for detection in found.values() for text in detection.warnings))
-    warn(_mixed_orientations(outcomes.values()))
-    warn(_another_board([_shown(outcome) for outcome in outcomes.values()], board))
+    note(*(f"{some_of(names)}: {text}" for text, names in remarks.items()))
+    warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
+    warn(*_mixed_orientations(outcomes.values()))
+    warn(*_another_board([_shown(outcome) for outcome in outcomes.values()], board))
     if not found and len(outcomes) == 1:
         raise NeurocalError(*problems.values())
     if not found:

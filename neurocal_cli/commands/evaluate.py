@@ -123,10 +123,10 @@ def _tell(evaluation: CameraEvaluation) -> None:
     ):
         if names:
             some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-            note([f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed"])
+            note(f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed")
     if evaluation.on_target:
-        note(["the points are taken where the calibration found them, not where their file has them"])
-    warn(evaluation.warnings)
+        note("the points are taken where the calibration found them, not where their file has them")
+    warn(*evaluation.warnings)
 
 
 @evaluate.command(cls=options.Command)
@@ -204,11 +204,11 @@ def stereo(
     from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
     from neurocal_cli.verdict.report import verdict_lines
 
-    note(views_alone(evaluation.alone))
+    note(*views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note([f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed"])
-    warn(evaluation.warnings)
+        note(f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed")
+    warn(*evaluation.warnings)
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
@@ -223,7 +223,7 @@ def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Corres
 
     notes: list[str] = []
     left, right = (read_points([name], notes=notes) for name in names)
-    note(notes)
+    note(*notes)
     return left, right
 
 
@@ -255,6 +255,6 @@ def _with_poses(name: str, points: Correspondences) -> Calibration:
     if isinstance(camera, Calibration):
         if camera.views:
             return camera
-        note([f"{name}: holds no poses; they are fitted"])
+        note(f"{name}: holds no poses; they are fitted")
     assert seen is not None
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

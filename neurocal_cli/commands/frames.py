@@ -60,7 +60,7 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
         if number in wanted:
             saved.append(os.path.join(folder, f"{name}_{number:06d}.png"))
             save_frame(grey, saved[-1])
-    note([f"{path}: {len(saved)} of {total} frames are sharp and differ from each other"])
+    note(f"{path}: {len(saved)} of {total} frames are sharp and differ from each other")
     return saved
 
 

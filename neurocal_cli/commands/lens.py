@@ -145,7 +145,7 @@ def fit(
 
     notes: list[str] = []
     data = read_lens_data(points, notes=notes)
-    note(notes)
+    note(*notes)
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
@@ -224,7 +224,7 @@ def camera(
         from neurocal_cli.zoom_lens.report import camera_report
 
         say(camera_report(calibration))
-    warn(calibration.warnings)
+    warn(*calibration.warnings)
 
 
 @lens.command(cls=options.Command)
@@ -268,7 +268,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     learnt = read_lens(lens_file)
     notes: list[str] = []
     data = read_lens_points(points, notes=notes)
-    note(notes)
+    note(*notes)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
@@ -279,4 +279,4 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
         print_summary(evaluation_json(evaluation, verdict))
     else:
         click.echo(evaluation_report(evaluation, learnt.controls, verdict))
-    warn(evaluation.warnings)
+    warn(*evaluation.warnings)

@@ -178,7 +178,7 @@ def typed(*names: str) -> list[str]:
 
 def note_unused(why: str, *names: str) -> None:
     """Say which parameters on the command line change nothing: "--name has no effect", and `why`."""
-    note(f"{option} has no effect {why}" for option in typed(*names))
+    note(*(f"{option} has no effect {why}" for option in typed(*names)))
 
 
 points = argument(

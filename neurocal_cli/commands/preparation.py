@@ -73,7 +73,7 @@ def given_points(names: str | Sequence[str]) -> Correspondences:
 
     notes: list[str] = []
     points = read_points(names, notes=notes)
-    note(notes)
+    note(*notes)
     return points
 
 
@@ -113,7 +113,7 @@ def calibration_or_camera(
         except FormatError:
             raise error from None
         why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
-        note([f"only the intrinsic parameters and the distortion are used{besides}: {why}"])
+        note(f"only the intrinsic parameters and the distortion are used{besides}: {why}")
     return camera, points
 
 

@@ -195,7 +195,7 @@ class _Work:
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         verdict = self.rig.verdict
         if verdict is not None and verdict.word == "poor":
-            warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}"])
+            warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}")
 
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify the points of both cameras and write them."""
@@ -215,7 +215,7 @@ class _Work:
                     f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
                     "which are 90 degrees from the rectified camera's axis or more"
                 )
-            note(notes)
+            note(*notes)
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
@@ -230,10 +230,8 @@ class _Work:
         )
         if self.own_rows and error.median_px > max(_MISFIT * self.own_rows.median_px, _NO_MISFIT):
             warn(
-                [
-                    "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
-                    "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
-                ]
+                "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
+                "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
             )
 
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
@@ -250,7 +248,7 @@ class _Work:
         pictures = []
         for remapping, path in zip(self.remappings, pair, strict=True):
             pixels, source, notes = read_picture(path)
-            note(f"{source}: {text}" for text in notes)
+            note(*(f"{source}: {text}" for text in notes))
             try:
                 pictures.append(remapping(pixels))
             except InputError as error:

@@ -113,5 +113,5 @@ def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str,
     images = photographs_of(views, word)
     missing = [view for view in views if view not in images]
     if missing:
-        note([f"no image of {len(missing)} views, such as {missing[0]}, in {word}"])
+        note(f"no image of {len(missing)} views, such as {missing[0]}, in {word}")
     return thumbnails(images, calibration.image_size, _MOST_BYTES // cameras)

@@ -185,7 +185,7 @@ def simulate(
             try:
                 starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
             except DegenerateGeometryError as error:
-                note([f"no random starts: {error}"])
+                note(f"no random starts: {error}")
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_simulation
 
@@ -224,7 +224,7 @@ def _scene(
             try:
                 return scenes.calibrated_scene(read_calibration(camera_file)), False
             except FormatError:
-                note([f"{camera_file} holds no points of its own; the paper's boards are used"])
+                note(f"{camera_file} holds no points of its own; the paper's boards are used")
         camera = read_intrinsics(camera_file)
     count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)
     poses = scenes.random_poses(camera, board, count, np.random.default_rng((seed, 2)))

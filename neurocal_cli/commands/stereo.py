@@ -120,7 +120,7 @@ def stereo(
     for name, side in zip((left, right), sides, strict=True):
         notes: list[str] = []
         prepared.append(side.prepare(read_points(name, notes=notes)))
-        note(notes)
+        note(*notes)
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
@@ -134,9 +134,9 @@ def stereo(
 
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
-    warn(write_result(rig, output, lean=lean, alpha=alpha))
+    warn(*write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
-    note(views_alone(rig.alone))
+    note(*views_alone(rig.alone))
     conclude(rig, as_json, rig_json, rig_report)
 
 

@@ -6,7 +6,7 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -87,13 +87,13 @@ def refer_to(what: str) -> str:
     return f"see the {what} above" if _VERBOSITY.get() >= -1 else f"the {what} are shown without -qq"
 
 
-def note(texts: Iterable[str]) -> None:
+def note(*texts: str) -> None:
     """Report how the input was treated, if the user may not expect it."""
     for text in texts:
         say(f"note: {one_line(text)}")
 
 
-def warn(texts: Iterable[str]) -> None:
+def warn(*texts: str) -> None:
     """Warn of problems that may make the result worse than it looks."""
     for text in texts:
         complain(f"warning: {text}")
@@ -113,7 +113,7 @@ def conclude(
         print_summary(in_json(result))
     else:
         say(in_words(result))
-    warn(result.warnings)
+    warn(*result.warnings)
     if not result.converged:
         click.get_current_context().exit(_NOT_CONVERGED)
 

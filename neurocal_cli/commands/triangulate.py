@@ -98,7 +98,7 @@ def triangulate(
     # Read the first rows before the output is opened, so that errors in the header leave it untouched.
     matches = read_matches(inputs[-1], notes)
     matches = chain([next(matches)], matches)
-    note(notes)
+    note(*notes)
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
@@ -109,7 +109,7 @@ def _sigma(rig: Rig) -> float:
     """The noise of the rig's own points; a typical value if it has none."""
     if rig.sigma == rig.sigma:
         return rig.sigma
-    note([f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma"])
+    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
     return _USUAL_SIGMA
 
 
@@ -126,8 +126,8 @@ def _rig(names: tuple[str, ...]) -> Rig:
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)
     views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
-    note([f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}"])
-    warn(rig.warnings)
+    note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
+    warn(*rig.warnings)
     if not rig.warnings:
         _warn_of_poor(rig)
     return rig
@@ -136,7 +136,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
 def _warn_of_poor(rig: Rig) -> None:
     verdict = rig.verdict
     if verdict is not None and verdict.word == "poor":
-        warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}; points in space may be far off"])
+        warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}; points in space may be far off")
 
 
 class _Tally:
@@ -179,13 +179,9 @@ class _Tally:
         else:
             say(", ".join(parts))
         if self.outside:
-            warn(
-                [f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras"]
-            )
+            warn(f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras")
         if self.off + self.behind > _MANY_OFF * self.points:
             warn(
-                [
-                    "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
-                    "and that the pixels are neither undistorted nor rectified"
-                ]
+                "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
+                "and that the pixels are neither undistorted nor rectified"
             )

@@ -65,7 +65,7 @@ class Undistorting:
     def tell_notes(self) -> None:
         """Report the remarks about images, each once."""
         for text, names in self.notes.items():
-            note([f"{some_of(names)}: {text}"])
+            note(f"{some_of(names)}: {text}")
 
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
@@ -168,7 +168,7 @@ class Undistorting:
                 "degrees from the axis or more; --to cylinder keeps them"
             )
         corrected = map_points(points.select(kept), self.camera, new)
-        note(notes)
+        note(*notes)
         return format_points(corrected)
 
 
