@@ -18,10 +18,10 @@ from neurocal_cli.commands.streams import (
     note,
     one_line,
     print_summary,
-    refer_to,
     say,
     some_of,
     warn,
+    where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
 
@@ -277,7 +277,7 @@ def _report(
     if not found and len(outcomes) == 1:
         raise NeurocalError(*problems.values())
     if not found:
-        raise NeurocalError(f"none of the {len(outcomes)} images shows the board; {refer_to('reasons')}")
+        raise NeurocalError(f"none of the {len(outcomes)} images shows the board; {where_reasons_are()}")
     summary: dict[str, Any] = {
         "n_images": len(outcomes),
         "n_points": sum(len(detection.ids) for detection in found.values()),

@@ -15,6 +15,9 @@ from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line,
 from neurocal_cli.errors import FormatError, NeurocalError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
 
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
@@ -44,23 +47,20 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
     from neurocal_cli.io.video import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
-    total = 0
     with ProgressBar() as progress:
 
-        def counted() -> Iterator[object]:
-            nonlocal total
+        def watched() -> Iterator[NDArray[np.uint8]]:
             for grey in video_frames(path):
-                total += 1
                 progress(f"choosing frames of {name}", 0.0)
                 yield grey
 
-        numbers = choose_frames(counted(), most, frame_rate(path))  # type: ignore[arg-type]
+        numbers = choose_frames(watched(), most, frame_rate(path))
     wanted, saved = set(numbers), []
     for number, grey in enumerate(video_frames(path)):
         if number in wanted:
             saved.append(os.path.join(folder, f"{name}_{number:06d}.png"))
             save_frame(grey, saved[-1])
-    note(f"{path}: {len(saved)} of {total} frames are sharp and differ from each other")
+    note(f"{path}: {len(saved)} of {number + 1} frames are sharp and differ from each other")
     return saved
 
 

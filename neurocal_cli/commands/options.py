@@ -95,19 +95,12 @@ class FiniteNumber(FloatParamType):
         return number
 
 
-class _MethodNames(click.ParamType):  # type: ignore[type-arg]
-    """Names of methods, separated by commas; a tuple without repetitions."""
-
-    name = "methods"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Split, or fail as click does."""
-        if isinstance(value, tuple):
-            return value
-        names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
-        if not names or any(name not in METHODS for name in names):
-            self.fail(f"{value!r} is not a list of {', '.join(METHODS)}.", param, ctx)
-        return names
+def _method_names(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
+    """Names of methods, separated by commas, without repetitions."""
+    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+    if not names or any(name not in METHODS for name in names):
+        raise click.BadParameter(f"{value!r} is not a list of {', '.join(METHODS)}.")
+    return names
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -249,7 +242,7 @@ def methods(default: str) -> Callable[[F], F]:
     return click.option(
         "--methods",
         metavar="M,...",
-        type=_MethodNames(),
+        callback=_method_names,
         default=default,
         help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
         "with the paper's trainer.",

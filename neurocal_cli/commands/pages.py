@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
 
-F = TypeVar("F", bound=Callable[..., Any])
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
 

@@ -82,9 +82,9 @@ def complain(text: str) -> None:
         tell(one_line(text))
 
 
-def refer_to(what: str) -> str:
+def where_reasons_are() -> str:
     """Tell where the lines of `complain` are, which -qq leaves out."""
-    return f"see the {what} above" if _VERBOSITY.get() >= -1 else f"the {what} are shown without -qq"
+    return "see the reasons above" if _VERBOSITY.get() >= -1 else "the reasons are shown without -qq"
 
 
 def note(*texts: str) -> None:
@@ -195,7 +195,7 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
                 failed[k] = str(error)
             progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
     if len(failed) == len(items):
-        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {refer_to('reasons')}")
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {where_reasons_are()}")
     return failed
 
 

@@ -47,22 +47,16 @@ def residual_map(
         f"M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}" for (u, v), (x, y) in zip(pixels[::step], ends, strict=True)
     )
     dots = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in pixels[::step])
+    image = "" if photograph is None else b64encode(photograph).decode()
+    if image:  # its pixel centres are at whole numbers
+        place = f'x="-.5" y="-.5" width="{width}" height="{height}"'
+        image = f'<image {place} href="data:image/jpeg;base64,{image}"/>'
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="residuals, {scale:.3g} times enlarged">'
-        f'<rect width="{width}" height="{height}" class="frame"/>{_photograph(photograph, size)}'
+        f'<rect width="{width}" height="{height}" class="frame"/>{image}'
         f'<path d="{dots}" class="dots" stroke-width="{bold * width / 160:.2f}"/>'
         f'<path d="{path}" class="lines" stroke-width="{bold * width / 450:.2f}"/>'
         f"{_crosses(left_out, width)}</svg>"
-    )
-
-
-def _photograph(jpeg: bytes | None, size: tuple[int, int]) -> str:
-    """Embed the image, with pixel centres at whole numbers."""
-    if jpeg is None:
-        return ""
-    data = b64encode(jpeg).decode()
-    return (
-        f'<image x="-.5" y="-.5" width="{size[0]}" height="{size[1]}" href="data:image/jpeg;base64,{data}"/>'
     )
 
 
@@ -96,13 +90,12 @@ def scatter(residuals: Array) -> str:
     step = -(-len(residuals) // _MOST)
     shown = np.clip(residuals[::step] / sigma, -5.5, 5.5)
     dots = "".join(f"M{x:.2f} {y:.2f}h0" for x, y in shown)
-    circles = '<circle r="3" class="axis"/>'
-    labels = f'<text x="2.3" y="2.75" font-size="0.5">{3 * sigma:.2g} px</text>'
     return (
         '<svg viewBox="-6 -6 12 12" role="img" aria-label="du and dv of all points">'
         '<rect x="-6" y="-6" width="12" height="12" class="frame"/>'
-        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/>{circles}'
-        f'<path d="{dots}" class="dots" stroke-width="0.11"/>{labels}</svg>'
+        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/><circle r="3" class="axis"/>'
+        f'<path d="{dots}" class="dots" stroke-width="0.11"/>'
+        f'<text x="2.3" y="2.75" font-size="0.5">{3 * sigma:.2g} px</text></svg>'
     )
 
 

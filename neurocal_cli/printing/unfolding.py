@@ -6,6 +6,8 @@ to the right and y downwards, in the board's unit.
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
@@ -159,12 +161,11 @@ def _laid(plane: Plane, place: _Map, planes: tuple[Plane, ...]) -> Laid:
 
 
 def _check_apart(laid: list[Laid]) -> None:
-    boxes = [(one.outline.min(axis=0), one.outline.max(axis=0)) for one in laid]
-    for k, (low, high) in enumerate(boxes):
-        for n in range(k):
-            gap = np.maximum(low - boxes[n][1], boxes[n][0] - high)
-            if (gap < -_SAME * laid[k].plane.square).all():
-                raise InputError(
-                    f"the planes {laid[n].plane.name!r} and {laid[k].plane.name!r} would lie on each other "
-                    "on the sheet; print them one by one"
-                )
+    for first, second in combinations(laid, 2):
+        a, b = first.outline, second.outline
+        gap = np.maximum(b.min(axis=0) - a.max(axis=0), a.min(axis=0) - b.max(axis=0))
+        if (gap < -_SAME * second.plane.square).all():
+            raise InputError(
+                f"the planes {first.plane.name!r} and {second.plane.name!r} would lie on each other on the "
+                "sheet; print them one by one"
+            )
