@@ -42,7 +42,13 @@ class Plane:
     measured: tuple[tuple[float, ...], ...] = ()  # c, r [squares] and X, Y, Z of points
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        name = self.name
+        if not isinstance(name, str):
+            raise InputError(f"name must be text, found {name!r}")
+        if name != name.strip() or not name.isprintable() or "/" in name:
+            raise InputError(
+                f"name must be printable, without '/' and outer blanks, found {name!r}; rename it"
+            )
         for count in ("cols", "rows"):
             object.__setattr__(self, count, _count(count, getattr(self, count)))
         square = _numbers("square", self.square, ())
@@ -76,10 +82,7 @@ class Plane:
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
 
     def truly_at(self, grid: ArrayLike) -> Array:
-        """True world coordinates (N, 3) of places (N, 2) [squares]: as measured, and smooth in between.
-
-        A thin-plate spline through the measured points of the plane.
-        """
+        """True world coordinates (N, 3) of places (N, 2) [squares]: measured, else by a thin-plate spline."""
         world = self.at(grid)
         if not self.measured:
             return world
@@ -218,13 +221,6 @@ def smooth_between(places: Array, values: Array, at: Array) -> Array:
     from scipy.interpolate import RBFInterpolator
 
     return np.asarray(RBFInterpolator(places, values)(at))
-
-
-def _check_name(name: object) -> None:
-    if not isinstance(name, str):
-        raise InputError(f"name must be text, found {name!r}")
-    if name != name.strip() or not name.isprintable() or "/" in name:
-        raise InputError(f"name must be printable, without '/' and outer blanks, found {name!r}; rename it")
 
 
 def _count(name: str, value: object) -> int:

@@ -208,7 +208,8 @@ def _measure(
         columns = n_points, n_points - n_seen, np.sqrt(sums / n_seen), np.sqrt(largest), fitted
     rows = zip(*(column.tolist() for column in columns), strict=True)
     views = {name: ViewEvaluation(*row) for name, row in zip(points.view_names, rows, strict=True)}
-    bias, power = _moments(residuals[in_front])
+    seen = residuals[in_front] if in_front.any() else np.full((1, 2), np.nan)
+    bias, power = seen.mean(axis=0), (seen**2).mean(axis=0)
     return CameraEvaluation(
         residuals=residuals,
         n_points=len(points),
@@ -222,10 +223,3 @@ def _measure(
         views=views,
         warnings=warnings,
     )
-
-
-def _moments(residuals: Array) -> tuple[Array, Array]:
-    """Mean and mean square of each axis; nan when there is no residual."""
-    if not len(residuals):
-        return np.full(2, np.nan), np.full(2, np.nan)
-    return residuals.mean(axis=0), (residuals**2).mean(axis=0)

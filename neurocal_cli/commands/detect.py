@@ -199,7 +199,10 @@ def _examined(
         names = view_names(paths)
         note(*_mixed_sizes(paths))
         if overlay is not None:
-            _check_overlay(overlay, paths)
+            preparation.check_folder("--overlay", overlay)
+            folders = {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}
+            if os.path.realpath(overlay) in folders:
+                raise UsageError(f"--overlay {overlay} is the folder of the images; give another folder")
         outcomes = []
         with ProgressBar() as progress:
             for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
@@ -251,12 +254,6 @@ def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
         "they may be of one camera; remove the orientation from all files, for example with `exiftool "
         "-Orientation= FILE`, and detect again"
     ]
-
-
-def _check_overlay(folder: str, paths: Sequence[str]) -> None:
-    preparation.check_folder("--overlay", folder)
-    if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
-        raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
 def _report(

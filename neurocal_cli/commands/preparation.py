@@ -97,10 +97,7 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
 def calibration_or_camera(
     name: str, points: Correspondences | None, besides: str = ""
 ) -> tuple[Calibration | Camera, Correspondences | None]:
-    """Read a calibration or, for use with points, any camera file; both may hold the image size.
-
-    If the file is neither, the error says why it is no calibration.
-    """
+    """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
     from neurocal_cli.io.calibration_yaml import read_calibration
 
     try:

@@ -108,7 +108,9 @@ def stereo(
         options.note_unused("on cameras that are known", *known)
     preparation.check_one_stdin(left, right, left_intrinsics, right_intrinsics)
     check_plots(plots, output)
-    _check_outputs(output, ros)
+    names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
+    if len(set(names)) < len(names):
+        raise UsageError("-o and --ros name the same file twice; give three different files")
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
     from neurocal_cli.io.points_csv import read_points
@@ -157,9 +159,3 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
     return replace(
         estimation, type="3", intrinsics=intrinsics, image_center=None, no_skew=False, distortion="none"
     )
-
-
-def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
-    names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
-    if len(set(names)) < len(names):
-        raise UsageError("-o and --ros name the same file twice; give three different files")

@@ -197,10 +197,7 @@ def _name(path: str) -> str:
 def _check_distinct(
     inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
 ) -> None:
-    """Refuse to overwrite inputs, or to write two results to the same file; the UsageError names the two.
-
-    `paths` are the inputs from which `outputs` are made, and `others` further output files by their content.
-    """
+    """Refuse to overwrite inputs, or to write two results, which a UsageError names, to the same file."""
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}
     targets = list(zip(outputs, paths, strict=True))

@@ -42,6 +42,9 @@ def calibration_from_field(root: Field) -> Calibration:
     rejected = read_rejected(block.get("rejected"), points.unit)
     if fit["n_rejected"].integer() != len(rejected):
         fit["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
+    kind = block["type"].integer()
+    if kind not in (1, 2, 3, 4):
+        block["type"].fail("1, 2, 3 or 4")
     names, covariance = _covariance(block)
     model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
@@ -51,7 +54,7 @@ def calibration_from_field(root: Field) -> Calibration:
         fixed=fixed,
         views=views,
         points=points,
-        type=_type(block["type"]),
+        type=kind,
         method=block["method"].text(),
         trainer=block["trainer"].text(),
         seed=block["seed"].integer(),
@@ -126,13 +129,6 @@ def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
 
 def _unit(block: Field) -> str:
     return block.get("unit", "mm").text()
-
-
-def _type(field: Field) -> int:
-    number = field.integer()
-    if number not in (1, 2, 3, 4):
-        field.fail("1, 2, 3 or 4")
-    return number
 
 
 def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:

@@ -72,11 +72,7 @@ def read_calibration(path: str | Path) -> Calibration:
 def calibration_lines(
     cal: Calibration, rectified: tuple[Array, Array] | None = None, by_rows: bool = False
 ) -> Iterator[str]:
-    """Lines of the file without its header and without line ends.
-
-    `rectified` are the rectification (3, 3) and projection matrix (3, 4) of a camera on a rig, as ROS defines
-    them. See `format_calibration` for `by_rows`.
-    """
+    """Lines of a file without header; see `camera_info_lines` and, for `by_rows`, `format_calibration`."""
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
     long = large and not by_rows and have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)

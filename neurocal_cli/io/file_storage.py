@@ -95,11 +95,7 @@ def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any
 
 
 def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
-    """Write a FileStorage of strings, numbers, lists of strings, and matrices.
-
-    Matrices are (rows, cols) or (rows, cols, channels) arrays. The `ending` ``.xml`` or ``.json`` chooses the
-    format; it is YAML otherwise.
-    """
+    """Write texts, numbers, lists of texts and (rows, cols[, channels]) arrays as .xml, .json or YAML."""
     if ending == ".xml":
         body = "\n".join(_xml(key, value) for key, value in entries.items())
         return f'<?xml version="1.0"?>\n<opencv_storage>\n{body}\n</opencv_storage>\n'

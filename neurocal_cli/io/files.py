@@ -48,10 +48,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
-    """Read a file, or stdin for ``-``, in blocks of whole lines of about `size` bytes; see `read_bytes`.
-
-    A file without line ends is one block.
-    """
+    """Read a file in blocks of whole lines of about `size` bytes; without line ends it is one block."""
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
@@ -131,10 +128,7 @@ def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
 
 
 def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
-    """Decode UTF-8, with or without a byte order mark; `source` is the name for messages.
-
-    The message about a binary file names the expected `kind` of file, and ends with `instead`.
-    """
+    """Decode UTF-8; a message about a binary file names the `kind` that is wanted, and ends in `instead`."""
     if data.isascii() and b"\0" not in data:
         return data.decode("ascii")
     for mark, name in _WIDE_MARKS:

@@ -64,10 +64,7 @@ def view_names(paths: Iterable[str]) -> tuple[str, ...]:
 
 
 def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
-    """Find the image of each view: the file with its name, without folder and extension.
-
-    `word` is a folder or a pattern, see `find_images`. An InputError says that no view has an image there.
-    """
+    """Find the image of each view in a folder or by a pattern: the file with its name, without extension."""
     paths = find_images([word])
     found = dict(zip(view_names(paths), paths, strict=True))
     images = {view: found[view] for view in views if view in found}

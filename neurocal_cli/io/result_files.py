@@ -50,7 +50,11 @@ def write_result(
         text = format_rig(result, alpha, by_rows)
     else:
         text = format_calibration(result, by_rows)
-    write_whole(path, _as_json(text) if by_rows else text)
+    if by_rows:
+        from neurocal_cli.io.yaml_tree import parse_yaml
+
+        text = _lines(parse_yaml(text, "the calibration"), 3) + "\n"
+    write_whole(path, text)
     return ()
 
 
@@ -79,14 +83,8 @@ def lean_rig(rig: Rig) -> Rig:
     )
 
 
-def _as_json(text: str) -> str:
-    """Convert YAML text to JSON, with one entry of the upper levels per line."""
-    from neurocal_cli.io.yaml_tree import parse_yaml
-
-    return _lines(parse_yaml(text, "the calibration"), 3) + "\n"
-
-
 def _lines(value: Any, depth: int, indent: str = "") -> str:
+    """JSON with one entry of the upper levels per line."""
     inner = indent + "  "
     if depth and isinstance(value, dict) and value:
         parts = [f"{inner}{json.dumps(key)}: {_lines(part, depth - 1, inner)}" for key, part in value.items()]

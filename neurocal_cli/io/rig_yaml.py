@@ -130,11 +130,12 @@ def rig_from_field(root: Field) -> Rig:
         pose = Pose(block["R"].array(3, 3), block["t"].array(3))
     except InputError as error:
         raise FormatError(f"stereo: {error}; correct it", root.source) from error
+    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
     rig = Rig(
         left,
         right,
         pose,
-        _std(block),
+        std | {"baseline": block["baseline_std"].number_or_nan()},
         block["covariance"]["data"].array(6, 6, unknown=True),
         tuple(_names(entry, 2) for entry in block["pairs"].items()),  # type: ignore[misc]
         {_names(entry, 3)[:2]: _names(entry, 3)[2] for entry in block["left_out"].items()},  # type: ignore[misc]
@@ -148,11 +149,6 @@ def rig_from_field(root: Field) -> Rig:
     )
     _check_consistent(rig, block)
     return rig
-
-
-def _std(block: Field) -> dict[str, float]:
-    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
-    return std | {"baseline": block["baseline_std"].number_or_nan()}
 
 
 def _names(entry: Field, count: int) -> tuple[str, ...]:

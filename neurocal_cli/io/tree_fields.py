@@ -123,10 +123,7 @@ class Field:
         return self.value
 
     def array(self, *shape: int, unknown: bool = False) -> Array:
-        """Value as an array, from nested lists of finite numbers; -1 in the shape allows any length.
-
-        If `unknown`, null is allowed for unknown numbers and becomes NaN.
-        """
+        """Value as an array of finite numbers; -1 in the shape is any length, and null NaN if `unknown`."""
         words = " x ".join("n" if s < 0 else str(s) for s in shape)
         expected = f"{words} finite numbers{' or null' * unknown}"
         try:

@@ -97,11 +97,7 @@ def quoted(value: str) -> str:
         return quoted
     if re.search(_SURROGATE, value):
         raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
-    return re.sub(_UNSAFE, _escaped, quoted)
-
-
-def _escaped(match: re.Match[str]) -> str:
-    return f"\\u{ord(match[0]):04x}"
+    return re.sub(_UNSAFE, lambda match: f"\\u{ord(match[0]):04x}", quoted)
 
 
 def _with_point(numbers: str) -> str:

@@ -56,10 +56,7 @@ def read_yaml(path: str | Path) -> tuple[Any, str]:
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None.
-
-    Aliases, duplicate keys and several documents are refused.
-    """
+    """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None; without aliases."""
     if source == "<stdin>" and not text.strip():
         raise FormatError("is empty; check the command before it", source)
     text = text.replace("\r\n", "\n")
@@ -113,7 +110,9 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
         if kind is yaml.ScalarEvent:
             value: Any = event.value
             if type(containers[-1]) is dict and keys[-1] is None:
-                keys[-1] = _new_key(value, containers[-1], event, source)
+                if value in containers[-1]:
+                    _fail(f"the key {value[:60]!r} appears twice; remove one", event, source)
+                keys[-1] = value
                 continue
             if not event.style:
                 value = value if str(event.tag).endswith(":str") else plain_value(value)
@@ -153,12 +152,6 @@ def plain_value(text: str) -> Any:
         if _INTEGER(text):
             return int(text)
     return _WORDS.get(text, text)
-
-
-def _new_key(key: str, container: dict[str, Any], event: Any, source: str) -> str:
-    if key in container:
-        _fail(f"the key {key[:60]!r} appears twice; remove one", event, source)
-    return key
 
 
 def _fail(problem: str, event: Any, source: str) -> NoReturn:

@@ -222,10 +222,7 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
 def draw_poses(
     axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
 ) -> None:
-    """Draw the targets relative to the camera, coloured by their errors, on axes with ``projection="3d"``.
-
-    `others` are other cameras on the rig, with their poses from the frame of the first camera to theirs.
-    """
+    """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs."""
     space: Any = axes
     style(axes, "Poses")
     if calibration is None or not calibration.views or not len(calibration.points):

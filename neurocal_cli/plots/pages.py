@@ -26,14 +26,16 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw all panels of a camera on one page, or one of `plots.CAMERA_PANELS`, as png, pdf or svg.
-
-    The same subject gives the same bytes. A NeurocalError says that matplotlib is not installed.
-    """
+    """Draw all panels of a camera, or one of `plots.CAMERA_PANELS`; the same subject gives the same bytes."""
     panels = panels_of(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
-    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, _title(subject), _PAGE, kind)
+    evaluation = subject.evaluation
+    title = (
+        f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
+        f"{evaluation.n_points} points, {len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
+    )
+    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, title, _PAGE, kind)
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
@@ -91,14 +93,6 @@ def draw_points_in_space(
         f"epipolar rms {found.epipolar_px:.3g} px"
     )
     return _page(rows, (1, 1), panels, title, (16.0, 9.0), kind)
-
-
-def _title(subject: Subject) -> str:
-    evaluation = subject.evaluation
-    return (
-        f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
-        f"{evaluation.n_points} points, {len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
-    )
 
 
 def _page(

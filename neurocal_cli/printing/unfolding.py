@@ -97,7 +97,8 @@ def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[
         inward, opposite = (_across(p, point, along) for p in (plane, other))
         B = np.outer(place.B @ along, along) - np.outer(place.B @ opposite, inward)
         new = _Map(B, place(point) - B @ point)
-        marks = np.concatenate([p.at(_corners(p)) for p in (plane, other)])
+        corners = [[[-1, -1], [p.cols, -1], [p.cols, p.rows], [-1, p.rows]] for p in (plane, other)]  # uncut
+        marks = np.concatenate([plane.at(corners[0]), other.at(corners[1])])
         lengths = (marks - point) @ along
         return new, place(point + np.outer([lengths.min(), lengths.max()], along))
     raise InputError(
@@ -107,11 +108,6 @@ def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[
 
 def _middle(plane: Plane) -> Array:
     return plane.at(np.array([plane.cols - 1, plane.rows - 1]) / 2)
-
-
-def _corners(plane: Plane) -> Array:
-    """Grid coordinates of the corners of the pattern, uncut."""
-    return np.array([[-1, -1], [plane.cols, -1], [plane.cols, plane.rows], [-1, plane.rows]], dtype=float)
 
 
 def _meeting(a: Plane, b: Plane) -> tuple[Array, Array] | None:

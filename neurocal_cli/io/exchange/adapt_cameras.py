@@ -8,7 +8,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -49,7 +49,9 @@ def adapt_cameras(
         )
     if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):
         raise InputError(f"a file of {target.program} needs the size of the images; give --image-size W H")
-    views = {} if target.poses else {name: pose for name, pose in cameras.poses.items() if _tells(pose)}
+    # ROS and mrcal write the pose of a camera in its own frame, which tells nothing.
+    poses = () if target.poses else cameras.poses.values()
+    n_views = sum(not np.array_equal(pose.D, np.eye(3, 4)) for pose in poses)
     if target.metres:
         cameras = (cameras if target.poses else replace(cameras, poses={})).in_metres()
     if model is not None and model not in target.models:
@@ -72,18 +74,13 @@ def adapt_cameras(
             if not own
             else "the new camera has no standard deviations, points and verdict"
         )
-    if views:
-        count = f"{len(views)} view{'s' * (len(views) != 1)}"
+    if n_views:
+        count = f"{n_views} view{'s' * (n_views != 1)}"
         remarks.append(f"a file of {target.program} has no place for the poses of {count}")
     origin = cameras.origin if own and not changed else None
     return AdaptedCameras(
         replace(cameras, cameras=tuple(adapted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
     )
-
-
-def _tells(pose: Pose) -> bool:
-    """Whether a pose is known, not that of a camera in its own frame, as ROS and mrcal write it."""
-    return not np.array_equal(pose.D, np.eye(3, 4))
 
 
 def _pixels_of(cameras: CameraSet) -> list[Array | None]:

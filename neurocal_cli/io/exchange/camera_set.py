@@ -59,11 +59,7 @@ class CameraSet:
 
 @frozen_dataclass
 class Format:
-    """Capabilities of a file format, and the function that writes it.
-
-    `text` takes cameras that fit the format, and the extension of the output, such as ".xml". It returns the
-    contents of the files by name; "" is the name of a single file.
-    """
+    """Capabilities of a file format, and the function that writes cameras which fit it."""
 
     program: str  # name for messages
     models: tuple[str, ...]  # our names of its distortion models, the simplest first
@@ -72,4 +68,5 @@ class Format:
     most_cameras: int
     metres: bool  # whether lengths are in metres
     needs_size: bool  # whether the image size must be known
+    # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
