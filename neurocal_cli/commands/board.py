@@ -81,15 +81,6 @@ def board(
     if target is None:
         target = default_board(size)
     sheet = on_paper(target, size)
-    _write(sheet, output, ending, dpi)
-    if beside is not None:
-        from neurocal_cli.io.board_yaml import write_board
-
-        write_board(target, beside)
-    _report(target, sheet, beside, as_json)
-
-
-def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
     from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
     from neurocal_cli.io.writing import write_whole
 
@@ -97,6 +88,11 @@ def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
         write_whole(output, board_svg(sheet))
     else:
         write_whole(output, board_pdf(sheet) if ending == ".pdf" else board_png(sheet, dpi))
+    if beside is not None:
+        from neurocal_cli.io.board_yaml import write_board
+
+        write_board(target, beside)
+    _report(target, sheet, beside, as_json)
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:

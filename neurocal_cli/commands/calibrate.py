@@ -15,7 +15,7 @@ from neurocal_cli.plots import CAMERA_PANELS
 
 @click.command(cls=options.Command)
 @options.points
-@estimation_options
+@estimation_options()
 @options.camera_name
 @plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option

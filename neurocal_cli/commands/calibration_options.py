@@ -132,27 +132,25 @@ class Estimation:
         return center
 
 
-def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `Estimation` to a command, which gets them as the keyword ``estimation``."""
-    return _collecting(command, _OPTIONS)
+def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add the options of `Estimation`, which a command gets as the keyword ``estimation``.
 
-
-def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `Estimation` without the files of known cameras and poses."""
-    return _collecting(command, [option for option in _OPTIONS if option not in _FILES])
-
-
-def _collecting(command: Callable[..., Any], chosen: list[Any]) -> Callable[..., Any]:
+    Without `files` those of known cameras and poses are left out.
+    """
     names = [field.name for field in fields(Estimation)]
 
-    @wraps(command)
-    def collected(*args: Any, **kwargs: Any) -> Any:
-        estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
-        return command(*args, estimation=estimation, **kwargs)
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def collected(*args: Any, **kwargs: Any) -> Any:
+            estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
+            return command(*args, estimation=estimation, **kwargs)
 
-    for option in reversed(chosen):
-        collected = option(collected)
-    return collected
+        for option in reversed(_OPTIONS):
+            if files or option not in _FILES:
+                collected = option(collected)
+        return collected
+
+    return add
 
 
 _FILES = [

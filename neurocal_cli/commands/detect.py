@@ -141,7 +141,12 @@ def detect(
     if target is None:
         raise UsageError(preparation.NO_SIZE)
     if target.distances:
-        note(_rescaled(target))
+        scale = target.scale
+        said = f"; {scale.contradiction}" if scale.contradiction else ""
+        note(
+            f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
+            f"{100 * scale.std:.2g} %{said}"
+        )
     target = target.as_measured()
     wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
@@ -152,15 +157,6 @@ def detect(
     found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
     _report(outcomes, found, target, as_json)
     _write(outcomes, found, target, overlay, output)
-
-
-def _rescaled(board: Board) -> str:
-    scale = board.scale
-    said = f"; {scale.contradiction}" if scale.contradiction else ""
-    return (
-        f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
-        f"{100 * scale.std:.2g} %{said}"
-    )
 
 
 def _wanted(

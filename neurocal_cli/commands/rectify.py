@@ -95,7 +95,11 @@ def rectify(
     images = bool(files) and is_image(sides[0][0])
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
-    _check_folders(sides, output)
+    preparation.check_outputs((), (*sides[0], *sides[1]))
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
     from neurocal_cli.stereo.rectified_pair import rectified_pair
 
     found = _read_rig(rig)
@@ -128,15 +132,6 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
-
-
-def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
-    """Refuse to overwrite inputs."""
-    preparation.check_outputs((), (*sides[0], *sides[1]))
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
 
 
 def _read_rig(name: str) -> Rig:

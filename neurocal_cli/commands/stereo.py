@@ -9,7 +9,7 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
+from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
@@ -19,7 +19,7 @@ from neurocal_cli.plots import RIG_PANELS
 @click.command(cls=options.Command)
 @options.argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
 @options.argument("right", "RIGHT.csv", "Points of the right camera.")
-@estimation_options_without_files
+@estimation_options(files=False)
 @options.path(
     "--left-intrinsics",
     "CAMERA.yaml",

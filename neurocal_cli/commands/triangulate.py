@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -91,7 +92,10 @@ def triangulate(
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
-    sigma = _sigma(rig) if sigma is None else sigma
+    if sigma is None and math.isnan(rig.sigma):
+        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+        sigma = _USUAL_SIGMA
+    sigma = rig.sigma if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
@@ -103,14 +107,6 @@ def triangulate(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
     tally.tell(as_json)
-
-
-def _sigma(rig: Rig) -> float:
-    """The noise of the rig's own points; a typical value if it has none."""
-    if rig.sigma == rig.sigma:
-        return rig.sigma
-    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-    return _USUAL_SIGMA
 
 
 def _rig(names: tuple[str, ...]) -> Rig:

@@ -116,7 +116,8 @@ def undistort(
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
         options.note_unused("without images", "interpolation")
-    folder, outputs = _places_of(paths, output)
+    folder = _folder(paths, output) if paths else None
+    outputs = [output for _ in paths] if folder is None else [_place(folder, path) for path in paths]
     _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
@@ -151,15 +152,8 @@ def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alp
         )
 
 
-def _places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
-    """The output folder, if the output is one, and the output file of each input."""
-    if not paths:
-        return None, []
-    folder = _folder(paths, output)
-    return folder, [output] if folder is None else [os.path.join(folder, _name(path)) for path in paths]
-
-
 def _folder(paths: Sequence[str], output: str) -> str | None:
+    """The output folder, if the output is one."""
     from neurocal_cli.io.image_paths import is_image
 
     several = len(paths) > 1
@@ -185,13 +179,12 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
     return output
 
 
-def _name(path: str) -> str:
+def _place(folder: str, path: str) -> str:
+    """The output of an input in the output folder."""
     from neurocal_cli.io.image_paths import is_image
 
-    if path == "-":
-        return "points.csv"
-    name = os.path.basename(path)
-    return os.path.splitext(name)[0] + ".png" if is_image(path) else name
+    name = "points.csv" if path == "-" else os.path.basename(path)
+    return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
 
 def _check_distinct(

@@ -107,14 +107,10 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
         columns |= {name: target.stated[:, k] for k, name in enumerate(_STATED)}
     yield from indented(table_lines(columns, long, indent=2))
     if target.bends is not None:
-        yield from indented(_bends_lines(target.bends, long))
-
-
-def _bends_lines(bends: Bends, long: bool) -> Iterator[str]:
-    yield "bends:  # of each view, from the points above"
-    yield f"  size: {number(bends.size)}"
-    columns = dict(zip(_SHAPES, bends.coefficients.T, strict=True))
-    yield from indented(table_lines({"view": list(bends.names), **columns}, long, indent=2))
+        yield "  bends:  # of each view, from the points above"
+        yield f"    size: {number(target.bends.size)}"
+        shapes = dict(zip(_SHAPES, target.bends.coefficients.T, strict=True))
+        yield from indented(table_lines({"view": list(target.bends.names), **shapes}, long, indent=2), 4)
 
 
 def read_target(field: Field) -> Target:

@@ -188,20 +188,15 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
             file.flush()
             os.fsync(file.fileno())
         if former is not None:
-            _take_over(temporary, former)
+            if hasattr(os, "chown"):
+                with suppress(OSError):  # only root may give files away
+                    os.chown(temporary, former.st_uid, former.st_gid)
+            os.chmod(temporary, stat.S_IMODE(former.st_mode))
     except BaseException:  # includes interrupts
         with suppress(OSError):
             os.unlink(temporary)
         raise
     return temporary
-
-
-def _take_over(temporary: str, former: os.stat_result) -> None:
-    """Copy permissions and, if allowed, owner of the file that is to be replaced."""
-    if hasattr(os, "chown"):
-        with suppress(OSError):
-            os.chown(temporary, former.st_uid, former.st_gid)
-    os.chmod(temporary, stat.S_IMODE(former.st_mode))
 
 
 def _write_failure(error: Exception) -> str:
