@@ -203,17 +203,11 @@ class Board:
         return replace(self, planes=tuple(plane.rescaled(factor) for plane in self.planes))
 
     def plane(self, name: str) -> Plane:
-        """Find the plane with a name.
-
-        Raises
-        ------
-        InputError
-            There is none.
-        """
-        for plane in self.planes:
-            if plane.name == name:
-                return plane
-        raise InputError(f"the board has no plane {name!r}; it has {[p.name for p in self.planes]}")
+        """The plane with a name; an InputError if there is none."""
+        named = {plane.name: plane for plane in self.planes}
+        if name not in named:
+            raise InputError(f"the board has no plane {name!r}; it has {list(named)}")
+        return named[name]
 
 
 def smooth_between(places: Array, values: Array, at: Array) -> Array:

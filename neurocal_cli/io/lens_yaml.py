@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.optional_blocks import read_target, target_lines
@@ -55,11 +54,10 @@ def read_lens(path: str | Path) -> ZoomLens:
     FormatError
         The file cannot be read, is another kind of file, or a key is missing or wrong.
     """
-    tree, source = read_yaml(path)
-    root = Field(tree, source)
-    if not isinstance(tree, dict) or _BLOCK not in root:
-        kind = "is a camera" if isinstance(tree, dict) and "camera_matrix" in root else "is not a lens"
-        raise FormatError(f"{kind}; give a file that `neurocal lens fit` wrote", source)
+    root = read_yaml(path)
+    if _BLOCK not in root:
+        kind = "is a camera" if "camera_matrix" in root else "is not a lens"
+        root.refuse(f"{kind}; give a file that `neurocal lens fit` wrote")
     return lens_from_field(root)
 
 

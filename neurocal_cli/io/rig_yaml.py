@@ -113,7 +113,7 @@ def read_rig(path: str | Path) -> Rig:
 
 def rig_from_field(root: Field) -> Rig:
     """Read a rig; see `read_rig`."""
-    if not isinstance(root.value, dict) or "stereo" not in root:
+    if "stereo" not in root:
         if "neurocal" in root:
             root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
         root.refuse(

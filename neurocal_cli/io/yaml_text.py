@@ -34,14 +34,18 @@ def number(value: float) -> str:
     return _with_point(repr(value))
 
 
+def nested(array: Array) -> Any:
+    """Nested lists of an array's numbers; None for those that are not finite."""
+    if np.isfinite(array).all():
+        return array.tolist()
+    entries = array.astype(object)
+    entries[~np.isfinite(array)] = None
+    return entries.tolist()
+
+
 def flow(values: Array) -> str:
     """Write an array as nested flow sequences on one line, ``[[1.0, 2.0], [3.0, 4.0]]``."""
-    array = np.asarray(values, dtype=float)
-    entries: Any = array
-    if not np.isfinite(array).all():
-        entries = array.astype(object)
-        entries[~np.isfinite(array)] = None
-    return _with_point(json.dumps(entries.tolist()))
+    return _with_point(json.dumps(nested(np.asarray(values, dtype=float))))
 
 
 def flows(stack: Array) -> list[str]:

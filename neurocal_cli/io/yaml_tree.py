@@ -22,6 +22,7 @@ import yaml
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.files import read_text
+from neurocal_cli.io.tree_fields import Field
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
@@ -49,10 +50,10 @@ _LABELS = frozenset(("view", "point"))
 _CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
-def read_yaml(path: str | Path) -> tuple[Any, str]:
-    """Read a YAML file as a tree, and its name for messages; see `parse_yaml`."""
+def read_yaml(path: str | Path) -> Field:
+    """Read a YAML file as a tree; see `parse_yaml`."""
     text, source = read_text(path, "a YAML file")
-    return parse_yaml(text, source), source
+    return Field(parse_yaml(text, source), source)
 
 
 def parse_yaml(text: str, source: str) -> Any:

@@ -1,15 +1,21 @@
-"""Contents of a camera file of any program, and properties of the formats."""
+"""Contents of a camera file of any program, poses in the forms of these programs, and properties of formats.
+
+SciPy gets copies of rotations, because older versions refuse read-only arrays.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 
+import numpy as np
+
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.rig import Rig
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
@@ -70,3 +76,42 @@ class Format:
     needs_size: bool  # whether the image size must be known
     # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
+
+
+def to_vector(R: Array) -> Array:
+    """Rotation vector (axis times angle [rad]) of a rotation (3, 3), like ``cv2.Rodrigues``; also near pi."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(np.array(R)).as_rotvec())
+
+
+def from_vector(r: Array) -> Array:
+    """Rotation (3, 3) of a rotation vector (axis times angle [rad])."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.array(r, dtype=float).reshape(3)).as_matrix())
+
+
+def to_quaternion(R: Array) -> Array:
+    """Unit quaternion w, x, y, z of a rotation (3, 3), with w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat()
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def from_quaternion(q: Array) -> Array:
+    """Rotation (3, 3) of a quaternion w, x, y, z of any non-zero length."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(np.roll(np.asarray(q, dtype=float), -1)).as_matrix())
+
+
+def inverse(pose: Pose) -> Pose:
+    """Inverse of a pose."""
+    return Pose(pose.R.T, -pose.R.T @ pose.t)
+
+
+def after(second: Pose, first: Pose) -> Pose:
+    """Compose two poses: ``X'' = R2 (R1 X + t1) + t2``."""
+    return Pose(second.R @ first.R, second.R @ first.t + second.t)

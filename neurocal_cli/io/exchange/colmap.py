@@ -17,8 +17,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quaternion
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.io.files import read_text, value_failures
 from neurocal_cli.io.yaml_text import number
 

@@ -13,8 +13,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import after, inverse
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, text
 

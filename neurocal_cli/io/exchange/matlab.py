@@ -18,8 +18,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import from_vector
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, from_vector
 from neurocal_cli.io.mat_file import read_variables
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
