@@ -11,16 +11,15 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.calibration_blocks import read_rejected, read_target, read_verdict, read_views
 from neurocal_cli.io.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
 from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.observations_yaml import read_observations
-from neurocal_cli.io.optional_blocks import read_rejected, read_target, read_verdict
 from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.

@@ -21,11 +21,10 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.geometry import Array
+from neurocal_cli.io import calibration_blocks as blocks
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.observations_yaml import observation_lines
-from neurocal_cli.io.optional_blocks import rejected_lines, target_lines, verdict_lines
 from neurocal_cli.io.text_columns import column_lines, named_lines
-from neurocal_cli.io.views_yaml import have_same_std, view_lines
 from neurocal_cli.io.yaml_text import block, boolean, flow, flows, list_lines, mapping, number, quoted, text
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
@@ -74,18 +73,18 @@ def calibration_lines(
 ) -> Iterator[str]:
     """Lines of a file without header; see `camera_info_lines` and, for `by_rows`, `format_calibration`."""
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and have_same_std(cal.views)
+    long = large and not by_rows and blocks.have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
     yield from block(
         "neurocal",
         chain(
             _record_lines(cal, long),
             _parameter_lines(cal),
-            view_lines(cal.views, cal.K, long),
+            blocks.view_lines(cal.views, cal.K, long),
             ["network: null"] if cal.network is None else block("network", _network_lines(cal.network, long)),
-            verdict_lines(cal.verdict),
-            rejected_lines(cal.rejected, long),
-            target_lines(cal.target, long),
+            blocks.verdict_lines(cal.verdict),
+            blocks.rejected_lines(cal.rejected, long),
+            blocks.target_lines(cal.target, long),
             _straight_lines(cal.straight_lines),
             observation_lines(cal.points, long),
         ),

@@ -14,13 +14,12 @@ import numpy as np
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
+from neurocal_cli.io.calibration_blocks import POSE_GROUPS, read_verdict, verdict_lines
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
-from neurocal_cli.io.optional_blocks import read_verdict, verdict_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.views_yaml import POSE_GROUPS
 from neurocal_cli.io.yaml_text import block, boolean, flow, list_lines, mapping, number, quoted, text, words
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
