@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, Verdict, ViewResult
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
@@ -66,17 +66,18 @@ def align(rows: Iterable[Sequence[str]]) -> list[str]:
 
 def calibration_report(calibration: Calibration) -> str:
     """Summary of a calibration: parameters, views, fit, training and verdict, without the warnings."""
-    blocks = [
-        [_headline(calibration)],
-        align(parameter_rows(calibration)),
-        _view_lines(calibration.views),
-        [
-            *_training_lines(calibration),
-            *target_lines(calibration.target, calibration.unit),
-            *_scale_lines(calibration),
-        ],
-        [] if calibration.verdict is None else verdict_lines(calibration.verdict),
-    ]
+    size, points = calibration.image_size, calibration.points
+    headline = (
+        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]}), "
+        f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
+        f"{'image size unknown' if size is None else f'{size[0]} x {size[1]} px'}"
+    )
+    fit = [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)]
+    if points.distances:
+        held = plural(len(points.distances), "measured distance")
+        fit.append(f"scale: held by {held}, std {100 * scale_of(points).std:.2g} %")
+    verdict = [] if calibration.verdict is None else verdict_lines(calibration.verdict)
+    blocks = [[headline], align(parameter_rows(calibration)), _view_lines(calibration.views), fit, verdict]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
@@ -98,16 +99,6 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     if target.bends is not None:
         lines.append(f"target: bends anew in each view, by {target.bend_of_views():.2g} {unit} rms")
     return lines
-
-
-def _scale_lines(calibration: Calibration) -> list[str]:
-    distances = calibration.points.distances
-    if not distances:
-        return []
-    return [
-        f"scale: held by {plural(len(distances), 'measured distance')}, std "
-        f"{100 * scale_of(calibration.points).std:.2g} %"
-    ]
 
 
 def _surveyed_line(target: Target, unit: str) -> str:
@@ -242,16 +233,6 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def _headline(calibration: Calibration) -> str:
-    size = calibration.image_size
-    parts = [
-        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]})",
-        f"{plural(len(calibration.points), 'point')} in {plural(len(calibration.views), 'view')}",
-        "image size unknown" if size is None else f"{size[0]} x {size[1]} px",
-    ]
-    return ", ".join(parts)
-
-
 def parameter_rows(calibration: Calibration) -> list[list[str]]:
     """Rows of the intrinsic parameters, and of the pose if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
@@ -315,8 +296,14 @@ def _training_lines(calibration: Calibration) -> list[str]:
     if calibration.n_rejected:
         fit += f", {plural(calibration.n_rejected, 'outlier')} rejected"
     training = [] if calibration.network is None else _network_lines(calibration.network)
-    if calibration.straight_lines is not None:
-        training.insert(0, _lens_line(calibration.straight_lines))
+    if (found := calibration.straight_lines) is not None:
+        u, v = found.centre
+        training.insert(
+            0,
+            f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
+            f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
+            f"after; centre of distortion ({u:.1f}, {v:.1f})",
+        )
     return [fit, *training, *_lens_lines(calibration), calibration.stop_reason]
 
 
@@ -331,16 +318,6 @@ def _lens_lines(calibration: Calibration) -> list[str]:
         f"distortion model: {chosen}, chosen by cross-validation error and number of coefficients:",
         f"  {', '.join(errors)} px",
     ]
-
-
-def _lens_line(found: StraightLines) -> str:
-    u, v = found.centre
-    return (
-        f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
-        "distance "
-        f"{_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px after; centre of "
-        f"distortion ({u:.1f}, {v:.1f})"
-    )
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:

@@ -121,9 +121,11 @@ def _camera_parts(
 ) -> list[str]:
     """Sections on a camera: parameters, drawings, views, rejected points and views, warnings."""
     parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
-    residuals = _residuals(calibration)
-    pixels = calibration.points.pixels
-    if len(residuals):
+    points, pixels = calibration.points, calibration.points.pixels
+    if len(points):
+        poses = [calibration.views[name].pose for name in points.view_names]
+        # 0 for points that cannot be projected.
+        residuals = np.nan_to_num(predict(calibration.camera, poses, points)[0] - pixels)
         size = calibration.image_size or tuple((np.ceil(pixels.max(axis=0)) + 1).astype(int).tolist())
         scale = enlargement(residuals, size)
         names = list(calibration.views)
@@ -165,15 +167,6 @@ def _uncertainty(calibration: Calibration) -> str:
         "How uncertain the camera is: standard deviation of a projected pixel, for points at the middle "
         f"distance; {found.worst:.3g} px at most. Dots are the points of all views.",
     )
-
-
-def _residuals(calibration: Calibration) -> Array:
-    """(N, 2) projected minus observed pixels; 0 for points that cannot be projected."""
-    points = calibration.points
-    if not len(points):
-        return np.zeros((0, 2))
-    poses = [calibration.views[name].pose for name in points.view_names]
-    return np.asarray(np.nan_to_num(predict(calibration.camera, poses, points)[0] - points.pixels))
 
 
 def _view_parts(

@@ -44,7 +44,10 @@ def calibration_from_field(root: Field) -> Calibration:
     kind = block["type"].integer()
     if kind not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
-    names, covariance = _covariance(block)
+    stated = block.get("covariance", {"names": []})
+    names = tuple(stated["names"].texts())
+    size = len(names), len(names)
+    covariance = stated["data"].array(*size, unknown=True) if names else np.zeros(size)
     model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
     return Calibration(
@@ -128,14 +131,6 @@ def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
 
 def _unit(block: Field) -> str:
     return block.get("unit", "mm").text()
-
-
-def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
-    field = block.get("covariance", {"names": []})
-    names = tuple(field["names"].texts())
-    if not names:
-        return (), np.zeros((0, 0))
-    return names, field["data"].array(len(names), len(names), unknown=True)
 
 
 def distortion_from_field(root: Field) -> tuple[str, Array]:

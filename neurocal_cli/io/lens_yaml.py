@@ -33,7 +33,10 @@ _MOST_UNITS = 1000
 
 def format_lens(lens: ZoomLens) -> str:
     """Text of a lens file."""
-    parts = [_record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)]
+    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
+    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
+    settings = block("settings", table_lines(columns, long=False, indent=2))
+    parts = [_record_lines(lens), settings, _member_lines(lens), _tables_lines(lens)]
     parts.append(target_lines(lens.target, long=False))
     if lens.target_coupling is not None:
         coupling = lens.target_coupling.reshape(len(lens.settings), -1)
@@ -102,12 +105,6 @@ def _coupling(field: Field, S: int, size: int) -> Array:
     if flat.shape[1] % size:
         field.fail(f"rows of a multiple of {size} numbers")
     return flat.reshape(S, size, -1)
-
-
-def _setting_lines(lens: ZoomLens) -> Iterator[str]:
-    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
-    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
-    yield from block("settings", table_lines(columns, long=False, indent=2))
 
 
 def _member_lines(lens: ZoomLens) -> Iterator[str]:

@@ -252,7 +252,9 @@ def draw_poses(
     for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
         corners = (_frustum(camera, size) - pose.t) @ pose.R
         extent.append(corners)
-        _draw_camera(space, corners, (INK, ACCENT)[number % 2])
+        centre, *ends = _turned(corners)
+        for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
+            space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
     everything = _turned(np.vstack(extent))
     low, high = everything.min(axis=0), everything.max(axis=0)
     space.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=1.1)
@@ -289,12 +291,6 @@ def _frustum(camera: Camera, size: float) -> Array:
     pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])
     rays = pixels @ np.linalg.inv(camera.intrinsics.A).T
     return np.vstack([np.zeros(3), size * rays])
-
-
-def _draw_camera(space: Any, corners: Array, colour: str) -> None:
-    centre, *ends = _turned(corners)
-    for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
-        space.plot(*np.array([centre, end, after]).T, color=colour, linewidth=1.2)
 
 
 def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
