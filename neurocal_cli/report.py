@@ -86,31 +86,26 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     if target is None:
         return []
     unit = "units" if unit == "unknown" else printable(unit)
+    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
     if target.stated is not None:
-        return [_surveyed_line(target, unit)]
+        held = int((target.stated == 0).all(axis=1).sum())
+        exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
+        factor = target.sizes["stated"]
+        taken = "" if factor == 1 else f", scaled by {factor:.2g} to match the residuals"
+        return [
+            f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their stated "
+            f"standard deviations{taken}{exact}"
+        ]
     lines = []
     if not target.only_bends:
         parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
         parts.append(f"stretched by {100 * target.stretch():.2g} %")
-        found = np.sqrt((target.offsets**2).sum(axis=1).mean())
         lines.append(
             f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
         )
     if target.bends is not None:
         lines.append(f"target: bends anew in each view, by {target.bend_of_views():.2g} {unit} rms")
     return lines
-
-
-def _surveyed_line(target: Target, unit: str) -> str:
-    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
-    held = int((target.stated == 0).all(axis=1).sum()) if target.stated is not None else 0
-    exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
-    factor = target.sizes["stated"]
-    taken = "" if factor == 1 else f", scaled by {factor:.2g} to match the residuals"
-    return (
-        f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their stated "
-        f"standard deviations{taken}{exact}"
-    )
 
 
 def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:

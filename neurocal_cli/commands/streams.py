@@ -155,19 +155,15 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         if not self._visible or time.monotonic() - self._start < _PATIENCE:
             return
         if self._bar is None:
-            self._open()
-        assert self._bar is not None
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("", total=1.0)
+            self._bar.start()
         assert self._task is not None
         self._bar.update(self._task, description=stage, completed=min(max(fraction, 0.0), 1.0))
-
-    def _open(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
-        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-        self._task = self._bar.add_task("", total=1.0)
-        self._bar.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -47,6 +47,14 @@ def residual_map(
         f"M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}" for (u, v), (x, y) in zip(pixels[::step], ends, strict=True)
     )
     dots = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in pixels[::step])
+    arm, crosses = width / 100, ""
+    if left_out is not None and len(left_out):
+        arms = "".join(
+            f"M{u - arm:.1f} {v - arm:.1f}L{u + arm:.1f} {v + arm:.1f}"
+            f"M{u - arm:.1f} {v + arm:.1f}L{u + arm:.1f} {v - arm:.1f}"
+            for u, v in left_out
+        )
+        crosses = f'<path d="{arms}" class="out" stroke-width="{width / 300:.2f}"/>'
     image = "" if photograph is None else b64encode(photograph).decode()
     if image:  # its pixel centres are at whole numbers
         place = f'x="-.5" y="-.5" width="{width}" height="{height}"'
@@ -56,20 +64,8 @@ def residual_map(
         f'<rect width="{width}" height="{height}" class="frame"/>{image}'
         f'<path d="{dots}" class="dots" stroke-width="{bold * width / 160:.2f}"/>'
         f'<path d="{path}" class="lines" stroke-width="{bold * width / 450:.2f}"/>'
-        f"{_crosses(left_out, width)}</svg>"
+        f"{crosses}</svg>"
     )
-
-
-def _crosses(pixels: Array | None, width: int) -> str:
-    if pixels is None or not len(pixels):
-        return ""
-    arm = width / 100
-    path = "".join(
-        f"M{u - arm:.1f} {v - arm:.1f}L{u + arm:.1f} {v + arm:.1f}"
-        f"M{u - arm:.1f} {v + arm:.1f}L{u + arm:.1f} {v - arm:.1f}"
-        for u, v in pixels
-    )
-    return f'<path d="{path}" class="out" stroke-width="{width / 300:.2f}"/>'
 
 
 def enlargement(residuals: Array, size: tuple[int, int]) -> float:

@@ -7,6 +7,7 @@ of the rectified pair. ``stereo`` has the rest.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,14 @@ _SAME = 1e-6
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
     """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
-    return "\n".join([*HEADER, *_rig_lines(rig, rectify(rig, alpha), by_rows), ""])
+    rectified = rectify(rig, alpha)
+    pairs: tuple[tuple[Array, Array] | None, ...] = (None, None)
+    if rectified is not None:
+        pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
+    cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
+    parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
+    lines = chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
+    return "\n".join([*HEADER, *lines, ""])
 
 
 def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
@@ -58,15 +66,6 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
     first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
     return first, second
-
-
-def _rig_lines(rig: Rig, rectified: Rectification | None, by_rows: bool) -> Iterator[str]:
-    matrices: tuple[tuple[Array, Array] | None, ...] = (None, None)
-    if rectified is not None:
-        matrices = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
-    yield from block("left", calibration_lines(rig.left, matrices[0], by_rows))
-    yield from block("right", calibration_lines(rig.right, matrices[1], by_rows))
-    yield from block("stereo", _stereo_lines(rig, rectified))
 
 
 def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:

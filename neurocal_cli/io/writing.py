@@ -20,6 +20,11 @@ from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_
 
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
 STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
+_FAILURES = {
+    IsADirectoryError: "is a folder; give the name of a file",
+    FileNotFoundError: "its folder does not exist; create it first",
+    PermissionError: "may not be written; change the permissions of it or its folder",
+}
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
@@ -120,7 +125,9 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
     except (BrokenPipeError, NeurocalError):
         raise
     except (OSError, ValueError) as error:
-        raise NeurocalError(f"{one_line(path)}: {_write_failure(error)}") from error
+        other = f"cannot be written ({reason(error)}); give another place"
+        said = next((text for kind, text in _FAILURES.items() if isinstance(error, kind)), other)
+        raise NeurocalError(f"{one_line(path)}: {said}") from error
 
 
 def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
@@ -197,13 +204,3 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
             os.unlink(temporary)
         raise
     return temporary
-
-
-def _write_failure(error: Exception) -> str:
-    if isinstance(error, IsADirectoryError):
-        return "is a folder; give the name of a file"
-    if isinstance(error, FileNotFoundError):
-        return "its folder does not exist; create it first"
-    if isinstance(error, PermissionError):
-        return "may not be written; change the permissions of it or its folder"
-    return f"cannot be written ({reason(error)}); give another place"

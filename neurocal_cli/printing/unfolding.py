@@ -71,7 +71,14 @@ def unfolded(board: Board) -> tuple[list[Laid], list[Array]]:
         maps.append(new)
         folds.append(fold)
     laid = [_laid(plane, place, planes) for plane, place in zip(planes, maps, strict=True)]
-    _check_apart(laid)
+    for first, second in combinations(laid, 2):
+        a, b = first.outline, second.outline
+        gap = np.maximum(b.min(axis=0) - a.max(axis=0), a.min(axis=0) - b.max(axis=0))
+        if (gap < -_SAME * second.plane.square).all():
+            raise InputError(
+                f"the planes {first.plane.name!r} and {second.plane.name!r} would lie on each other on the "
+                "sheet; print them one by one"
+            )
     return laid, folds
 
 
@@ -154,14 +161,3 @@ def _laid(plane: Plane, place: _Map, planes: tuple[Plane, ...]) -> Laid:
         reach[axis, side] = min(reach[axis, side], room)
     axes = np.array([plane.x_axis, plane.y_axis]) @ place.B.T
     return Laid(plane, place(np.array(plane.origin)), axes, reach)
-
-
-def _check_apart(laid: list[Laid]) -> None:
-    for first, second in combinations(laid, 2):
-        a, b = first.outline, second.outline
-        gap = np.maximum(b.min(axis=0) - a.max(axis=0), a.min(axis=0) - b.max(axis=0))
-        if (gap < -_SAME * second.plane.square).all():
-            raise InputError(
-                f"the planes {first.plane.name!r} and {second.plane.name!r} would lie on each other on the "
-                "sheet; print them one by one"
-            )

@@ -58,7 +58,13 @@ def adapt_cameras(
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
     losses, remarks, adapted, moved = [], [], [], []
-    for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
+    # Pixels of the points with which each camera was calibrated.
+    seen: list[Array | None] = [None] * len(cameras.cameras)
+    if cameras.origin is not None:
+        origin = cameras.origin
+        parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
+        seen = [part.points.pixels for part in parts]
+    for camera, points in zip(cameras.cameras, seen, strict=True):
         if model is None:
             new, near, loss = _adapted(camera, target, force, points)
         else:
@@ -77,19 +83,8 @@ def adapt_cameras(
     if n_views:
         count = f"{n_views} view{'s' * (n_views != 1)}"
         remarks.append(f"a file of {target.program} has no place for the poses of {count}")
-    origin = cameras.origin if own and not changed else None
-    return AdaptedCameras(
-        replace(cameras, cameras=tuple(adapted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
-    )
-
-
-def _pixels_of(cameras: CameraSet) -> list[Array | None]:
-    """Pixels of the points with which each camera was calibrated; None if unknown."""
-    origin = cameras.origin
-    if origin is None:
-        return [None] * len(cameras.cameras)
-    parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
-    return [part.points.pixels for part in parts]
+    found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else cameras.origin)
+    return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
 
 
 def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Adaptation:

@@ -27,6 +27,7 @@ _NAMES = {
     "none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8",
     "thin_prism": "OPENCV12",
 }  # fmt: skip
+_BY_LENGTH = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
 _START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
 
 
@@ -49,7 +50,9 @@ def parse(text: str, source: str) -> CameraSet:
             "mrcal-convert-lensmodel LENSMODEL_OPENCV8"
         )
     values = _numbers(root["intrinsics"], 4 + _LENGTHS[model])
-    lens = _distortion(values[4:])
+    k = values[4:]
+    k = k[:8] if len(k) == 12 and not k[8:].any() else k
+    lens = Distortion(_BY_LENGTH[len(k)], k) if k.any() else Distortion()
     width, height = _numbers(root["imagersize"], 2)
     key = "rt_cam_ref" if "rt_cam_ref" in root else "extrinsics"
     rt = _numbers(root[key], 6)
@@ -61,15 +64,6 @@ def _numbers(field: Field, count: int) -> Array:
     """Read the numbers of a list or a tuple."""
     values = list(field.value) if isinstance(field.value, tuple) else field.value
     return Field(values, field.source, field.path).array(count)
-
-
-def _distortion(k: Array) -> Distortion:
-    if len(k) == 12 and not k[8:].any():
-        k = k[:8]
-    if not k.any():
-        return Distortion()
-    names = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
-    return Distortion(names[len(k)], k)
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
