@@ -112,7 +112,11 @@ def evaluate_camera(
         if given is not None:
             renamed = other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}
-            warnings += _compare_units(calibration, points, poses)
+            if points.unit != calibration.unit and not poses.keys().isdisjoint(points.view_names):
+                warnings.append(
+                    f"the points are in {points.unit}, but the poses of the calibration are in "
+                    f"{calibration.unit}; the error is wrong unless these are the same unit"
+                )
     elif points is None:
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
@@ -160,16 +164,6 @@ def other_images(calibration: Calibration, points: Correspondences) -> tuple[str
     count = np.bincount(some.view_index)
     other = (2 * np.bincount(some.view_index, far) >= count) & (count >= _FEWEST)
     return tuple(np.array(some.view_names)[other].tolist())
-
-
-def _compare_units(calibration: Calibration, points: Correspondences, poses: Mapping[str, Pose]) -> list[str]:
-    """Warn if calibrated poses are used for points in another unit."""
-    if points.unit == calibration.unit or poses.keys().isdisjoint(points.view_names):
-        return []
-    return [
-        f"the points are in {points.unit}, but the poses of the calibration are in {calibration.unit}; "
-        "the error is wrong unless these are the same unit"
-    ]
 
 
 def _fit_poses(

@@ -14,7 +14,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
-    from neurocal_cli.training.backprop import BackpropOptions
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -91,8 +90,12 @@ class Estimation:
             "target": self.target,
             "seed": self.seed,
             "starts": self.starts,
-            "backprop": self._backprop(),
         }
+        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
+        if given := {name: value for name, value in values.items() if value is not None}:
+            from neurocal_cli.training.backprop import BackpropOptions
+
+            arguments["backprop"] = BackpropOptions(**given)  # type: ignore[arg-type]
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
@@ -102,15 +105,6 @@ class Estimation:
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
         return points, arguments
-
-    def _backprop(self) -> BackpropOptions | None:
-        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
-        given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-        if not given:
-            return None
-        from neurocal_cli.training.backprop import BackpropOptions
-
-        return BackpropOptions(**given)
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
         """The image centre of type 2: from the option, the points' header, or the middle of the image."""

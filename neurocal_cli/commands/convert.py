@@ -138,7 +138,16 @@ def convert(
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
         options.note_unused("on points", "force")
-        told = _write_points(found, target, output)
+        from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+        from neurocal_cli.io.writing import write_whole
+
+        text = corner_text(found, target, os.path.splitext(output)[1].lower())
+        losses, remarks = points_lost(found, target)
+        note(*remarks)
+        warn(*losses)
+        write_whole(output, text)
+        told = {"to": target, "n_points": len(found), "n_views": found.n_views}
+        told["warnings"] = [*losses, *remarks]
         if not as_json:
             say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
     if as_json:
@@ -210,20 +219,6 @@ def _read(
             sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
             cameras = replace(cameras, cameras=sized, origin=None)
     return cameras
-
-
-def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
-    """Write points; return the summary for programs."""
-    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
-    from neurocal_cli.io.writing import write_whole
-
-    text = corner_text(points, target, os.path.splitext(output)[1].lower())
-    losses, remarks = points_lost(points, target)
-    note(*remarks)
-    warn(*losses)
-    write_whole(output, text)
-    warnings = [*losses, *remarks]
-    return {"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": warnings}
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:

@@ -196,7 +196,14 @@ def stereo(
     preparation.check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
-    evaluation, rig = _evaluate_stereo(cameras, _read_points(points), method)
+    given = None
+    if points is not None:
+        from neurocal_cli.io.points_csv import read_points
+
+        notes: list[str] = []
+        given = read_points([points[0]], notes=notes), read_points([points[1]], notes=notes)
+        note(*notes)
+    evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
@@ -214,17 +221,6 @@ def stereo(
     else:
         verdict = evaluation.verdict
         show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
-
-
-def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:
-    if names is None:
-        return None
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    left, right = (read_points([name], notes=notes) for name in names)
-    note(*notes)
-    return left, right
 
 
 def _evaluate_stereo(

@@ -23,16 +23,16 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
 
     def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
-        return tuple(_parsed(word) for word in words)
-
-    def _parsed(word: str) -> tuple[str | None, str]:
-        panel, equals, file = word.partition("=")
-        if equals and panel.isalpha() and panel not in panels:
-            raise click.BadParameter(
-                f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a file "
-                "of this name"
-            )
-        return (panel, file) if equals and panel in panels else (None, word)
+        plots: list[tuple[str | None, str]] = []
+        for word in words:
+            panel, equals, file = word.partition("=")
+            if equals and panel.isalpha() and panel not in panels:
+                raise click.BadParameter(
+                    f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a "
+                    "file of this name"
+                )
+            plots.append((panel, file) if equals and panel in panels else (None, word))
+        return tuple(plots)
 
     return click.option(
         "--plot",

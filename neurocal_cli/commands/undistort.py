@@ -102,7 +102,15 @@ def undistort(
           --maps maps.npz
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(camera, *files)
-    _check_view(shape, fov, size, alpha)
+    options.check_alpha(alpha)
+    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
+        raise UsageError(
+            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
+        )
+    most = 170 if shape == "plane" else 360
+    if fov is not None and not 0 < fov <= most:
+        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
+        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     if not files and options.typed("output"):
@@ -136,20 +144,6 @@ def undistort(
     work.tell_loss()
     if len(paths) > 1:
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
-
-
-def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alpha: float | None) -> None:
-    options.check_alpha(alpha)
-    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
-        raise UsageError(
-            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
-        )
-    most = 170 if shape == "plane" else 360
-    if fov is not None and not 0 < fov <= most:
-        raise UsageError(
-            f"--fov is {fov:g}; give a number up to {most}"
-            + (", or --to cylinder for more" if shape == "plane" and fov > 0 else "")
-        )
 
 
 def _folder(paths: Sequence[str], output: str) -> str | None:

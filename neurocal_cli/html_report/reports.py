@@ -179,7 +179,7 @@ def _view_parts(
     points = calibration.points
     unit = printable(calibration.unit)
     rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
-    figures = []
+    figures, rejected = [], calibration.rejected.points
     for k, name in enumerate(points.view_names):
         view, own = calibration.views[name], points.view_index == k
         lengths = np.hypot(*residuals[own].T)
@@ -189,10 +189,12 @@ def _view_parts(
             [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
              f"{distance:.5g}", f"{tilt:.1f}"]
         )  # fmt: skip
-        image = photographs.get(name)
+        crosses = None
+        if rejected is not None and name in rejected.view_names:
+            crosses = rejected.pixels[rejected.view_index == rejected.view_names.index(name)]
         drawing = residual_map(
             points.pixels[own], residuals[own], size, scale, bold=2.2,
-            left_out=_left_out(calibration, name), photograph=image,
+            left_out=crosses, photograph=photographs.get(name),
         )  # fmt: skip
         figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
     return [
@@ -204,14 +206,6 @@ def _view_parts(
             f'<div class="views{" wider" if photographs else ""}">{"".join(figures)}</div>',
         ),
     ]
-
-
-def _left_out(calibration: Calibration, view: str) -> Array:
-    """(M, 2) pixels of the rejected points of a view."""
-    points = calibration.rejected.points
-    if points is None or view not in points.view_names:
-        return np.zeros((0, 2))
-    return points.pixels[points.view_index == points.view_names.index(view)]
 
 
 def _rejected(calibration: Calibration) -> str:

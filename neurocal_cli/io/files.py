@@ -135,7 +135,10 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         if data.startswith(mark):
             raise FormatError(f"is {name} text; save it as UTF-8", source)
     if b"\0" in data:
-        if _alternates_with_nul(data):
+        # Is it ASCII text with two bytes per character and no byte order mark?
+        head = data[:1000]
+        even, odd = head[::2].count(0), head[1::2].count(0)
+        if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
         raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
@@ -166,10 +169,3 @@ def one_line(path: str | Path) -> str:
     """Make a path, or any text, printable on one line."""
     text = str(path)
     return text if text.isprintable() else repr(text)[1:-1]
-
-
-def _alternates_with_nul(data: bytes) -> bool:
-    """Whether the data are ASCII text with two bytes per character and no byte order mark."""
-    head = data[:1000]
-    even, odd = head[::2].count(0), head[1::2].count(0)
-    return max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0

@@ -111,7 +111,11 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     several = len(tables) > 1
     views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
     owners = _owners(tables, views) if several and views else None
-    points = _points(tables, notes)
+    points, without = None, [table.source for table in tables if "point" not in table.labels]
+    if not without:
+        points = _joined([table.labels["point"] for table in tables])
+    elif len(without) < len(tables):
+        notes.append(f"{without[0]}: has no column point, so the point ids of the other files are not used")
     return Correspondences(
         _joined([table.stack(PLACE) for table in tables]),
         _joined([table.stack(PIXEL) for table in tables]),
@@ -133,16 +137,6 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
 def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:
     """Concatenate blocks; a single one is not copied, because it may have a million rows."""
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
-
-
-def _points(tables: list[Table], notes: list[str]) -> NDArray[Any] | None:
-    """Ids of the points; None if a table has none."""
-    without = [table.source for table in tables if "point" not in table.labels]
-    if not without:
-        return _joined([table.labels["point"] for table in tables])
-    if len(without) < len(tables):
-        notes.append(f"{without[0]}: has no column point, so the point ids of the other files are not used")
-    return None
 
 
 def _views_of_file(table: Table) -> NDArray[Any]:
