@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -299,20 +300,13 @@ def _training_lines(calibration: Calibration) -> list[str]:
             f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
             f"after; centre of distortion ({u:.1f}, {v:.1f})",
         )
-    return [fit, *training, *_lens_lines(calibration), calibration.stop_reason]
-
-
-def _lens_lines(calibration: Calibration) -> list[str]:
-    """The candidates of the model selection with their cross-validation errors, best first."""
-    choice = calibration.lens_choice
-    if not choice:
-        return []
-    errors = [f"{name} {_pixels(choice[name])}" for name in sorted(choice, key=lambda name: choice[name])]
-    chosen = calibration.distortion_model
-    return [
-        f"distortion model: {chosen}, chosen by cross-validation error and number of coefficients:",
-        f"  {', '.join(errors)} px",
-    ]
+    if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
+        chosen = (
+            f"{calibration.distortion_model}, chosen by cross-validation error and number of coefficients"
+        )
+        errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
+        training += [f"distortion model: {chosen}:", f"  {', '.join(errors)} px"]
+    return [fit, *training, calibration.stop_reason]
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:

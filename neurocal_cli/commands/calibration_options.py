@@ -127,10 +127,7 @@ class Estimation:
 
 
 def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the options of `Estimation`, which a command gets as the keyword ``estimation``.
-
-    Without `files` those of known cameras and poses are left out.
-    """
+    """Add the options of `Estimation`, a command's keyword ``estimation``; known cameras only if `files`."""
     names = [field.name for field in fields(Estimation)]
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -156,7 +156,17 @@ def detect(
     outcomes = of_one_size(outcomes)
     found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
     _report(outcomes, found, target, as_json)
-    _write(outcomes, found, target, overlay, output)
+    from neurocal_cli.detection.detect import gather
+    from neurocal_cli.io.points_csv import format_points
+    from neurocal_cli.io.writing import make_folder, write_whole
+
+    text = format_points(replace(gather(found, target.unit), distances=target.distances))
+    if overlay is not None:
+        make_folder(overlay)
+        for name, outcome in outcomes.items():
+            if outcome.overlay is not None:
+                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
+    write_whole(output, text)
 
 
 def _wanted(
@@ -308,23 +318,3 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
         f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
         "for; count inner vertices, not squares"
     ]
-
-
-def _write(
-    outcomes: Mapping[str, Outcome],
-    found: Mapping[str, Detection],
-    board: Board,
-    overlay: str | None,
-    output: str,
-) -> None:
-    from neurocal_cli.detection.detect import gather
-    from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import make_folder, write_whole
-
-    text = format_points(replace(gather(found, board.unit), distances=board.distances))
-    if overlay is not None:
-        make_folder(overlay)
-        for name, outcome in outcomes.items():
-            if outcome.overlay is not None:
-                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
-    write_whole(output, text)

@@ -90,7 +90,11 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
         raise ValueError("no shape")
     name = parts[2][1].decode("ascii")
     if kind == _CHAR:
-        return name, _text(parts[3], order) if len(parts) > 3 else ""
+        form, content = parts[3] if len(parts) > 3 else (1, b"")
+        encoding = _TEXT_TYPES[form]
+        if encoding == "utf-16":
+            encoding += "-le" if order == "<" else "-be"
+        return name, content.decode(encoding)
     if kind == _CELL:
         return name, [_matrix(content, order, depth - 1)[1] for _, content in parts[3 : 3 + count]]
     if kind == _STRUCT:
@@ -111,11 +115,3 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
 def _values(part: tuple[int, bytes], order: str) -> np.ndarray[Any, Any]:
     kind, content = part
     return np.frombuffer(content, dtype=np.dtype(order + _TYPES[kind]))
-
-
-def _text(part: tuple[int, bytes], order: str) -> str:
-    kind, content = part
-    encoding = _TEXT_TYPES[kind]
-    if encoding == "utf-16":
-        encoding += "-le" if order == "<" else "-be"
-    return content.decode(encoding)

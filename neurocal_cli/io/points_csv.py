@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.io.table import Table, read_table
 from neurocal_cli.io.table_header import Schema, quoted_field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
+PLACE = ("X", "Y", "Z")
+PIXEL = ("u", "v")
+OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ"), "across": ("nu", "nv")}
+"""Names of the optional columns, by their attribute of `Correspondences`."""
 SETTINGS = ("zoom", "focus")
 POINTS = Schema(
     kind="points",
@@ -81,6 +84,17 @@ def format_points(points: Correspondences) -> str:
     numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
     rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
     return "\n".join([*_metadata_lines(points), ",".join([*labels, *PLACE, *names]), *rows, ""])
+
+
+def value_columns(points: Correspondences) -> tuple[list[str], list[Array]]:
+    """Names and values of the columns after the world coordinates: pixels and the optional columns."""
+    names, blocks = list(PIXEL), [points.pixels]
+    for attribute, columns in OPTIONAL.items():
+        values = getattr(points, attribute)
+        if values is not None:
+            names += columns
+            blocks.append(values)
+    return names, blocks
 
 
 def _metadata_lines(points: Correspondences) -> list[str]:

@@ -126,7 +126,13 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
     lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
     rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
-    text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), _caption(board), 2.8)
+    sizes = [
+        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
+        f"{plane.square:g} {board.unit}"
+        for plane in board.planes
+    ]
+    caption = f"{', '.join(sizes)}. Print at 100 %, then measure the rulers."
+    text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), caption, 2.8)
     return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
 
 
@@ -176,12 +182,3 @@ def _rulers(corner: Array, size: Array, height: float) -> tuple[list[Line], list
                 shown = f"{mark:.0f}{' mm' if last else ''}"
                 texts.append(Text(place + shift, shown, 2.5, middle=axis == 0))
     return lines, texts
-
-
-def _caption(board: Board) -> str:
-    sizes = ", ".join(
-        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
-        f"{plane.square:g} {board.unit}"
-        for plane in board.planes
-    )
-    return f"{sizes}. Print at 100 %, then measure the rulers."

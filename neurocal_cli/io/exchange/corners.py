@@ -59,7 +59,11 @@ def read_corners(
     names = [str(path) for path in paths]
     data, source = read_bytes(names[0])
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
-        return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
+        try:
+            array = np.load(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+        return _corners(Field({"corners": array.tolist()}, source), board, unit)
     if data.startswith(b"PK\x03\x04"):
         return _corners(Field(arrays_of(data, source), source), board, unit)
     if data.startswith(b"MATLAB 5.0 MAT-file"):
@@ -88,13 +92,6 @@ def read_corners(
     if named or text.lstrip()[:1] in ("{", "<", "%"):
         return _corners(parse_tree(text, source), board, unit)
     return None
-
-
-def _npy(data: bytes, source: str) -> Any:
-    try:
-        return np.load(io.BytesIO(data), allow_pickle=False).tolist()
-    except (ValueError, OSError, EOFError) as error:
-        raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
 
 
 def _corners(
