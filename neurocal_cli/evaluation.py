@@ -121,9 +121,13 @@ def evaluate_camera(
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
-        fit, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
+        from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed
+
+        fit = fit_poses(points.select(fitted[points.view_index]), calibration, seed)
         poses.update({name: view.pose for name, view in fit.views.items()})
-        warnings += problems
+        warnings += [f"fitting the poses of the new views: {text}" for text in fit.warnings]
+        if not fit.converged:
+            warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
     camera = camera_of(calibration)
     predicted, in_front = predict(camera, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
@@ -164,19 +168,6 @@ def other_images(calibration: Calibration, points: Correspondences) -> tuple[str
     count = np.bincount(some.view_index)
     other = (2 * np.bincount(some.view_index, far) >= count) & (count >= _FEWEST)
     return tuple(np.array(some.view_names)[other].tolist())
-
-
-def _fit_poses(
-    camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
-) -> tuple[Calibration, list[str]]:
-    """Fit the poses of new views (type 3); also the warnings."""
-    from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed
-
-    fit = fit_poses(points, camera, seed)
-    warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
-    if not fit.converged:
-        warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
-    return fit, warnings
 
 
 def predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.streams import note
+from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.stereo.rig import Rig
 
 NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
@@ -112,6 +113,13 @@ def calibration_or_camera(
         why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
         note(f"only the intrinsic parameters and the distortion are used{besides}: {why}")
     return camera, points
+
+
+def warn_of_poor(rig: Rig, so: str = "") -> None:
+    """Warn of a rig whose verdict is poor, with the first reason and what follows from it."""
+    verdict = rig.verdict
+    if verdict is not None and verdict.word == "poor":
+        warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
 
 
 def given_board(

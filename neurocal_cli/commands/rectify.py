@@ -100,9 +100,14 @@ def rectify(
         folder = os.path.realpath(os.path.join(output, side))
         if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
             raise UsageError(f"{folder} is the folder of the inputs; give another output")
+    from neurocal_cli.io.exchange.neurocal import as_rig
+    from neurocal_cli.io.exchange.reading import read_cameras
     from neurocal_cli.stereo.rectified_pair import rectified_pair
 
-    found = _read_rig(rig)
+    cameras = read_cameras([rig])
+    if (count := len(cameras.cameras)) != 2:
+        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", rig)
+    found = as_rig(cameras)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
@@ -132,20 +137,6 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
-
-
-def _read_rig(name: str) -> Rig:
-    from neurocal_cli.io.exchange.neurocal import as_rig
-    from neurocal_cli.io.exchange.reading import read_cameras
-
-    cameras = read_cameras([name])
-    if len(cameras.cameras) != 2:
-        raise FormatError(
-            f"holds {len(cameras.cameras)} camera{'s' * (len(cameras.cameras) != 1)}; give the file of a rig "
-            "of two",
-            name,
-        )
-    return as_rig(cameras)
 
 
 @dataclass
@@ -188,9 +179,7 @@ class _Work:
             points = f"the rig's own {error.n_points} points"
             self._tell(f"{self.along} of {points} differ by {error.rms_px:.3g} px rms")
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
-        verdict = self.rig.verdict
-        if verdict is not None and verdict.word == "poor":
-            warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}")
+        preparation.warn_of_poor(self.rig)
 
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify the points of both cameras and write them."""

@@ -114,7 +114,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
         from neurocal_cli.io.rig_yaml import read_rig
 
         rig = read_rig(names[0])
-        _warn_of_poor(rig)
+        preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.stereo.fit_rig import fit_rig
@@ -125,14 +125,8 @@ def _rig(names: tuple[str, ...]) -> Rig:
     note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
     warn(*rig.warnings)
     if not rig.warnings:
-        _warn_of_poor(rig)
+        preparation.warn_of_poor(rig, "; points in space may be far off")
     return rig
-
-
-def _warn_of_poor(rig: Rig) -> None:
-    verdict = rig.verdict
-    if verdict is not None and verdict.word == "poor":
-        warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}; points in space may be far off")
 
 
 class _Tally:

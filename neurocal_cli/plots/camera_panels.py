@@ -169,12 +169,8 @@ def draw_learning(axes: Axes, subject: Subject) -> None:
     axes.semilogy(
         np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK, label="error of the network"
     )
-    axes.axhline(
-        max(network.rmse_after, _ZERO),
-        color=ACCENT,
-        linewidth=1.2,
-        label=f"error after bundle adjustment, {network.rmse_after:.4g} px",
-    )
+    label = f"error after bundle adjustment, {network.rmse_after:.4g} px"
+    axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2, label=label)
     axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
     axes.legend(loc="upper right", frameon=False)
 
