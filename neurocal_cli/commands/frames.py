@@ -25,11 +25,7 @@ _PAUSE = 0.3  # seconds between two checks; a file that is still being copied gr
 
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Replace each video by its frames that are worth measuring.
-
-    Yields the paths, and the temporary folder of the frames, with a separator, to be cut from messages; empty
-    without videos.
-    """
+    """Replace videos by their best frames; also the folder of these, with a separator, for messages."""
     from neurocal_cli.io.video import is_video
 
     if not any(map(is_video, paths)):

@@ -103,14 +103,11 @@ def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
     cells = "".join(
         f"<th{' class=text' * text}>{escape(cell)}</th>" for cell, text in zip(head, texts, strict=True)
     )
-    lines = "\n".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in body)
+    marks = ("", " class=text")  # of texts that are long and may wrap
+    written = ((f"<td{marks[len(cell) > _LONG]}>{escape(cell)}</td>" for cell in row) for row in body)
+    lines = "\n".join(f"<tr>{''.join(row)}</tr>" for row in written)
     content = f"<thead><tr>{cells}</tr></thead>\n<tbody>{lines}</tbody>"
     return f'<div class="wide"><table{sort}>{content}</table></div>'
-
-
-def _cell(content: str) -> str:
-    """Make a cell; long texts may wrap."""
-    return f"<td{' class=text' if len(content) > _LONG else ''}>{escape(content)}</td>"
 
 
 def figure(drawing: str, caption: str) -> str:

@@ -84,11 +84,7 @@ def own_length(model: str) -> int:
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
-    """Lines of the file, without line ends.
-
-    `rectified` are the rectification (3, 3) and projection matrix (3, 4) of a camera on a rig; by default
-    those of a single camera.
-    """
+    """Lines of the file; `rectified` are R (3, 3) and P (3, 4) of a camera on a rig, as ROS defines them."""
     R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
     width, height = camera.image_size or (0, 0)  # ROS's readers require numbers
     model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)

@@ -27,9 +27,8 @@ _KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
 @contextmanager
 def repeatable_stdin() -> Iterator[None]:
     """Keep what is read from stdin, so that several readers can look at it in turn."""
-    token = _KEPT.set(None)
+    token = _KEPT.set(read_bytes("-")[0])
     try:
-        _KEPT.set(read_bytes("-")[0])
         yield
     finally:
         _KEPT.reset(token)

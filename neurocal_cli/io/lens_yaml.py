@@ -100,13 +100,6 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
     yield from list_lines("warnings", map(quoted, lens.warnings))
 
 
-def _coupling(field: Field, S: int, size: int) -> Array:
-    flat = field.array(S, -1)
-    if flat.shape[1] % size:
-        field.fail(f"rows of a multiple of {size} numbers")
-    return flat.reshape(S, size, -1)
-
-
 def _member_lines(lens: ZoomLens) -> Iterator[str]:
     yield "members:"
     for member in lens.members:
@@ -160,6 +153,9 @@ def _lens(block: Field) -> ZoomLens:
     width, height = block["image_width"].integer(), block["image_height"].integer()
     fit = block["fit"]
     Q = {"known": 0, "still": 6, "moving": 1}[camera]
+    coupling = block.read("target_coupling", lambda field: field.array(S, -1))
+    if coupling is not None and coupling.shape[1] % (L + Q):
+        block["target_coupling"].fail(f"rows of a multiple of {L + Q} numbers")
     return ZoomLens(
         controls=controls,
         settings=settings,
@@ -188,7 +184,7 @@ def _lens(block: Field) -> ZoomLens:
         unit=block["unit"].text(),
         warnings=tuple(block["warnings"].texts()),
         target=block.read("target", read_target),
-        target_coupling=block.read("target_coupling", lambda field: _coupling(field, S, L + Q)),
+        target_coupling=None if coupling is None else coupling.reshape(S, L + Q, -1),
     )
 
 

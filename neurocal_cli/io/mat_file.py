@@ -26,11 +26,7 @@ _MOST_BYTES = 500_000_000  # unpacked
 
 
 def read_variables(data: bytes, source: str) -> dict[str, Any]:
-    """Read the variables of a file.
-
-    They are arrays of numbers, strings, lists for cells, and dictionaries for structs. Objects of MATLAB's
-    classes are left out, because only MATLAB can read them.
-    """
+    """Read arrays, strings, lists for cells and dicts for structs; objects of classes are left out."""
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise FormatError("is no .mat file of version 5 to 7; save it again with -v7", source)

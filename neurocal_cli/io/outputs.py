@@ -167,8 +167,7 @@ def remove_stale(folder: str) -> None:
         return
     _seen.add(folder)
     with suppress(OSError):
-        names = [name for name in os.listdir(folder or ".") if name.startswith(".neurocal-")]
-        for name in names:
+        for name in os.listdir(folder or "."):
             match = re.fullmatch(_NAME, name)
             if match and match[1] == _computer() and not _runs(int(match[2])):
                 with suppress(OSError):

@@ -76,16 +76,12 @@ def format_space_points(
         if k == 0:
             names = COLUMNS if labels is None else ("point", *COLUMNS)
             yield "\n".join([*header, ",".join(names), ""])
-        yield _rows(found, labels, sigma, limit)
-
-
-def _rows(found: Triangulated, labels: NDArray[Any] | None, sigma: float, limit: float) -> str:
-    assert found.covariance is not None
-    numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
-    numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
-    flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
-    columns: list[list[Any]] = [*numbers.T.tolist(), flags]
-    row = _ROW
-    if labels is not None:
-        columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
-    return "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
+        assert found.covariance is not None
+        numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
+        numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
+        flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
+        columns: list[list[Any]] = [*numbers.T.tolist(), flags]
+        row = _ROW
+        if labels is not None:
+            columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
+        yield "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"

@@ -92,11 +92,7 @@ def paper_size(name: str) -> tuple[float, float]:
 
 
 def default_board(paper: tuple[float, float]) -> Board:
-    """A board of 9 x 6 inner vertices whose squares are as large as fits on a paper, in whole mm.
-
-    Of 10 x 7 squares, so that it does not look the same after a turn of 180 degrees. An InputError says that
-    the paper is too small for squares of 5 mm.
-    """
+    """A board of 9 x 6 inner vertices, which looks different turned, with the largest squares in whole mm."""
     room = _room(max(paper), min(paper))
     square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
     if square < 5:
