@@ -26,41 +26,29 @@ _MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing err
 
 @frozen_dataclass
 class Plane:
-    """One flat chessboard.
+    """One flat chessboard; an InputError about a value out of range begins with its name.
 
-    Parameters
-    ----------
-    name : str
-        Prefix of the point ids; may be empty for the only plane of a board.
-    cols, rows : int
-        Inner vertices along x_axis and y_axis.
-    square : float [world unit]
-        Side of a square.
-    origin : 3 floats [world unit]
-        Vertex (0, 0).
-    x_axis, y_axis : 3 floats
-        Unit vectors, perpendicular to each other.
-    measured : tuple of 5 floats each
-        Places (c, r) in squares, and the measured X, Y, Z of the point there; none: all points are at their
-        nominal positions.
-
-    Raises
-    ------
-    InputError
-        A value out of range; the message begins with its name.
+    `name` is the prefix of the point ids, and may be empty for the only plane of a board. Points that are not
+    `measured` are at their nominal positions.
     """
 
     name: str
-    cols: int
-    rows: int
-    square: float
-    origin: Triple = (0.0, 0.0, 0.0)
+    cols: int  # inner vertices along x_axis
+    rows: int  # and along y_axis
+    square: float  # side of a square [world unit]
+    origin: Triple = (0.0, 0.0, 0.0)  # vertex (0, 0) [world unit]
     x_axis: Triple = (1.0, 0.0, 0.0)
-    y_axis: Triple = (0.0, 1.0, 0.0)
-    measured: tuple[tuple[float, ...], ...] = ()
+    y_axis: Triple = (0.0, 1.0, 0.0)  # unit vectors, perpendicular to each other
+    measured: tuple[tuple[float, ...], ...] = ()  # c, r [squares] and X, Y, Z of points
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        name = self.name
+        if not isinstance(name, str):
+            raise InputError(f"name must be text, found {name!r}")
+        if name != name.strip() or not name.isprintable() or "/" in name:
+            raise InputError(
+                f"name must be printable, without '/' and outer blanks, found {name!r}; rename it"
+            )
         for count in ("cols", "rows"):
             object.__setattr__(self, count, _count(count, getattr(self, count)))
         square = _numbers("square", self.square, ())
@@ -89,34 +77,12 @@ class Plane:
         return np.cross(self.x_axis, self.y_axis)
 
     def at(self, grid: ArrayLike) -> Array:
-        """World coordinates of grid coordinates, (0, 0) being the first vertex and 1 a square.
-
-        Parameters
-        ----------
-        grid : (..., 2) array
-            Along x_axis and y_axis, in squares.
-
-        Returns
-        -------
-        world : (..., 3) array [world unit]
-        """
+        """World coordinates (..., 3) of places (..., 2) along the axes, in squares from the first vertex."""
         lengths = self.square * np.asarray(grid, dtype=float)
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
 
     def truly_at(self, grid: ArrayLike) -> Array:
-        """True world coordinates: as measured, and interpolated smoothly in between.
-
-        A thin-plate spline through the measured points of the plane.
-
-        Parameters
-        ----------
-        grid : (N, 2) array
-            Along x_axis and y_axis, in squares.
-
-        Returns
-        -------
-        world : (N, 3) array [world unit]
-        """
+        """True world coordinates (N, 3) of places (N, 2) [squares]: measured, else by a thin-plate spline."""
         world = self.at(grid)
         if not self.measured:
             return world
@@ -141,13 +107,9 @@ class Plane:
         return tuple(f"{self.prefix}{c}:{r}" for r in range(self.rows) for c in range(self.cols))
 
     def midpoint_grid(self) -> Array:
-        """Grid coordinates of the mid-points, all of ``h`` row by row and then all of ``v``.
+        """Grid coordinates (N, 2) [squares] of the mid-points, all of ``h`` row by row and then all of ``v``.
 
-        Returns
-        -------
-        grid : (N, 2) array [squares]
-            (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``;
-            N = (cols - 1) rows + cols (rows - 1).
+        (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``; N = (cols - 1) rows + cols (rows - 1).
         """
         c, r = np.meshgrid(np.arange(self.cols - 1) + 0.5, np.arange(self.rows))
         along_x = np.stack([c, r], axis=-1).reshape(-1, 2)
@@ -241,17 +203,11 @@ class Board:
         return replace(self, planes=tuple(plane.rescaled(factor) for plane in self.planes))
 
     def plane(self, name: str) -> Plane:
-        """Find the plane with a name.
-
-        Raises
-        ------
-        InputError
-            There is none.
-        """
-        for plane in self.planes:
-            if plane.name == name:
-                return plane
-        raise InputError(f"the board has no plane {name!r}; it has {[p.name for p in self.planes]}")
+        """The plane with a name; an InputError if there is none."""
+        named = {plane.name: plane for plane in self.planes}
+        if name not in named:
+            raise InputError(f"the board has no plane {name!r}; it has {list(named)}")
+        return named[name]
 
 
 def smooth_between(places: Array, values: Array, at: Array) -> Array:
@@ -259,13 +215,6 @@ def smooth_between(places: Array, values: Array, at: Array) -> Array:
     from scipy.interpolate import RBFInterpolator
 
     return np.asarray(RBFInterpolator(places, values)(at))
-
-
-def _check_name(name: object) -> None:
-    if not isinstance(name, str):
-        raise InputError(f"name must be text, found {name!r}")
-    if name != name.strip() or not name.isprintable() or "/" in name:
-        raise InputError(f"name must be printable, without '/' and outer blanks, found {name!r}; rename it")
 
 
 def _count(name: str, value: object) -> int:

@@ -31,67 +31,33 @@ _FEWEST = 4  # fewest points that determine a pose
 
 @frozen_dataclass
 class ViewEvaluation:
-    """One view's error.
-
-    Attributes
-    ----------
-    n_points : int
-    n_behind : int
-        Points on or behind the focal plane; all averages leave them out.
-    rmse_px, max_px : float [px]
-        nan if no point lies in front of the camera.
-    fitted : bool
-        Whether the pose was estimated from these points.
-    """
+    """One view's error; nan [px] if no point lies in front of the camera."""
 
     n_points: int
-    n_behind: int
+    n_behind: int  # points on or behind the focal plane; all averages leave them out
     rmse_px: float
     max_px: float
-    fitted: bool
+    fitted: bool  # whether the pose was estimated from these points
 
 
 @frozen_dataclass(eq=False)
 class CameraEvaluation:
-    """A camera's error over all the points.
+    """A camera's error over all the points; averages leave out points on or behind the focal plane."""
 
-    Attributes
-    ----------
-    residuals : (N, 2) array [px]
-        Predicted minus observed; nan for points on or behind the focal plane, which all averages leave out.
-    n_points, n_behind : int
-    rmse_px : float [px]
-        ``sqrt(mean(du^2 + dv^2))``.
-    max_px : float [px]
-        Longest residual.
-    rms_u, rms_v : float [px]
-        Of each axis; their squares add up to that of `rmse_px`.
-    bias_u, bias_v : float [px]
-        Mean residual.
-    views : dict of ViewEvaluation by view name
-    warnings : tuple of str
-    renamed : tuple of str
-        Fitted views that have the name of a view of the calibration, but show another image.
-    fit : Calibration or None
-        The fitted views, with the camera given.
-    on_target : bool
-        Whether the estimated target of the calibration replaced the given world coordinates.
-    """
-
-    residuals: Array
+    residuals: Array  # (N, 2) predicted minus observed [px]; nan for points that are left out
     n_points: int
     n_behind: int
-    rmse_px: float
-    max_px: float
+    rmse_px: float  # sqrt(mean(du^2 + dv^2))
+    max_px: float  # longest residual
     rms_u: float
-    rms_v: float
+    rms_v: float  # of each axis [px]; their squares add up to that of rmse_px
     bias_u: float
-    bias_v: float
+    bias_v: float  # mean residual of each axis [px]
     views: Mapping[str, ViewEvaluation]
     warnings: tuple[str, ...] = ()
-    renamed: tuple[str, ...] = ()
-    fit: Calibration | None = None
-    on_target: bool = False
+    renamed: tuple[str, ...] = ()  # fitted views with the name of a calibrated view, of another image
+    fit: Calibration | None = None  # the fitted views, with the camera given
+    on_target: bool = False  # whether the estimated target replaced the given world points
 
     @property
     def fitted_views(self) -> tuple[str, ...]:
@@ -146,14 +112,22 @@ def evaluate_camera(
         if given is not None:
             renamed = other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}
-            warnings += _compare_units(calibration, points, poses)
+            if points.unit != calibration.unit and not poses.keys().isdisjoint(points.view_names):
+                warnings.append(
+                    f"the points are in {points.unit}, but the poses of the calibration are in "
+                    f"{calibration.unit}; the error is wrong unless these are the same unit"
+                )
     elif points is None:
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
-        fit, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
+        from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed
+
+        fit = fit_poses(points.select(fitted[points.view_index]), calibration, seed)
         poses.update({name: view.pose for name, view in fit.views.items()})
-        warnings += problems
+        warnings += [f"fitting the poses of the new views: {text}" for text in fit.warnings]
+        if not fit.converged:
+            warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
     camera = camera_of(calibration)
     predicted, in_front = predict(camera, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
@@ -168,13 +142,7 @@ def evaluate_camera(
 
 
 def refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
-    """Refuse points of images of another size than the camera's.
-
-    Raises
-    ------
-    InputError
-        It names both sizes.
-    """
+    """Refuse points of images of another size than the camera's, with an InputError."""
     here, there = points.image_size, calibration.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
@@ -202,29 +170,6 @@ def other_images(calibration: Calibration, points: Correspondences) -> tuple[str
     return tuple(np.array(some.view_names)[other].tolist())
 
 
-def _compare_units(calibration: Calibration, points: Correspondences, poses: Mapping[str, Pose]) -> list[str]:
-    """Warn if calibrated poses are used for points in another unit."""
-    if points.unit == calibration.unit or poses.keys().isdisjoint(points.view_names):
-        return []
-    return [
-        f"the points are in {points.unit}, but the poses of the calibration are in {calibration.unit}; "
-        "the error is wrong unless these are the same unit"
-    ]
-
-
-def _fit_poses(
-    camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
-) -> tuple[Calibration, list[str]]:
-    """Fit the poses of new views (type 3); also the warnings."""
-    from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed
-
-    fit = fit_poses(points, camera, seed)
-    warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
-    if not fit.converged:
-        warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
-    return fit, warnings
-
-
 def predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
     """Project all points with the poses of their views; also which points lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
@@ -242,19 +187,14 @@ def _measure(
     n_points = np.bincount(index, minlength=n_views)
     n_seen = np.bincount(index[in_front], minlength=n_views)
     sums = np.bincount(index[in_front], weights=squares, minlength=n_views)
-    largest = np.full(n_views, -1.0)
-    np.maximum.at(largest, index[in_front], squares)
-    views = {
-        name: ViewEvaluation(
-            n_points=int(n_points[k]),
-            n_behind=int(n_points[k] - n_seen[k]),
-            rmse_px=float(np.sqrt(sums[k] / n_seen[k])) if n_seen[k] else np.nan,
-            max_px=float(np.sqrt(largest[k])) if n_seen[k] else np.nan,
-            fitted=bool(fitted[k]),
-        )
-        for k, name in enumerate(points.view_names)
-    }
-    bias, power = _moments(residuals[in_front])
+    largest = np.full(n_views, np.nan)
+    np.fmax.at(largest, index[in_front], squares)
+    with np.errstate(invalid="ignore"):  # nan where no point is in front
+        columns = n_points, n_points - n_seen, np.sqrt(sums / n_seen), np.sqrt(largest), fitted
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    views = {name: ViewEvaluation(*row) for name, row in zip(points.view_names, rows, strict=True)}
+    seen = residuals[in_front] if in_front.any() else np.full((1, 2), np.nan)
+    bias, power = seen.mean(axis=0), (seen**2).mean(axis=0)
     return CameraEvaluation(
         residuals=residuals,
         n_points=len(points),
@@ -268,10 +208,3 @@ def _measure(
         views=views,
         warnings=warnings,
     )
-
-
-def _moments(residuals: Array) -> tuple[Array, Array]:
-    """Mean and mean square of each axis; nan when there is no residual."""
-    if not len(residuals):
-        return np.full(2, np.nan), np.full(2, np.nan)
-    return residuals.mean(axis=0), (residuals**2).mean(axis=0)

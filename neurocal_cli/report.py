@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, Verdict, ViewResult
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
@@ -66,17 +67,18 @@ def align(rows: Iterable[Sequence[str]]) -> list[str]:
 
 def calibration_report(calibration: Calibration) -> str:
     """Summary of a calibration: parameters, views, fit, training and verdict, without the warnings."""
-    blocks = [
-        [_headline(calibration)],
-        align(parameter_rows(calibration)),
-        _view_lines(calibration.views),
-        [
-            *_training_lines(calibration),
-            *target_lines(calibration.target, calibration.unit),
-            *_scale_lines(calibration),
-        ],
-        [] if calibration.verdict is None else verdict_lines(calibration.verdict),
-    ]
+    size, points = calibration.image_size, calibration.points
+    headline = (
+        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]}), "
+        f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
+        f"{'image size unknown' if size is None else f'{size[0]} x {size[1]} px'}"
+    )
+    fit = [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)]
+    if points.distances:
+        held = plural(len(points.distances), "measured distance")
+        fit.append(f"scale: held by {held}, std {100 * scale_of(points).std:.2g} %")
+    verdict = [] if calibration.verdict is None else verdict_lines(calibration.verdict)
+    blocks = [[headline], align(parameter_rows(calibration)), _view_lines(calibration.views), fit, verdict]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
@@ -85,41 +87,26 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     if target is None:
         return []
     unit = "units" if unit == "unknown" else printable(unit)
+    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
     if target.stated is not None:
-        return [_surveyed_line(target, unit)]
+        held = int((target.stated == 0).all(axis=1).sum())
+        exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
+        factor = target.sizes["stated"]
+        taken = "" if factor == 1 else f", scaled by {factor:.2g} to match the residuals"
+        return [
+            f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their stated "
+            f"standard deviations{taken}{exact}"
+        ]
     lines = []
     if not target.only_bends:
         parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
         parts.append(f"stretched by {100 * target.stretch():.2g} %")
-        found = np.sqrt((target.offsets**2).sum(axis=1).mean())
         lines.append(
             f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
         )
     if target.bends is not None:
         lines.append(f"target: bends anew in each view, by {target.bend_of_views():.2g} {unit} rms")
     return lines
-
-
-def _scale_lines(calibration: Calibration) -> list[str]:
-    distances = calibration.points.distances
-    if not distances:
-        return []
-    return [
-        f"scale: held by {plural(len(distances), 'measured distance')}, std "
-        f"{100 * scale_of(calibration.points).std:.2g} %"
-    ]
-
-
-def _surveyed_line(target: Target, unit: str) -> str:
-    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
-    held = int((target.stated == 0).all(axis=1).sum()) if target.stated is not None else 0
-    exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
-    factor = target.sizes["stated"]
-    taken = "" if factor == 1 else f", scaled by {factor:.2g} to match the residuals"
-    return (
-        f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their stated "
-        f"standard deviations{taken}{exact}"
-    )
 
 
 def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
@@ -242,16 +229,6 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def _headline(calibration: Calibration) -> str:
-    size = calibration.image_size
-    parts = [
-        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]})",
-        f"{plural(len(calibration.points), 'point')} in {plural(len(calibration.views), 'view')}",
-        "image size unknown" if size is None else f"{size[0]} x {size[1]} px",
-    ]
-    return ", ".join(parts)
-
-
 def parameter_rows(calibration: Calibration) -> list[list[str]]:
     """Rows of the intrinsic parameters, and of the pose if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
@@ -315,32 +292,21 @@ def _training_lines(calibration: Calibration) -> list[str]:
     if calibration.n_rejected:
         fit += f", {plural(calibration.n_rejected, 'outlier')} rejected"
     training = [] if calibration.network is None else _network_lines(calibration.network)
-    if calibration.straight_lines is not None:
-        training.insert(0, _lens_line(calibration.straight_lines))
-    return [fit, *training, *_lens_lines(calibration), calibration.stop_reason]
-
-
-def _lens_lines(calibration: Calibration) -> list[str]:
-    """The candidates of the model selection with their cross-validation errors, best first."""
-    choice = calibration.lens_choice
-    if not choice:
-        return []
-    errors = [f"{name} {_pixels(choice[name])}" for name in sorted(choice, key=lambda name: choice[name])]
-    chosen = calibration.distortion_model
-    return [
-        f"distortion model: {chosen}, chosen by cross-validation error and number of coefficients:",
-        f"  {', '.join(errors)} px",
-    ]
-
-
-def _lens_line(found: StraightLines) -> str:
-    u, v = found.centre
-    return (
-        f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
-        "distance "
-        f"{_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px after; centre of "
-        f"distortion ({u:.1f}, {v:.1f})"
-    )
+    if (found := calibration.straight_lines) is not None:
+        u, v = found.centre
+        training.insert(
+            0,
+            f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
+            f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
+            f"after; centre of distortion ({u:.1f}, {v:.1f})",
+        )
+    if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
+        chosen = (
+            f"{calibration.distortion_model}, chosen by cross-validation error and number of coefficients"
+        )
+        errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
+        training += [f"distortion model: {chosen}:", f"  {', '.join(errors)} px"]
+    return [fit, *training, calibration.stop_reason]
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:

@@ -19,23 +19,7 @@ _WIDTH, _HEIGHT = 5.5, 4.5  # inches of a panel
 
 
 def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
-    """Draw the estimated points of each plane: height as contours, offsets in the plane as arrows.
-
-    Parameters
-    ----------
-    target : Target
-    unit : str
-    kind : {"png", "pdf", "svg"}
-
-    Returns
-    -------
-    picture : bytes
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
-    """
+    """Draw the estimated points of each plane: height as contours, offsets in the plane as arrows."""
     planes = int(target.plane.max()) + 1
 
     def draw(figure: Figure) -> None:

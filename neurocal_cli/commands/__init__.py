@@ -44,13 +44,7 @@ _SUMMARIES = {
 
 
 class _LazyGroup(click.Group):
-    """A group that imports a command's module only when the command is used.
-
-    Parameters
-    ----------
-    summaries : dict
-        Summary of each command for ``--help``; None for a hidden one.
-    """
+    """A group that imports a command's module only when it is used; a hidden command has no summary."""
 
     def __init__(self, *args: Any, summaries: Mapping[str, str | None], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

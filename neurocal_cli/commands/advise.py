@@ -6,9 +6,8 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
-from neurocal_cli.commands.preparation import check_outputs
 from neurocal_cli.commands.streams import print_summary
 
 
@@ -36,7 +35,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
     options.check_plot(plot, "-")
-    check_outputs((plot,), (calibration,))
+    preparation.check_outputs((plot,), (calibration,))
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.planning.advice import advise as weigh
     from neurocal_cli.planning.report import advice_json, advice_lines

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.preparation import check_outputs
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -21,7 +19,7 @@ _ENDINGS = (".svg", ".pdf", ".png")
 
 
 @click.command(cls=options.Command)
-@board_options("Unit of --square. A board file names its own unit.")
+@options.board("Unit of --square. A board file names its own unit.")
 @click.option(
     "--paper",
     metavar="NAME|WxH",
@@ -75,23 +73,14 @@ def board(
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
     beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
-    check_outputs((output, beside), (board,))
+    preparation.check_outputs((output, beside), (board,))
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
-    target = given_board(board, cols, rows, square, unit)
+    target = preparation.given_board(board, cols, rows, square, unit)
     if target is None:
         target = default_board(size)
     sheet = on_paper(target, size)
-    _write(sheet, output, ending, dpi)
-    if beside is not None:
-        from neurocal_cli.io.board_yaml import write_board
-
-        write_board(target, beside)
-    _report(target, sheet, beside, as_json)
-
-
-def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
     from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
     from neurocal_cli.io.writing import write_whole
 
@@ -99,6 +88,11 @@ def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
         write_whole(output, board_svg(sheet))
     else:
         write_whole(output, board_pdf(sheet) if ending == ".pdf" else board_png(sheet, dpi))
+    if beside is not None:
+        from neurocal_cli.io.board_yaml import write_board
+
+        write_board(target, beside)
+    _report(target, sheet, beside, as_json)
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:
@@ -106,13 +100,11 @@ def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> N
     if alike and len(target.planes) == 1:
         cols, rows = alike[0].cols, alike[0].rows
         warn(
-            [
-                f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
-                f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
-            ]
+            f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
+            f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
         )
     if any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
-        warn(["neurocal detect needs at least 3 x 3 inner vertices"])
+        warn("neurocal detect needs at least 3 x 3 inner vertices")
     if as_json:
         keys = ("name", "cols", "rows", "square")
         planes = [{key: getattr(plane, key) for key in keys} for plane in target.planes]

@@ -6,23 +6,16 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 from neurocal_cli.plots import CAMERA_PANELS
 
 
 @click.command(cls=options.Command)
 @options.points
-@estimation_options
+@estimation_options()
 @options.camera_name
 @plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
@@ -79,15 +72,15 @@ def calibrate(
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    compute_in_one_thread()
+    preparation.compute_in_one_thread()
     estimation.check()
-    check_summary(as_json, output, html)
+    preparation.check_summary(as_json, output, html)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
-    check_one_stdin(*inputs)
+    preparation.check_one_stdin(*inputs)
     options.check_camera_name(camera_name)
     check_plots(plots, output)
-    check_outputs((output, html, *(file for _, file in plots)), inputs)
-    given, arguments = estimation.prepare(given_points(points))
+    preparation.check_outputs((output, html, *(file for _, file in plots)), inputs)
+    given, arguments = estimation.prepare(preparation.given_points(points))
 
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.methods import calibrate as learn
@@ -100,6 +93,6 @@ def calibrate(
         from neurocal_cli.plots.pages import draw_camera
 
         write_plots(plots, partial(draw_camera, Subject.of(calibration)))
-    warn(write_result(calibration, output, lean=lean))
+    warn(*write_result(calibration, output, lean=lean))
     write_page(html, calibration, *inputs)
     conclude(calibration, as_json, calibration_json, calibration_report)

@@ -7,15 +7,13 @@ from dataclasses import fields, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.given_camera import given_camera
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
-    from neurocal_cli.training.backprop import BackpropOptions
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -42,21 +40,14 @@ class Estimation:
     target: str
 
     def check(self) -> None:
-        """Refuse options that contradict each other, before any file is read.
-
-        Raises
-        ------
-        UsageError
-        """
-        for name, option, type_ in (
+        """Refuse options that contradict each other, before any file is read, with a UsageError."""
+        for given, option, type_ in (
             (self.image_center, "--image-center", "2"),
             (self.intrinsics, "--intrinsics", "3"),
             (self.extrinsics, "--extrinsics", "4"),
         ):
-            if name is not None and self.type != type_:
-                raise UsageError(
-                    f"{option} needs --type {type_}, but the type is {self.type}; give --type {type_}"
-                )
+            if given is not None:
+                self._require("type", type_, option)
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
@@ -74,25 +65,20 @@ class Estimation:
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
         for name, option in _BACKPROP_ONLY.items():
-            if getattr(self, name) is not None and self.trainer != "backprop":
-                raise UsageError(
-                    f"{option} needs --trainer backprop, but the trainer is {self.trainer}; give --trainer "
-                    "backprop"
-                )
+            if getattr(self, name) is not None:
+                self._require("trainer", "backprop", option)
+
+    def _require(self, name: str, wanted: str, option: str) -> None:
+        """Refuse an option that needs another value of the option with this name."""
+        if (given := getattr(self, name)) != wanted:
+            need = f"--{name} {wanted}"
+            raise UsageError(f"{option} needs {need}, but the {name} is {given}; give {need}")
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
-        """Read the given files; return the points and the library's keyword arguments.
-
-        Raises
-        ------
-        InputError
-            The given camera cannot be used with these points.
-        UsageError
-            Type 2 has no image centre.
-        """
+        """Read the given files; return the points and the library's keyword arguments."""
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
-                note([f"--image-size is used instead of the image_size in {points.source}"])
+                note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {
             "type": int(self.type),
@@ -104,26 +90,21 @@ class Estimation:
             "target": self.target,
             "seed": self.seed,
             "starts": self.starts,
-            "backprop": self._backprop(),
         }
+        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
+        if given := {name: value for name, value in values.items() if value is not None}:
+            from neurocal_cli.training.backprop import BackpropOptions
+
+            arguments["backprop"] = BackpropOptions(**given)  # type: ignore[arg-type]
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
-            points, arguments["intrinsics"] = given_camera(self.intrinsics, points)
+            points, arguments["intrinsics"] = preparation.given_camera(self.intrinsics, points)
         elif self.extrinsics is not None:
             from neurocal_cli.io.calibration_tree import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
         return points, arguments
-
-    def _backprop(self) -> BackpropOptions | None:
-        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
-        given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-        if not given:
-            return None
-        from neurocal_cli.training.backprop import BackpropOptions
-
-        return BackpropOptions(**given)
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
         """The image centre of type 2: from the option, the points' header, or the middle of the image."""
@@ -139,35 +120,28 @@ class Estimation:
         width, height = points.image_size
         center = (width - 1) / 2, (height - 1) / 2
         warn(
-            [
-                "no image centre is given, so the middle of the image, "
-                f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
-            ]
+            "no image centre is given, so the middle of the image, "
+            f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
         )
         return center
 
 
-def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `Estimation` to a command, which gets them as the keyword ``estimation``."""
-    return _collecting(command, _OPTIONS)
-
-
-def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `Estimation` without the files of known cameras and poses."""
-    return _collecting(command, [option for option in _OPTIONS if option not in _FILES])
-
-
-def _collecting(command: Callable[..., Any], chosen: list[Any]) -> Callable[..., Any]:
+def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add the options of `Estimation`, a command's keyword ``estimation``; known cameras only if `files`."""
     names = [field.name for field in fields(Estimation)]
 
-    @wraps(command)
-    def collected(*args: Any, **kwargs: Any) -> Any:
-        estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
-        return command(*args, estimation=estimation, **kwargs)
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def collected(*args: Any, **kwargs: Any) -> Any:
+            estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
+            return command(*args, estimation=estimation, **kwargs)
 
-    for option in reversed(chosen):
-        collected = option(collected)
-    return collected
+        for option in reversed(_OPTIONS):
+            if files or option not in _FILES:
+                collected = option(collected)
+        return collected
+
+    return add
 
 
 _FILES = [
@@ -194,10 +168,7 @@ _OPTIONS = [
     ),
     *_FILES,
     options.count(
-        "--image-size",
-        "W H",
-        "Width and height of the images in pixels.",
-        without="image_size in POINTS",
+        "--image-size", "W H", "Width and height of the images in pixels.", without="image_size in POINTS"
     ),
     options.choice(
         "--method",

@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.preparation import check_one_stdin, compute_in_one_thread
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 
 
@@ -82,9 +80,9 @@ def compare(
       neurocal compare sample_data/flat.csv --methods neuro,linear --outliers keep \\
           --image-size 640 480 --seed 1 --json
     """  # noqa: D301 - as in the group
-    check_one_stdin(points, right)
-    compute_in_one_thread()
-    given = [given_points([name]) for name in (points, right) if name is not None]
+    preparation.check_one_stdin(points, right)
+    preparation.compute_in_one_thread()
+    given = [preparation.given_points([name]) for name in (points, right) if name is not None]
     if image_size is not None:
         given = [replace(one, image_size=image_size) for one in given]
 
@@ -93,7 +91,7 @@ def compare(
 
     with ProgressBar() as progress:
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
-    note(found.notes)
+    note(*found.notes)
     if as_json:
         print_summary(comparison_json(found))
     else:

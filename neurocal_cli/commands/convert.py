@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.board_options import board_options, check_unit, given_board
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
@@ -53,7 +51,7 @@ if TYPE_CHECKING:
     "If the format does not have the distortion model, write the nearest camera that it has.",
     without="refuse",
 )
-@board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
+@options.board("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
 @options.count(
     "--image-size",
     "W H",
@@ -122,12 +120,13 @@ def convert(
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
           -o corners.npz
     """  # noqa: D301 - as in the group
-    check_one_stdin(*files, board)
-    check_summary(as_json, output)
-    check_unit(unit)
+    preparation.check_one_stdin(*files, board)
+    preparation.check_summary(as_json, output)
+    preparation.check_unit(unit)
     folder = os.path.isdir(output) or output.endswith(os.sep)
-    check_outputs((None if folder else output,), (*files, board))
-    target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
+    preparation.check_outputs((None if folder else output,), (*files, board))
+    of_board = None if square is None and board is None else unit
+    target_board = preparation.given_board(board, cols, rows, square, of_board)
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.io.files import repeatable_stdin
 
@@ -139,7 +138,16 @@ def convert(
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
         options.note_unused("on points", "force")
-        told = _write_points(found, target, output)
+        from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+        from neurocal_cli.io.writing import write_whole
+
+        text = corner_text(found, target, os.path.splitext(output)[1].lower())
+        losses, remarks = points_lost(found, target)
+        note(*remarks)
+        warn(*losses)
+        write_whole(output, text)
+        told = {"to": target, "n_points": len(found), "n_views": found.n_views}
+        told["warnings"] = [*losses, *remarks]
         if not as_json:
             say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
     if as_json:
@@ -157,8 +165,8 @@ def _write_cameras(
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
     _write(contents, output, target)
-    note(adapted.remarks)
-    warn(adapted.losses)
+    note(*adapted.remarks)
+    warn(*adapted.losses)
     written = [
         {
             "name": camera.name,
@@ -180,59 +188,24 @@ def _write_cameras(
 def _read(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | CameraSet:
-    points = _points(files, board, unit, size)
+    """The points of the files or, if they hold none, the cameras; with values that the files lack."""
+    from neurocal_cli.io.exchange.colmap import is_folder
+    from neurocal_cli.io.exchange.corners import read_corners
+
+    notes: list[str] = []
+    points = None if is_folder(files[0]) else read_corners(files, board, notes, unit)
+    note(*notes)
     if points is not None:
-        return points
+        if size is not None and points.image_size not in (None, size):
+            raise InputError("the image size of the file is another; leave out --image-size")
+        return points if size is None else replace(points, image_size=size)
     if board is not None:
         raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
     if len(files) > 2:
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
     from neurocal_cli.io.exchange.reading import read_cameras
 
-    return _completed(read_cameras(files), unit, size)
-
-
-def _points(
-    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
-) -> Correspondences | None:
-    """The points of the files; None if the files hold cameras."""
-    from neurocal_cli.io.exchange.colmap import is_folder
-    from neurocal_cli.io.exchange.corners import read_corners
-
-    if is_folder(files[0]):
-        return None
-    notes: list[str] = []
-    points = read_corners(files, board, notes, unit)
-    note(notes)
-    if points is not None and size is not None:
-        if points.image_size not in (None, size):
-            raise InputError("the image size of the file is another; leave out --image-size")
-        points = replace(points, image_size=size)
-    return points
-
-
-def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
-    """Write points; return the summary for programs."""
-    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
-    from neurocal_cli.io.writing import write_whole
-
-    text = corner_text(points, target, os.path.splitext(output)[1].lower())
-    losses, remarks = points_lost(points, target)
-    note(remarks)
-    warn(losses)
-    write_whole(output, text)
-    told = {"to": target, "n_points": len(points), "n_views": points.n_views}
-    return {**told, "warnings": [*losses, *remarks]}
-
-
-def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
-    """Add values that the file lacks.
-
-    Raises
-    ------
-    InputError
-        The file has another value.
-    """
+    cameras = read_cameras(files)
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
@@ -242,8 +215,8 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
             if camera.image_size not in (None, size):
                 stated = f"{camera.image_size[0]} {camera.image_size[1]}" if camera.image_size else ""
                 raise InputError(f"the image size of the file is {stated}; leave out --image-size")
-        sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
         if any(camera.image_size is None for camera in cameras.cameras):
+            sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
             cameras = replace(cameras, cameras=sized, origin=None)
     return cameras
 

@@ -4,38 +4,31 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
-from neurocal_cli.commands.preparation import (
-    check_folder,
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
     note,
     one_line,
     print_summary,
-    refer_to,
     say,
     some_of,
     warn,
+    where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
+    from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.measuring import Points
 
 _SECOND = 2  # images of another size that are no longer a single stray one
@@ -50,7 +43,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     nargs=-1,
     required=True,
 )
-@board_options("Unit of --square. A board file names its own unit.")
+@options.board("Unit of --square. A board file names its own unit.")
 @options.choice(
     "--points",
     "midpoints edges vertices",
@@ -139,17 +132,21 @@ def detect(
           --cache found --frames 30 -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
     """  # noqa: D301 - as in the group
-    check_one_stdin(*images, board)
-    check_summary(as_json, output)
+    preparation.check_one_stdin(*images, board)
+    preparation.check_summary(as_json, output)
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
-    compute_in_one_thread()
-    target = given_board(board, cols, rows, square, unit)
+    preparation.compute_in_one_thread()
+    target = preparation.given_board(board, cols, rows, square, unit)
     if target is None:
-        raise UsageError(
-            "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
+        raise UsageError(preparation.NO_SIZE)
+    if target.distances:
+        scale = target.scale
+        said = f"; {scale.contradiction}" if scale.contradiction else ""
+        note(
+            f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
+            f"{100 * scale.std:.2g} %{said}"
         )
-    note([_rescaled(target)] if target.distances else [])
     target = target.as_measured()
     wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
@@ -157,17 +154,19 @@ def detect(
     else:
         outcomes = _watched(images, wanted, board, output, watch)
     outcomes = of_one_size(outcomes)
-    _report(outcomes, target, as_json)
-    _write(outcomes, target, overlay, output)
+    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+    _report(outcomes, found, target, as_json)
+    from neurocal_cli.detection.detect import gather
+    from neurocal_cli.io.points_csv import format_points
+    from neurocal_cli.io.writing import make_folder, write_whole
 
-
-def _rescaled(board: Board) -> str:
-    scale = board.scale
-    said = f"; {scale.contradiction}" if scale.contradiction else ""
-    return (
-        f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
-        f"{100 * scale.std:.2g} %{said}"
-    )
+    text = format_points(replace(gather(found, target.unit), distances=target.distances))
+    if overlay is not None:
+        make_folder(overlay)
+        for name, outcome in outcomes.items():
+            if outcome.overlay is not None:
+                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
+    write_whole(output, text)
 
 
 def _wanted(
@@ -180,7 +179,7 @@ def _wanted(
     kind = cast("Points", points)
     known = None
     if cache is not None:
-        check_folder("--cache", cache)
+        preparation.check_folder("--cache", cache)
         known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
@@ -194,42 +193,44 @@ def _examined(
     overlay: str | None,
     jobs: int | None,
     frames: int,
-) -> list[tuple[str, Outcome]]:
-    """Outcomes of all images, with the names of their views."""
+) -> dict[str, Outcome]:
+    """Outcomes of all images, by the names of their views."""
     from neurocal_cli.detection.batch import default_jobs, detect_files
     from neurocal_cli.io.image_paths import find_images, view_names
 
     given = find_images(words)
     view_names(given)  # no name twice
-    check_outputs((output,), (*given, board_file))
+    preparation.check_outputs((output,), (*given, board_file))
     with videos_as_frames(given, frames) as (paths, folder):
         names = view_names(paths)
-        note(_mixed_sizes(paths))
+        note(*_mixed_sizes(paths))
         if overlay is not None:
-            _check_overlay(overlay, paths)
+            preparation.check_folder("--overlay", overlay)
+            folders = {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}
+            if os.path.realpath(overlay) in folders:
+                raise UsageError(f"--overlay {overlay} is the folder of the images; give another folder")
         outcomes = []
         with ProgressBar() as progress:
             for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
                 outcomes.append(replace(outcome, problem=outcome.problem.removeprefix(folder)))
                 progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
-    return list(zip(names, outcomes, strict=True))
+    return dict(zip(names, outcomes, strict=True))
 
 
 def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
-) -> list[tuple[str, Outcome]]:
-    """Outcomes of the images that have arrived, with the names of their views."""
+) -> dict[str, Outcome]:
+    """Outcomes of the images that have arrived, by the names of their views."""
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
-    check_outputs((output,), (board_file,))
+    preparation.check_outputs((output,), (board_file,))
     outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
-    check_outputs((output,), tuple(path for path, _ in outcomes))
-    names = view_names([path for path, _ in outcomes])
-    return [(name, outcome) for name, (_, outcome) in zip(names, outcomes, strict=True)]
+    preparation.check_outputs((output,), outcomes)
+    return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
 
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
@@ -243,7 +244,7 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
 
 
-def _mixed_orientations(outcomes: Sequence[Outcome]) -> list[str]:
+def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     """Warn of images that were turned differently: each way of turning has its own image centre."""
     from neurocal_cli.io.images import BY_EXIF
 
@@ -261,52 +262,39 @@ def _mixed_orientations(outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def _check_overlay(folder: str, paths: Sequence[str]) -> None:
-    check_folder("--overlay", folder)
-    if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
-        raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
-
-
-def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
+def _report(
+    outcomes: Mapping[str, Outcome], found: Mapping[str, Detection], board: Board, as_json: bool
+) -> None:
     """Report failed images with the reason, and remarks common to several images once."""
-    single = len(outcomes) == 1
-    for _, outcome in outcomes:
-        if outcome.problem and not single:
-            complain(outcome.problem)
+    problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
+    for problem in problems.values() if len(outcomes) > 1 else ():
+        complain(problem)
     remarks: dict[str, list[str]] = {}
-    for name, outcome in outcomes:
+    for name, outcome in outcomes.items():
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(f"{some_of(names)}: {text}" for text, names in remarks.items())
-    found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
-    warn(dict.fromkeys(text for detection in found for text in detection.warnings))
-    warn(_mixed_orientations([outcome for _, outcome in outcomes]))
-    warn(_another_board([_shown(outcome) for _, outcome in outcomes], board))
+    note(*(f"{some_of(names)}: {text}" for text, names in remarks.items()))
+    warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
+    warn(*_mixed_orientations(outcomes.values()))
+    warn(*_another_board([_shown(outcome) for outcome in outcomes.values()], board))
+    if not found and len(outcomes) == 1:
+        raise NeurocalError(*problems.values())
     if not found:
-        raise NeurocalError(
-            outcomes[0][1].problem
-            if single
-            else f"none of the {len(outcomes)} images shows the board; {refer_to('reasons')}"
-        )
-    if as_json:
-        print_summary(_summary(outcomes))
-        return
-    say(
-        f"board detected in {len(found)} of {len(outcomes)} images: "
-        f"{sum(len(detection.ids) for detection in found)} points, "
-        f"{sum(detection.rejected for detection in found)} rejected"
-    )
-
-
-def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
-    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
-    return {
+        raise NeurocalError(f"none of the {len(outcomes)} images shows the board; {where_reasons_are()}")
+    summary: dict[str, Any] = {
         "n_images": len(outcomes),
         "n_points": sum(len(detection.ids) for detection in found.values()),
         "n_rejected": sum(detection.rejected for detection in found.values()),
         "views": {name: len(detection.ids) for name, detection in found.items()},
-        "without_board": {name: one_line(outcome.problem) for name, outcome in outcomes if outcome.problem},
+        "without_board": {name: one_line(problem) for name, problem in problems.items()},
     }
+    if as_json:
+        print_summary(summary)
+    else:
+        say(
+            f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
+            f"{summary['n_rejected']} rejected"
+        )
 
 
 def _shown(outcome: Outcome) -> tuple[int, int] | None:
@@ -330,18 +318,3 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
         f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
         "for; count inner vertices, not squares"
     ]
-
-
-def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:
-    from neurocal_cli.detection.detect import gather
-    from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import make_folder, write_whole
-
-    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
-    text = format_points(replace(gather(found, board.unit), distances=board.distances))
-    if overlay is not None:
-        make_folder(overlay)
-        for name, outcome in outcomes:
-            if outcome.overlay is not None:
-                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
-    write_whole(output, text)

@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs
 from neurocal_cli.commands.streams import note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
@@ -77,10 +75,10 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
           --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    check_one_stdin(calibration, points)
+    preparation.check_one_stdin(calibration, points)
     check_plots(plots)
-    check_outputs((file for _, file in plots), (calibration, points))
-    given = None if points is None else given_points([points])
+    preparation.check_outputs((file for _, file in plots), (calibration, points))
+    given = None if points is None else preparation.given_points([points])
     evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
         from neurocal_cli.plots.camera_panels import Subject
@@ -106,7 +104,7 @@ def _evaluate_camera(
     from neurocal_cli.verdict.assessment import assess
     from neurocal_cli.verdict.given_points import judged_by_points
 
-    camera, points = calibration_or_camera(name, points)
+    camera, points = preparation.calibration_or_camera(name, points)
     evaluation = evaluate_camera(camera, points)
     if not isinstance(camera, Calibration):
         return evaluation, None, camera
@@ -125,10 +123,10 @@ def _tell(evaluation: CameraEvaluation) -> None:
     ):
         if names:
             some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-            note([f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed"])
+            note(f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed")
     if evaluation.on_target:
-        note(["the points are taken where the calibration found them, not where their file has them"])
-    warn(evaluation.warnings)
+        note("the points are taken where the calibration found them, not where their file has them")
+    warn(*evaluation.warnings)
 
 
 @evaluate.command(cls=options.Command)
@@ -156,11 +154,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
 @plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
-    cameras: tuple[str, ...],
-    points: tuple[str, str] | None,
-    method: str,
-    plots: Plots,
-    as_json: bool,
+    cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, plots: Plots, as_json: bool
 ) -> None:
     """Measure the triangulation error of two calibrated cameras.
 
@@ -199,10 +193,17 @@ def stereo(
         raise UsageError(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
-    check_one_stdin(*cameras, *(points or ()))
+    preparation.check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
-    check_outputs((file for _, file in plots), (*cameras, *(points or ())))
-    evaluation, rig = _evaluate_stereo(cameras, _read_points(points), method)
+    preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    given = None
+    if points is not None:
+        from neurocal_cli.io.points_csv import read_points
+
+        notes: list[str] = []
+        given = read_points([points[0]], notes=notes), read_points([points[1]], notes=notes)
+        note(*notes)
+    evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
@@ -210,27 +211,16 @@ def stereo(
     from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
     from neurocal_cli.verdict.report import verdict_lines
 
-    note(views_alone(evaluation.alone))
+    note(*views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note([f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed"])
-    warn(evaluation.warnings)
+        note(f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed")
+    warn(*evaluation.warnings)
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
         verdict = evaluation.verdict
         show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
-
-
-def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:
-    if names is None:
-        return None
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    left, right = (read_points([name], notes=notes) for name in names)
-    note(notes)
-    return left, right
 
 
 def _evaluate_stereo(
@@ -257,10 +247,10 @@ def _with_poses(name: str, points: Correspondences) -> Calibration:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.methods import calibrate
 
-    camera, seen = calibration_or_camera(name, points, "; the poses are fitted")
+    camera, seen = preparation.calibration_or_camera(name, points, "; the poses are fitted")
     if isinstance(camera, Calibration):
         if camera.views:
             return camera
-        note([f"{name}: holds no poses; they are fitted"])
+        note(f"{name}: holds no poses; they are fitted")
     assert seen is not None
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

@@ -15,6 +15,9 @@ from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line,
 from neurocal_cli.errors import FormatError, NeurocalError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
 
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
@@ -22,14 +25,7 @@ _PAUSE = 0.3  # seconds between two checks; a file that is still being copied gr
 
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Replace each video by its frames that are worth measuring.
-
-    Yields
-    ------
-    paths : tuple of str
-    folder : str
-        Temporary folder of the frames, with a separator, to be cut from messages; empty without videos.
-    """
+    """Replace videos by their best frames; also the folder of these, with a separator, for messages."""
     from neurocal_cli.io.video import is_video
 
     if not any(map(is_video, paths)):
@@ -47,66 +43,46 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
     from neurocal_cli.io.video import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
-    total = 0
     with ProgressBar() as progress:
 
-        def counted() -> Iterator[object]:
-            nonlocal total
+        def watched() -> Iterator[NDArray[np.uint8]]:
             for grey in video_frames(path):
-                total += 1
                 progress(f"choosing frames of {name}", 0.0)
                 yield grey
 
-        numbers = choose_frames(counted(), most, frame_rate(path))  # type: ignore[arg-type]
+        numbers = choose_frames(watched(), most, frame_rate(path))
     wanted, saved = set(numbers), []
     for number, grey in enumerate(video_frames(path)):
         if number in wanted:
             saved.append(os.path.join(folder, f"{name}_{number:06d}.png"))
             save_frame(grey, saved[-1])
-    note([f"{path}: {len(saved)} of {total} frames are sharp and differ from each other"])
+    note(f"{path}: {len(saved)} of {number + 1} frames are sharp and differ from each other")
     return saved
 
 
-def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
-    """Leave out boards in images whose size differs from the most common one; none if two sizes tie.
-
-    Parameters
-    ----------
-    outcomes : list of (name, Outcome)
-    """
-    sizes = Counter(outcome.detection.image_size for _, outcome in outcomes if outcome.detection is not None)
-    counts = [count for _, count in sizes.most_common(2)]
-    if len(counts) < 2 or counts[0] == counts[1]:
+def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
+    """Leave out boards in images whose size differs from the most common one; none if two sizes tie."""
+    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+    sizes = Counter(detection.image_size for detection in found.values()).most_common(2)
+    if len(sizes) < 2 or sizes[0][1] == sizes[1][1]:
         return outcomes
-    most = sizes.most_common(1)[0][0]
-    kept = []
-    for name, outcome in outcomes:
-        found = outcome.detection
-        if found is not None and found.image_size != most:
-            both = "{} x {} px and most have {} x {}".format(*found.image_size, *most)
+    most = sizes[0][0]
+    kept = dict(outcomes)
+    for name, detection in found.items():
+        if detection.image_size != most:
+            both = "{} x {} px and most have {} x {}".format(*detection.image_size, *most)
             problem = f"{name}: the image has {both}; run detect for each camera separately"
-            outcome = replace(outcome, detection=None, overlay=None, problem=problem)
-        kept.append((name, outcome))
+            kept[name] = replace(outcomes[name], detection=None, overlay=None, problem=problem)
     return kept
 
 
 def watch_for_images(
     find: Callable[[], Sequence[str]], options: DetectionOptions, seconds: float
-) -> list[tuple[str, Outcome]]:
+) -> dict[str, Outcome]:
     """Detect boards in images as they arrive, until a timeout or an interrupt by the user.
 
-    Parameters
-    ----------
-    find : callable
-        Returns the paths of the present images.
-    options : DetectionOptions
-    seconds : float
-        Time to wait for another image.
-
-    Returns
-    -------
-    outcomes : list of (path, Outcome)
-        In the order in which the images arrived.
+    `find` returns the paths of the present images; `seconds` is the time to wait for another one. Returns the
+    outcomes by path, in the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
 
@@ -122,7 +98,7 @@ def watch_for_images(
             time.sleep(_PAUSE)
     except KeyboardInterrupt:
         say("watching ends")
-    return list(outcomes.items())
+    return outcomes
 
 
 def _whole(
@@ -149,7 +125,7 @@ def _whole(
 
 
 def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) -> None:
-    alike = dict(of_one_size(list(outcomes.items())))
+    alike = of_one_size(outcomes)
     outcome = alike[path]
     if outcome.detection is None:
         complain(outcome.problem)

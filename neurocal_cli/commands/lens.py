@@ -6,14 +6,8 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
 _MOST_UNITS = 20
@@ -138,11 +132,11 @@ def fit(
       neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
           --target given --json -o lens.yaml
     """  # noqa: D301 - as in the group
-    compute_in_one_thread()
-    check_one_stdin(*points)
-    check_summary(as_json, output)
+    preparation.compute_in_one_thread()
+    preparation.check_one_stdin(*points)
+    preparation.check_summary(as_json, output)
     options.check_plot(plot, output)
-    check_outputs((output, plot), points)
+    preparation.check_outputs((output, plot), points)
     from neurocal_cli.io.lens_points import read_lens_data
     from neurocal_cli.io.lens_yaml import write_lens
     from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
@@ -151,7 +145,7 @@ def fit(
 
     notes: list[str] = []
     data = read_lens_data(points, notes=notes)
-    note(notes)
+    note(*notes)
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
@@ -209,10 +203,10 @@ def camera(
       neurocal lens camera lens.yaml --zoom 3100 --focus 400 --extrapolate \\
           --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
-    compute_in_one_thread()
+    preparation.compute_in_one_thread()
     options.check_camera_name(camera_name)
-    check_summary(as_json, output)
-    check_outputs((output,), (lens_file,))
+    preparation.check_summary(as_json, output)
+    preparation.check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.camera_at import camera_at
@@ -230,7 +224,7 @@ def camera(
         from neurocal_cli.zoom_lens.report import camera_report
 
         say(camera_report(calibration))
-    warn(calibration.warnings)
+    warn(*calibration.warnings)
 
 
 @lens.command(cls=options.Command)
@@ -261,10 +255,10 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --plot errors.png
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --json
     """  # noqa: D301 - as in the group
-    compute_in_one_thread()
-    check_one_stdin(lens_file, points)
+    preparation.compute_in_one_thread()
+    preparation.check_one_stdin(lens_file, points)
     options.check_plot(plot, None)
-    check_outputs((plot,), (lens_file, points))
+    preparation.check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.evaluation import evaluate_lens
@@ -274,7 +268,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     learnt = read_lens(lens_file)
     notes: list[str] = []
     data = read_lens_points(points, notes=notes)
-    note(notes)
+    note(*notes)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
@@ -285,4 +279,4 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
         print_summary(evaluation_json(evaluation, verdict))
     else:
         click.echo(evaluation_report(evaluation, learnt.controls, verdict))
-    warn(evaluation.warnings)
+    warn(*evaluation.warnings)

@@ -75,10 +75,7 @@ def man(ctx: click.Context, directory: str) -> None:
 
 
 def man_pages(root: click.Command) -> dict[str, str]:
-    """File names and texts of the man pages of a command and its subcommands.
-
-    Hidden commands have none.
-    """
+    """File names and texts of the man pages of a command and its subcommands that are not hidden."""
     contexts = list(_walk(click.Context(root, info_name="neurocal", **root.context_settings)))
     names = [_page_name(ctx) for ctx in contexts]
     return {f"{_page_name(ctx)}.1": _page(ctx, names) for ctx in contexts}
@@ -103,13 +100,15 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     summary, description, examples = _split_help(ctx.command.help or "")
     name = _page_name(ctx)
     others = [other for other in names if other != name]
+    children = [child for child in list(_walk(ctx))[1:] if not isinstance(child.command, click.Group)]
+    commands = [(child.command_path, _split_help(child.command.help or "")[0]) for child in children]
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
         *_section("NAME", _name_lines(name, summary)),
         *_section("SYNOPSIS", _synopsis(ctx)),
         *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
-        *_section("COMMANDS", _terms(_subcommands(ctx))),
+        *_section("COMMANDS", _terms(commands)),
         *_section("ARGUMENTS", _terms(_arguments(ctx))),
         *_section("OPTIONS", _terms(_options(ctx))),
         *_section("EXAMPLES", _verbatim(examples)),
@@ -143,15 +142,6 @@ def _synopsis(ctx: click.Context) -> list[str]:
     if isinstance(ctx.command, click.Group):
         words.append(r"\fICOMMAND\fR ...")
     return [" ".join(words)]
-
-
-def _subcommands(ctx: click.Context) -> list[tuple[str, str]]:
-    children = list(_walk(ctx))[1:]
-    return [
-        (child.command_path, _split_help(child.command.help or "")[0])
-        for child in children
-        if not isinstance(child.command, click.Group)
-    ]
 
 
 def _arguments(ctx: click.Context) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import click
@@ -79,13 +80,7 @@ class Command(click.Command):
 
 
 class FiniteNumber(FloatParamType):
-    """A finite number: neither nan nor infinite.
-
-    Parameters
-    ----------
-    positive : bool
-        Whether it must be greater than 0.
-    """
+    """A finite number: neither nan nor infinite, and, if `positive`, greater than 0."""
 
     def __init__(self, positive: bool = False) -> None:
         self._positive = positive
@@ -100,19 +95,12 @@ class FiniteNumber(FloatParamType):
         return number
 
 
-class _MethodNames(click.ParamType):  # type: ignore[type-arg]
-    """Names of methods, separated by commas; a tuple without repetitions."""
-
-    name = "methods"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Split, or fail as click does."""
-        if isinstance(value, tuple):
-            return value
-        names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
-        if not names or any(name not in METHODS for name in names):
-            self.fail(f"{value!r} is not a list of {', '.join(METHODS)}.", param, ctx)
-        return names
+def _method_names(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
+    """Names of methods, separated by commas, without repetitions."""
+    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+    if not names or any(name not in METHODS for name in names):
+        raise click.BadParameter(f"{value!r} is not a list of {', '.join(METHODS)}.")
+    return names
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -155,12 +143,7 @@ def flag(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F]
 
 
 def _option(
-    names: str | tuple[str, ...],
-    help: str,
-    without: str | None,
-    *,
-    to: str | None = None,
-    **attributes: Any,
+    names: str | tuple[str, ...], help: str, without: str | None, *, to: str | None = None, **attributes: Any
 ) -> Callable[[F], F]:
     """An option whose value is passed to the parameter `to` of the command; default: its own name."""
     if without is not None:
@@ -187,15 +170,8 @@ def typed(*names: str) -> list[str]:
 
 
 def note_unused(why: str, *names: str) -> None:
-    """Say which parameters on the command line change nothing.
-
-    Parameters
-    ----------
-    why : str
-        The rest of the sentence "--name has no effect".
-    *names : str
-    """
-    note(f"{option} has no effect {why}" for option in typed(*names))
+    """Say which parameters on the command line change nothing: "--name has no effect", and `why`."""
+    note(*(f"{option} has no effect {why}" for option in typed(*names)))
 
 
 points = argument(
@@ -213,6 +189,25 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
+
+
+def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
+    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `preparation.given_board`."""
+    size = partial(count, without="none", least=2, most=1000)
+    added = (
+        path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+        size("--cols", "C", "Number of inner vertices in a row of the board."),
+        size("--rows", "R", "Number of rows of inner vertices."),
+        number("--square", "S", "Side length of a square.", without="none", positive=True),
+        click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
+    )
+
+    def add(f: F) -> F:
+        for option in reversed(added):
+            f = option(f)
+        return f
+
+    return add
 
 
 camera_name = click.option(
@@ -247,7 +242,7 @@ def methods(default: str) -> Callable[[F], F]:
     return click.option(
         "--methods",
         metavar="M,...",
-        type=_MethodNames(),
+        callback=_method_names,
         default=default,
         help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
         "with the paper's trainer.",
@@ -288,15 +283,7 @@ def plot(what: str) -> Callable[[F], F]:
 
 
 def check_plot(plot: str | None, output: str | None = None) -> None:
-    """Refuse a picture that cannot be drawn, before any work is done.
-
-    Raises
-    ------
-    UsageError
-        The name has no ending of a picture, or is that of the output.
-    NeurocalError
-        matplotlib is not installed.
-    """
+    """Refuse a picture that cannot be drawn, before any work is done."""
     if plot is None:
         return
     if not plot.lower().endswith(_PICTURES):

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
 
-F = TypeVar("F", bound=Callable[..., Any])
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
 
@@ -23,16 +23,16 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
 
     def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
-        return tuple(_parsed(word) for word in words)
-
-    def _parsed(word: str) -> tuple[str | None, str]:
-        panel, equals, file = word.partition("=")
-        if equals and panel.isalpha() and panel not in panels:
-            raise click.BadParameter(
-                f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a file "
-                "of this name"
-            )
-        return (panel, file) if equals and panel in panels else (None, word)
+        plots: list[tuple[str | None, str]] = []
+        for word in words:
+            panel, equals, file = word.partition("=")
+            if equals and panel.isalpha() and panel not in panels:
+                raise click.BadParameter(
+                    f"there is no panel {panel!r}; choose from {', '.join(panels)}, or write ./{word} for a "
+                    "file of this name"
+                )
+            plots.append((panel, file) if equals and panel in panels else (None, word))
+        return tuple(plots)
 
     return click.option(
         "--plot",
@@ -53,14 +53,7 @@ def check_plots(plots: Plots, output: str | None = None) -> None:
 
 
 def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
-    """Draw and write all pictures.
-
-    Parameters
-    ----------
-    plots : Plots
-    draw : callable
-        Gives a picture of a kind ("png") and of a panel.
-    """
+    """Draw and write all pictures; `draw` gives a picture of a kind ("png") and of a panel."""
     for panel, file in plots:
         write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
 

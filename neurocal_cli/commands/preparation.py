@@ -1,23 +1,27 @@
-"""What a command does before its work: checks of its inputs and outputs, and the number of threads."""
+"""What commands do before their work: check inputs and outputs, and read points, boards and known cameras."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from neurocal_cli.errors import NeurocalError, UsageError
+from neurocal_cli.commands.streams import note, warn
+from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.board import Board
+    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.camera.camera import Camera
+    from neurocal_cli.points import Correspondences
+    from neurocal_cli.stereo.rig import Rig
+
+NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
-    """Refuse outputs that cannot be written, or that are one of the inputs.
-
-    Raises
-    ------
-    UsageError
-        An output is an input, or two outputs are the same file.
-    NeurocalError
-        An output cannot be written.
-    """
+    """Refuse outputs that cannot be written, or that are one of the inputs; see `check_places`."""
     from neurocal_cli.io.outputs import held_back
     from neurocal_cli.io.writing import check_places
 
@@ -28,15 +32,7 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
 
 
 def check_folder(option: str, folder: str) -> None:
-    """Refuse a folder that cannot be made or written to.
-
-    Raises
-    ------
-    UsageError
-        It is standard output or a file.
-    NeurocalError
-        It cannot be made.
-    """
+    """Refuse a folder that is standard output or a file, or cannot be made or written to."""
     if folder == "-":
         raise UsageError(f"{option} writes files, which cannot go to standard output; give a folder")
     if os.path.exists(folder) and not os.path.isdir(folder):
@@ -55,12 +51,7 @@ def check_one_stdin(*names: str | None) -> None:
 
 
 def check_summary(as_json: bool, *outputs: str | None) -> None:
-    """Refuse a summary and a result on one stream.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse a summary and a result on one stream, with a UsageError."""
     from neurocal_cli.io.writing import STDOUT_NAMES
 
     if as_json and not STDOUT_NAMES.isdisjoint(outputs):
@@ -75,3 +66,86 @@ def compute_in_one_thread() -> None:
     """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
         os.environ.setdefault(name, "1")
+
+
+def given_points(names: str | Sequence[str]) -> Correspondences:
+    """Read points, and report rows of their files that were left out."""
+    from neurocal_cli.io.points_csv import read_points
+
+    notes: list[str] = []
+    points = read_points(names, notes=notes)
+    note(*notes)
+    return points
+
+
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
+    """Read a known camera of the points' image size; give the points its image size if they have none."""
+    from neurocal_cli.io.exchange.reading import read_intrinsics
+
+    camera = read_intrinsics(path)
+    if camera.image_size is not None:
+        if points.image_size is None:
+            points = replace(points, image_size=camera.image_size)
+        elif points.image_size != tuple(camera.image_size):
+            raise InputError(
+                f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
+                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
+                "for this image size"
+            )
+    return points, camera
+
+
+def calibration_or_camera(
+    name: str, points: Correspondences | None, besides: str = ""
+) -> tuple[Calibration | Camera, Correspondences | None]:
+    """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
+    from neurocal_cli.io.calibration_yaml import read_calibration
+
+    try:
+        return read_calibration(name), points
+    except FormatError as error:
+        if points is None or name == "-":
+            raise
+        try:
+            points, camera = given_camera(name, points)
+        except FormatError:
+            raise error from None
+        why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
+        note(f"only the intrinsic parameters and the distortion are used{besides}: {why}")
+    return camera, points
+
+
+def warn_of_poor(rig: Rig, so: str = "") -> None:
+    """Warn of a rig whose verdict is poor, with the first reason and what follows from it."""
+    verdict = rig.verdict
+    if verdict is not None and verdict.word == "poor":
+        warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
+
+
+def given_board(
+    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
+) -> Board | None:
+    """Read the board; None if no option describes one, a UsageError if they contradict each other."""
+    from neurocal_cli.board import Board
+
+    check_unit(unit)
+    numbers = (cols, rows, square)
+    if path is not None:
+        if numbers != (None, None, None) or unit is not None:
+            raise UsageError(
+                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+            )
+        from neurocal_cli.io.board_yaml import read_board
+
+        return read_board(path)
+    if numbers == (None, None, None) and unit is None:
+        return None
+    if cols is None or rows is None or square is None:
+        raise UsageError(NO_SIZE)
+    return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+
+def check_unit(unit: str | None) -> None:
+    """Refuse a unit that cannot be stored in a file, with a UsageError."""
+    if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+        raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_folder, check_one_stdin, check_outputs
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
@@ -84,20 +84,31 @@ def rectify(
           "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
-    check_one_stdin(rig, *files)
+    preparation.check_one_stdin(rig, *files)
     options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
-    check_folder("-o", output)
+    preparation.check_folder("-o", output)
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
     images = bool(files) and is_image(sides[0][0])
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
-    _check_folders(sides, output)
-    found = _read_rig(rig)
-    work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
+    preparation.check_outputs((), (*sides[0], *sides[1]))
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
+    from neurocal_cli.io.exchange.neurocal import as_rig
+    from neurocal_cli.io.exchange.reading import read_cameras
+    from neurocal_cli.stereo.rectified_pair import rectified_pair
+
+    cameras = read_cameras([rig])
+    if (count := len(cameras.cameras)) != 2:
+        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", rig)
+    found = as_rig(cameras)
+    work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
@@ -128,65 +139,47 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return left, right
 
 
-def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
-    """Refuse to overwrite inputs."""
-    check_outputs((), (*sides[0], *sides[1]))
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
-
-
-def _read_rig(name: str) -> Rig:
-    from neurocal_cli.io.exchange.neurocal import as_rig
-    from neurocal_cli.io.exchange.reading import read_cameras
-
-    cameras = read_cameras([name])
-    if len(cameras.cameras) != 2:
-        raise FormatError(
-            f"holds {len(cameras.cameras)} camera{'s' * (len(cameras.cameras) != 1)}; give the file of a rig "
-            "of two",
-            name,
-        )
-    return as_rig(cameras)
-
-
 @dataclass
 class _Work:
     """A rig, its rectified cameras, and the folders of the results."""
 
     rig: Rig
-    alpha: float | None
+    pair: RectifiedPair
     interpolation: str
     output: str
     side_by_side: bool
     as_json: bool
-    pair: RectifiedPair = field(init=False)
-    remappings: list[Remapping] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
     own_rows: RowError | None = None
 
-    def __post_init__(self) -> None:
-        from neurocal_cli.stereo.rectified_pair import rectified_pair
+    @property
+    def along(self) -> str:
+        """What corresponds in both images."""
+        return "rows" if self.pair.axis == 0 else "columns"
 
-        self.pair = rectified_pair(self.rig, self.alpha)
-        self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
+    @cached_property
+    def remappings(self) -> list[Remapping]:
+        """Tables of both cameras' images, made only for images or for files of tables."""
+        from neurocal_cli.distortion.remapping import Remapping
+
+        sides = zip(self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True)
+        return [
+            Remapping(original, new, cast("tuple[int, int]", new.image_size), self.interpolation, R)
+            for original, new, R in sides
+        ]
 
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import row_error_of_rig
 
+        self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
         if error is not None:
-            along = self.summary["along"]
-            self._tell(
-                f"{along} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms"
-            )
+            points = f"the rig's own {error.n_points} points"
+            self._tell(f"{self.along} of {points} differ by {error.rms_px:.3g} px rms")
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
-        verdict = self.rig.verdict
-        if verdict is not None and verdict.word == "poor":
-            warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}"])
+        preparation.warn_of_poor(self.rig)
 
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify the points of both cameras and write them."""
@@ -206,7 +199,7 @@ class _Work:
                     f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
                     "which are 90 degrees from the rectified camera's axis or more"
                 )
-            note(notes)
+            note(*notes)
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
@@ -216,15 +209,13 @@ class _Work:
             "max_px": number_or_none(error.max_px),
         }
         self._tell(
-            f"{self.summary['along']} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
+            f"{self.along} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
             f"rms, {error.max_px:.3g} px at most"
         )
         if self.own_rows and error.median_px > max(_MISFIT * self.own_rows.median_px, _NO_MISFIT):
             warn(
-                [
-                    "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
-                    "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
-                ]
+                "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
+                "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
             )
 
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
@@ -239,9 +230,9 @@ class _Work:
         from neurocal_cli.stereo.rectified_pair import pair_picture
 
         pictures = []
-        for remapping, path in zip(self._remappings(), pair, strict=True):
+        for remapping, path in zip(self.remappings, pair, strict=True):
             pixels, source, notes = read_picture(path)
-            note(f"{source}: {text}" for text in notes)
+            note(*(f"{source}: {text}" for text in notes))
             try:
                 pictures.append(remapping(pixels))
             except InputError as error:
@@ -254,23 +245,12 @@ class _Work:
             shown = names[0] if names[0] == names[1] else "-".join(names)
             self._write(os.path.join("pairs", f"{shown}.png"), encode_png(drawn))
 
-    def _remappings(self) -> list[Remapping]:
-        from neurocal_cli.distortion.remapping import Remapping
-
-        if not self.remappings:
-            for original, new, R in zip(
-                self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True
-            ):
-                assert new.image_size is not None
-                self.remappings.append(Remapping(original, new, new.image_size, self.interpolation, R))
-        return self.remappings
-
     def write_maps(self) -> None:
         """Write the tables and matrices."""
         from neurocal_cli.io.exchange.dictionary import npz_bytes
 
         tree = {}
-        for side, remapping in zip(_SIDES, self._remappings(), strict=True):
+        for side, remapping in zip(_SIDES, self.remappings, strict=True):
             tree[f"{side}_u"], tree[f"{side}_v"] = remapping.tables()
         matrices = self.pair.matrices
         tree |= {key: getattr(matrices, key) for key in ("R1", "R2", "P1", "P2", "Q")}

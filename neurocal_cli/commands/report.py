@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_outputs
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 
@@ -57,7 +56,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     """  # noqa: D301 - as in the group
     if len(images) > 2:
         raise UsageError("--images is for one folder, or for the left and the right one of a rig")
-    check_outputs((output,), (result,))
+    preparation.check_outputs((output,), (result,))
     import hashlib
 
     from neurocal_cli.io.file_storage import parse_tree
@@ -107,11 +106,12 @@ def _versions(root: Field) -> dict[str, str]:
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
     """Thumbnails of the views' photographs, for the page."""
-    from neurocal_cli.io.thumbnails import photographs_of, thumbnails
+    from neurocal_cli.io.image_paths import photographs_of
+    from neurocal_cli.io.images import thumbnails
 
     views = calibration.points.view_names
     images = photographs_of(views, word)
     missing = [view for view in views if view not in images]
     if missing:
-        note([f"no image of {len(missing)} views, such as {missing[0]}, in {word}"])
+        note(f"no image of {len(missing)} views, such as {missing[0]}, in {word}")
     return thumbnails(images, calibration.image_size, _MOST_BYTES // cameras)

@@ -8,14 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
-from neurocal_cli.commands.preparation import (
-    check_folder,
-    check_one_stdin,
-    check_outputs,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -155,15 +149,20 @@ def simulate(
           --sigma 0.2 --trials 2 --random-starts 2 --save simulated --images --jobs 1
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
-    check_one_stdin(camera, board)
+    preparation.check_one_stdin(camera, board)
     if rates:
         options.note_unused("with --rates", "sigma", "trials", "methods", "random_starts")
     else:
         options.note_unused("without --rates", "data_sets")
-    _check(rates, save, images, (camera, board, views))
+    if images and save is None:
+        raise UsageError("--images needs a place to write to; give --save DIR")
+    if rates and (save, camera, board, views) != (None,) * 4:
+        raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
+    if save is not None:
+        preparation.check_folder("--save", save)
     options.check_plot(plot, "-")
-    check_outputs((plot,), (camera, board))
-    compute_in_one_thread()
+    preparation.check_outputs((plot,), (camera, board))
+    preparation.compute_in_one_thread()
 
     from neurocal_cli.processes import usable_cores
 
@@ -186,7 +185,7 @@ def simulate(
             try:
                 starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
             except DegenerateGeometryError as error:
-                note([f"no random starts: {error}"])
+                note(f"no random starts: {error}")
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_simulation
 
@@ -199,15 +198,6 @@ def simulate(
         print_summary(found)
     else:
         click.echo(text_of(*simulation_tables(study, starts, paper)))
-
-
-def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...]) -> None:
-    if images and save is None:
-        raise UsageError("--images needs a place to write to; give --save DIR")
-    if rates and (save is not None or any(part is not None for part in scene)):
-        raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
-    if save is not None:
-        check_folder("--save", save)
 
 
 def _scene(
@@ -234,7 +224,7 @@ def _scene(
             try:
                 return scenes.calibrated_scene(read_calibration(camera_file)), False
             except FormatError:
-                note([f"{camera_file} holds no points of its own; the paper's boards are used"])
+                note(f"{camera_file} holds no points of its own; the paper's boards are used")
         camera = read_intrinsics(camera_file)
     count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)
     poses = scenes.random_poses(camera, board, count, np.random.default_rng((seed, 2)))

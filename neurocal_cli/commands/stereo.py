@@ -8,15 +8,9 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
+from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
-from neurocal_cli.commands.preparation import (
-    check_one_stdin,
-    check_outputs,
-    check_summary,
-    compute_in_one_thread,
-)
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
@@ -25,7 +19,7 @@ from neurocal_cli.plots import RIG_PANELS
 @click.command(cls=options.Command)
 @options.argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
 @options.argument("right", "RIGHT.csv", "Points of the right camera.")
-@estimation_options_without_files
+@estimation_options(files=False)
 @options.path(
     "--left-intrinsics",
     "CAMERA.yaml",
@@ -104,19 +98,21 @@ def stereo(
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
-    compute_in_one_thread()
-    check_summary(as_json, output, html, *(ros or ()))
+    preparation.compute_in_one_thread()
+    preparation.check_summary(as_json, output, html, *(ros or ()))
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     if left_intrinsics is not None and right_intrinsics is not None:
         known = ("no_skew", "distortion", "image_center", *(["type"] if estimation.type == "2" else []))
         options.note_unused("on cameras that are known", *known)
-    check_one_stdin(left, right, left_intrinsics, right_intrinsics)
+    preparation.check_one_stdin(left, right, left_intrinsics, right_intrinsics)
     check_plots(plots, output)
-    _check_outputs(output, ros)
+    names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
+    if len(set(names)) < len(names):
+        raise UsageError("-o and --ros name the same file twice; give three different files")
     inputs = left, right, left_intrinsics, right_intrinsics
-    check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
+    preparation.check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
     from neurocal_cli.io.points_csv import read_points
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
@@ -126,7 +122,7 @@ def stereo(
     for name, side in zip((left, right), sides, strict=True):
         notes: list[str] = []
         prepared.append(side.prepare(read_points(name, notes=notes)))
-        note(notes)
+        note(*notes)
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
@@ -140,9 +136,9 @@ def stereo(
 
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
-    warn(write_result(rig, output, lean=lean, alpha=alpha))
+    warn(*write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
-    note(views_alone(rig.alone))
+    note(*views_alone(rig.alone))
     conclude(rig, as_json, rig_json, rig_report)
 
 
@@ -161,16 +157,5 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
             )
         return estimation
     return replace(
-        estimation,
-        type="3",
-        intrinsics=intrinsics,
-        image_center=None,
-        no_skew=False,
-        distortion="none",
+        estimation, type="3", intrinsics=intrinsics, image_center=None, no_skew=False, distortion="none"
     )
-
-
-def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
-    names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
-    if len(set(names)) < len(names):
-        raise UsageError("-o and --ros name the same file twice; give three different files")

@@ -6,7 +6,7 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -82,18 +82,18 @@ def complain(text: str) -> None:
         tell(one_line(text))
 
 
-def refer_to(what: str) -> str:
+def where_reasons_are() -> str:
     """Tell where the lines of `complain` are, which -qq leaves out."""
-    return f"see the {what} above" if _VERBOSITY.get() >= -1 else f"the {what} are shown without -qq"
+    return "see the reasons above" if _VERBOSITY.get() >= -1 else "the reasons are shown without -qq"
 
 
-def note(texts: Iterable[str]) -> None:
+def note(*texts: str) -> None:
     """Report how the input was treated, if the user may not expect it."""
     for text in texts:
         say(f"note: {one_line(text)}")
 
 
-def warn(texts: Iterable[str]) -> None:
+def warn(*texts: str) -> None:
     """Warn of problems that may make the result worse than it looks."""
     for text in texts:
         complain(f"warning: {text}")
@@ -113,7 +113,7 @@ def conclude(
         print_summary(in_json(result))
     else:
         say(in_words(result))
-    warn(result.warnings)
+    warn(*result.warnings)
     if not result.converged:
         click.get_current_context().exit(_NOT_CONVERGED)
 
@@ -155,19 +155,15 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         if not self._visible or time.monotonic() - self._start < _PATIENCE:
             return
         if self._bar is None:
-            self._open()
-        assert self._bar is not None
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("", total=1.0)
+            self._bar.start()
         assert self._task is not None
         self._bar.update(self._task, description=stage, completed=min(max(fraction, 0.0), 1.0))
-
-    def _open(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
-        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-        self._task = self._bar.add_task("", total=1.0)
-        self._bar.start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -180,24 +176,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:
     """Process each item; if there are several, those that fail are reported and left out.
 
-    Parameters
-    ----------
-    items : sequence
-    work : callable
-    what, done : str
-        Words for the items and for what is done to them, for messages.
-
-    Returns
-    -------
-    failed : dict of str by int
-        Reason of each failure, by the item's index.
-
-    Raises
-    ------
-    InputError, FormatError
-        The only item fails.
-    NeurocalError
-        All items fail.
+    `what` and `done` are the words for the items and for what is done to them. Returns the reason of each
+    failure, by the item's index. If the only item fails, its error is raised; if all fail, a NeurocalError.
     """
     failed: dict[int, str] = {}
     with ProgressBar() as progress:
@@ -211,7 +191,7 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
                 failed[k] = str(error)
             progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
     if len(failed) == len(items):
-        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {refer_to('reasons')}")
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; {where_reasons_are()}")
     return failed
 
 

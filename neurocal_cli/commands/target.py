@@ -6,9 +6,8 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
-from neurocal_cli.commands.preparation import check_outputs, check_summary
 from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.errors import InputError
 
@@ -37,8 +36,8 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
     options.check_plot(plot, output)
-    check_summary(as_json, output)
-    check_outputs((output, plot), (camera,))
+    preparation.check_summary(as_json, output)
+    preparation.check_outputs((output, plot), (camera,))
 
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import read_calibration

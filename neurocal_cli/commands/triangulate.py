@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -84,34 +84,29 @@ def triangulate(
         )
     if sigma is not None and sigma > _LARGEST_SIGMA:
         raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
-    check_one_stdin(*inputs)
-    check_summary(as_json, output)
-    check_outputs((output,), inputs)
+    preparation.check_one_stdin(*inputs)
+    preparation.check_summary(as_json, output)
+    preparation.check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
-    sigma = _sigma(rig) if sigma is None else sigma
+    if sigma is None and math.isnan(rig.sigma):
+        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+        sigma = _USUAL_SIGMA
+    sigma = rig.sigma if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
     # Read the first rows before the output is opened, so that errors in the header leave it untouched.
     matches = read_matches(inputs[-1], notes)
     matches = chain([next(matches)], matches)
-    note(notes)
+    note(*notes)
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
     tally.tell(as_json)
-
-
-def _sigma(rig: Rig) -> float:
-    """The noise of the rig's own points; a typical value if it has none."""
-    if rig.sigma == rig.sigma:
-        return rig.sigma
-    note([f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma"])
-    return _USUAL_SIGMA
 
 
 def _rig(names: tuple[str, ...]) -> Rig:
@@ -119,7 +114,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
         from neurocal_cli.io.rig_yaml import read_rig
 
         rig = read_rig(names[0])
-        _warn_of_poor(rig)
+        preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.stereo.fit_rig import fit_rig
@@ -127,17 +122,11 @@ def _rig(names: tuple[str, ...]) -> Rig:
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)
     views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
-    note([f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}"])
-    warn(rig.warnings)
+    note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
+    warn(*rig.warnings)
     if not rig.warnings:
-        _warn_of_poor(rig)
+        preparation.warn_of_poor(rig, "; points in space may be far off")
     return rig
-
-
-def _warn_of_poor(rig: Rig) -> None:
-    verdict = rig.verdict
-    if verdict is not None and verdict.word == "poor":
-        warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}; points in space may be far off"])
 
 
 class _Tally:
@@ -180,13 +169,9 @@ class _Tally:
         else:
             say(", ".join(parts))
         if self.outside:
-            warn(
-                [f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras"]
-            )
+            warn(f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras")
         if self.off + self.behind > _MANY_OFF * self.points:
             warn(
-                [
-                    "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
-                    "and that the pixels are neither undistorted nor rectified"
-                ]
+                "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
+                "and that the pixels are neither undistorted nor rectified"
             )

@@ -9,8 +9,7 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands import options
-from neurocal_cli.commands.preparation import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import is_terminal, print_summary, say
 from neurocal_cli.errors import UsageError
 
@@ -102,13 +101,21 @@ def undistort(
       neurocal undistort fisheye.yaml --to cylinder --fov 140 --size 800 480 \\
           --maps maps.npz
     """  # noqa: D301 - as in the group
-    check_one_stdin(camera, *files)
-    _check_view(shape, fov, size, alpha)
+    preparation.check_one_stdin(camera, *files)
+    options.check_alpha(alpha)
+    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
+        raise UsageError(
+            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
+        )
+    most = 170 if shape == "plane" else 360
+    if fov is not None and not 0 < fov <= most:
+        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
+        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     if not files and options.typed("output"):
         raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
-    check_summary(as_json, new_camera, maps, output if files else None)
+    preparation.check_summary(as_json, new_camera, maps, output if files else None)
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.exchange.reading import read_intrinsics
@@ -117,9 +124,10 @@ def undistort(
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
         options.note_unused("without images", "interpolation")
-    folder, outputs = _places_of(paths, output)
+    folder = _folder(paths, output) if paths else None
+    outputs = [output for _ in paths] if folder is None else [_place(folder, path) for path in paths]
     _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
-    check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
+    preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
     work = Undistorting(original, view, interpolation, folder)
@@ -138,35 +146,8 @@ def undistort(
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
 
 
-def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alpha: float | None) -> None:
-    options.check_alpha(alpha)
-    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
-        raise UsageError(
-            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
-        )
-    most = 170 if shape == "plane" else 360
-    if fov is not None and not 0 < fov <= most:
-        raise UsageError(
-            f"--fov is {fov:g}; give a number up to {most}"
-            + (", or --to cylinder for more" if shape == "plane" and fov > 0 else "")
-        )
-
-
-def _places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
-    """The output folder, if the output is one, and the output file of each input.
-
-    Raises
-    ------
-    UsageError
-        The output cannot hold several files or an image.
-    """
-    if not paths:
-        return None, []
-    folder = _folder(paths, output)
-    return folder, [output] if folder is None else [os.path.join(folder, _name(path)) for path in paths]
-
-
 def _folder(paths: Sequence[str], output: str) -> str | None:
+    """The output folder, if the output is one."""
     from neurocal_cli.io.image_paths import is_image
 
     several = len(paths) > 1
@@ -192,33 +173,18 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
     return output
 
 
-def _name(path: str) -> str:
+def _place(folder: str, path: str) -> str:
+    """The output of an input in the output folder."""
     from neurocal_cli.io.image_paths import is_image
 
-    if path == "-":
-        return "points.csv"
-    name = os.path.basename(path)
-    return os.path.splitext(name)[0] + ".png" if is_image(path) else name
+    name = "points.csv" if path == "-" else os.path.basename(path)
+    return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
 
 def _check_distinct(
     inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
 ) -> None:
-    """Refuse to overwrite inputs, or to write two results to the same file.
-
-    Parameters
-    ----------
-    inputs : iterable of str
-    outputs, paths : sequences of str of one length
-        Output files, and the inputs from which they are made.
-    others : dict
-        Further output files by their content.
-
-    Raises
-    ------
-    UsageError
-        The message names the two files that collide.
-    """
+    """Refuse to overwrite inputs, or to write two results, which a UsageError names, to the same file."""
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}
     targets = list(zip(outputs, paths, strict=True))

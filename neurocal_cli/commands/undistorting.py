@@ -22,31 +22,15 @@ _UNTOLD = 2.0  # degrees of field of view whose loss is not reported
 
 @dataclass
 class Undistorting:
-    """One camera with the prepared tables for its images, and the notes for the user.
-
-    Attributes
-    ----------
-    camera : Camera
-    view : callable
-        The camera of the results, from the size of the images.
-    interpolation : str
-    folder : str or None
-        Output folder, if the output is one.
-    notes : dict
-        Remarks about images, with the images concerned.
-    left_out : int
-        Number of points that the result cannot show.
-    size : (width, height) or None [px]
-        Of the images, once it is known.
-    """
+    """One camera with the prepared tables for its images, and the notes for the user."""
 
     camera: Camera
-    view: Callable[[tuple[int, int] | None], Undistorted]
+    view: Callable[[tuple[int, int] | None], Undistorted]  # of the results, from the size of the images
     interpolation: str
-    folder: str | None
-    notes: dict[str, list[str]] = field(default_factory=dict)
-    left_out: int = 0
-    size: tuple[int, int] | None = None
+    folder: str | None  # output folder, if the output is one
+    notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
+    left_out: int = 0  # number of points that the result cannot show
+    size: tuple[int, int] | None = None  # of the images [px], once it is known
     remapping: Remapping | None = None
 
     def __post_init__(self) -> None:
@@ -80,7 +64,7 @@ class Undistorting:
     def tell_notes(self) -> None:
         """Report the remarks about images, each once."""
         for text, names in self.notes.items():
-            note([f"{some_of(names)}: {text}"])
+            note(f"{some_of(names)}: {text}")
 
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
@@ -183,7 +167,7 @@ class Undistorting:
                 "degrees from the axis or more; --to cylinder keeps them"
             )
         corrected = map_points(points.select(kept), self.camera, new)
-        note(notes)
+        note(*notes)
         return format_points(corrected)
 
 

@@ -34,20 +34,10 @@ def residual_map(
     left_out: Array | None = None,
     photograph: bytes | None = None,
 ) -> str:
-    """Draw residuals as enlarged lines from their points, in an empty frame or over the photograph.
+    """Draw residuals (N, 2) [px] as enlarged lines from their pixels, also over a JPEG photograph.
 
-    Parameters
-    ----------
-    pixels, residuals : (N, 2) arrays [px]
-    size : (width, height) [px]
-    scale : float, optional
-        Enlargement of the residuals; by default their `enlargement`.
-    bold : float
-        Factor on the thickness of lines, for small drawings.
-    left_out : (M, 2) array, optional [px]
-        Points to draw as crosses.
-    photograph : bytes, optional
-        The image as a JPEG file.
+    `scale` is the enlargement of the residuals; by default their `enlargement`. `bold` is a factor on the
+    thickness of lines, for small drawings. Points `left_out` (M, 2) become crosses.
     """
     width, height = size
     scale = enlargement(residuals, size) if scale is None else scale
@@ -57,35 +47,25 @@ def residual_map(
         f"M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}" for (u, v), (x, y) in zip(pixels[::step], ends, strict=True)
     )
     dots = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in pixels[::step])
+    arm, crosses = width / 100, ""
+    if left_out is not None and len(left_out):
+        arms = "".join(
+            f"M{u - arm:.1f} {v - arm:.1f}L{u + arm:.1f} {v + arm:.1f}"
+            f"M{u - arm:.1f} {v + arm:.1f}L{u + arm:.1f} {v - arm:.1f}"
+            for u, v in left_out
+        )
+        crosses = f'<path d="{arms}" class="out" stroke-width="{width / 300:.2f}"/>'
+    image = "" if photograph is None else b64encode(photograph).decode()
+    if image:  # its pixel centres are at whole numbers
+        place = f'x="-.5" y="-.5" width="{width}" height="{height}"'
+        image = f'<image {place} href="data:image/jpeg;base64,{image}"/>'
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="residuals, {scale:.3g} times enlarged">'
-        f'<rect width="{width}" height="{height}" class="frame"/>{_photograph(photograph, size)}'
+        f'<rect width="{width}" height="{height}" class="frame"/>{image}'
         f'<path d="{dots}" class="dots" stroke-width="{bold * width / 160:.2f}"/>'
         f'<path d="{path}" class="lines" stroke-width="{bold * width / 450:.2f}"/>'
-        f"{_crosses(left_out, width)}</svg>"
+        f"{crosses}</svg>"
     )
-
-
-def _photograph(jpeg: bytes | None, size: tuple[int, int]) -> str:
-    """Embed the image, with pixel centres at whole numbers."""
-    if jpeg is None:
-        return ""
-    data = b64encode(jpeg).decode()
-    return (
-        f'<image x="-.5" y="-.5" width="{size[0]}" height="{size[1]}" href="data:image/jpeg;base64,{data}"/>'
-    )
-
-
-def _crosses(pixels: Array | None, width: int) -> str:
-    if pixels is None or not len(pixels):
-        return ""
-    arm = width / 100
-    path = "".join(
-        f"M{u - arm:.1f} {v - arm:.1f}L{u + arm:.1f} {v + arm:.1f}"
-        f"M{u - arm:.1f} {v + arm:.1f}L{u + arm:.1f} {v - arm:.1f}"
-        for u, v in pixels
-    )
-    return f'<path d="{path}" class="out" stroke-width="{width / 300:.2f}"/>'
 
 
 def enlargement(residuals: Array, size: tuple[int, int]) -> float:
@@ -106,13 +86,12 @@ def scatter(residuals: Array) -> str:
     step = -(-len(residuals) // _MOST)
     shown = np.clip(residuals[::step] / sigma, -5.5, 5.5)
     dots = "".join(f"M{x:.2f} {y:.2f}h0" for x, y in shown)
-    circles = '<circle r="3" class="axis"/>'
-    labels = f'<text x="2.3" y="2.75" font-size="0.5">{3 * sigma:.2g} px</text>'
     return (
         '<svg viewBox="-6 -6 12 12" role="img" aria-label="du and dv of all points">'
         '<rect x="-6" y="-6" width="12" height="12" class="frame"/>'
-        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/>{circles}'
-        f'<path d="{dots}" class="dots" stroke-width="0.11"/>{labels}</svg>'
+        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/><circle r="3" class="axis"/>'
+        f'<path d="{dots}" class="dots" stroke-width="0.11"/>'
+        f'<text x="2.3" y="2.75" font-size="0.5">{3 * sigma:.2g} px</text></svg>'
     )
 
 
@@ -139,25 +118,10 @@ def error_bars(names: Sequence[str], errors: Sequence[float], overall: float) ->
 
 
 def heat_map(values: Array, size: tuple[float, float], dots: Array, unit: str, label: str) -> str:
-    """Draw values given on a grid that reaches from edge to edge, with interpolation.
+    """Draw positive values (R, C) on a grid from edge to edge, with interpolation; empty if none is finite.
 
-    Parameters
-    ----------
-    values : (R, C) array
-        Positive; nan if unknown. R and C are at least 2.
-    size : (width, height)
-        Of the area, in the unit of the dots.
-    dots : (N, 2) array
-        Places to mark.
-    unit : str
-        Of the values, for the scale below the map.
-    label : str
-        Description for screen readers.
-
-    Returns
-    -------
-    svg : str
-        Empty if no value is finite.
+    nan is unknown, and R and C are at least 2. `size` and the places `dots` (N, 2) to mark have one unit.
+    `unit` is that of the values, for the scale below the map, and `label` is for screen readers.
     """
     logarithms = np.log(np.where(values > 0, values, np.nan))
     seen = logarithms[np.isfinite(logarithms)]

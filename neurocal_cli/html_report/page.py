@@ -74,14 +74,7 @@ large.onclick=()=>large.close();
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """Make a whole page.
-
-    Parameters
-    ----------
-    title : str
-    parts : iterable of str
-        HTML in order.
-    """
+    """Make a whole page of a title and HTML parts in order."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width,initial-scale=1">\n'
@@ -101,21 +94,20 @@ def section(title: str, *parts: str) -> str:
 
 
 def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
-    """Make a table of rows, the first of which are the headings."""
+    """Make a table of rows, the first of which are the headings; empty without others."""
     head, *body = rows
+    if not body:
+        return ""
     sort = ' class="sort"' if sortable else ""
     texts = [any(len(row[k]) > _LONG for row in body) for k in range(len(head))]
     cells = "".join(
         f"<th{' class=text' * text}>{escape(cell)}</th>" for cell, text in zip(head, texts, strict=True)
     )
-    lines = "\n".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in body)
+    marks = ("", " class=text")  # of texts that are long and may wrap
+    written = ((f"<td{marks[len(cell) > _LONG]}>{escape(cell)}</td>" for cell in row) for row in body)
+    lines = "\n".join(f"<tr>{''.join(row)}</tr>" for row in written)
     content = f"<thead><tr>{cells}</tr></thead>\n<tbody>{lines}</tbody>"
     return f'<div class="wide"><table{sort}>{content}</table></div>'
-
-
-def _cell(content: str) -> str:
-    """Make a cell; long texts may wrap."""
-    return f"<td{' class=text' if len(content) > _LONG else ''}>{escape(content)}</td>"
 
 
 def figure(drawing: str, caption: str) -> str:
@@ -143,21 +135,11 @@ def definitions(entries: Mapping[str, str]) -> str:
 
 @frozen_dataclass
 class Origin:
-    """The run that produced a result, as far as known.
+    """The run that produced a result, as far as known."""
 
-    Attributes
-    ----------
-    files : dict of str by name
-        SHA-256 of the input files; of the result's own file if the run is unknown.
-    command : str, optional
-        The command line.
-    versions : dict of str by name
-        Of the programs that computed the result.
-    """
-
-    files: Mapping[str, str]
-    command: str | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str]  # SHA-256 of the input files, or of the result's own if the run is unknown
+    command: str | None = None  # the command line
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the programs that computed the result
 
 
 def versions() -> dict[str, str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import InputError
+from neurocal_cli.evaluation import predict
 from neurocal_cli.geometry import Array
 from neurocal_cli.html_report.drawings import enlargement, error_bars, heat_map, residual_map, scatter
 from neurocal_cli.html_report.page import Origin, definitions, figure, page, section, table, verdict_block
@@ -27,19 +28,15 @@ _SETTINGS = 25  # samples along a control
 def calibration_page(
     calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
 ) -> str:
-    """Make the page of a camera.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    origin : Origin
-    photographs : dict of bytes by view, optional
-        The images as JPEG files.
-    """
-    size = _size(calibration)
-    head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+    """Make the page of a camera, with the images of views as JPEG files, if given."""
+    size = calibration.image_size
+    head = (
+        f"images of {'unknown size' if size is None else f'{size[0]} x {size[1]} px'}, "
+        f"{len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+        f"{calibration.distortion_model}"
+    )
     parts = [
-        f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
+        f'<p class="soft">{escape(head)}</p>',
         verdict_block(calibration.verdict),
         *_camera_parts(calibration, photographs or {}),
         _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
@@ -48,9 +45,7 @@ def calibration_page(
 
 
 def rig_page(
-    rig: Rig,
-    origin: Origin,
-    photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None,
+    rig: Rig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
 ) -> str:
     """Make the page of a rig; see `calibration_page`."""
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
@@ -65,8 +60,8 @@ def rig_page(
         verdict_block(rig.verdict),
         section("The right camera relative to the left one", table(rig_rows(rig))),
         section("Both cameras", table(camera_rows(rig))),
-        section("Pairs", table(pairs, sortable=True) if len(pairs) > 1 else ""),
-        section("Pairs left out", table(left_out) if len(left_out) > 1 else ""),
+        section("Pairs", table(pairs, sortable=True)),
+        section("Pairs left out", table(left_out)),
         _warnings(rig.warnings),
     ]
     sides = ("Left camera", rig.left), ("Right camera", rig.right)
@@ -126,9 +121,11 @@ def _camera_parts(
 ) -> list[str]:
     """Sections on a camera: parameters, drawings, views, rejected points and views, warnings."""
     parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
-    residuals = _residuals(calibration)
-    pixels = calibration.points.pixels
-    if len(residuals):
+    points, pixels = calibration.points, calibration.points.pixels
+    if len(points):
+        poses = [calibration.views[name].pose for name in points.view_names]
+        # 0 for points that cannot be projected.
+        residuals = np.nan_to_num(predict(calibration.camera, poses, points)[0] - pixels)
         size = calibration.image_size or tuple((np.ceil(pixels.max(axis=0)) + 1).astype(int).tolist())
         scale = enlargement(residuals, size)
         names = list(calibration.views)
@@ -172,18 +169,6 @@ def _uncertainty(calibration: Calibration) -> str:
     )
 
 
-def _residuals(calibration: Calibration) -> Array:
-    """(N, 2) projected minus observed pixels; 0 for points that cannot be projected."""
-    points = calibration.points
-    if not len(points):
-        return np.zeros((0, 2))
-    views = [calibration.views[name].pose for name in points.view_names]
-    R, t = np.stack([pose.R for pose in views]), np.stack([pose.t for pose in views])
-    k = points.view_index
-    X = np.einsum("nij,nj->ni", R[k], points.world) + t[k]
-    return np.asarray(np.nan_to_num(calibration.camera.project(X)[0] - points.pixels))
-
-
 def _view_parts(
     calibration: Calibration,
     residuals: Array,
@@ -194,7 +179,7 @@ def _view_parts(
     points = calibration.points
     unit = printable(calibration.unit)
     rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
-    figures = []
+    figures, rejected = [], calibration.rejected.points
     for k, name in enumerate(points.view_names):
         view, own = calibration.views[name], points.view_index == k
         lengths = np.hypot(*residuals[own].T)
@@ -204,10 +189,12 @@ def _view_parts(
             [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
              f"{distance:.5g}", f"{tilt:.1f}"]
         )  # fmt: skip
-        image = photographs.get(name)
+        crosses = None
+        if rejected is not None and name in rejected.view_names:
+            crosses = rejected.pixels[rejected.view_index == rejected.view_names.index(name)]
         drawing = residual_map(
             points.pixels[own], residuals[own], size, scale, bold=2.2,
-            left_out=_left_out(calibration, name), photograph=image,
+            left_out=crosses, photograph=photographs.get(name),
         )  # fmt: skip
         figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
     return [
@@ -219,14 +206,6 @@ def _view_parts(
             f'<div class="views{" wider" if photographs else ""}">{"".join(figures)}</div>',
         ),
     ]
-
-
-def _left_out(calibration: Calibration, view: str) -> Array:
-    """(M, 2) pixels of the rejected points of a view."""
-    points = calibration.rejected.points
-    if points is None or view not in points.view_names:
-        return np.zeros((0, 2))
-    return points.pixels[points.view_index == points.view_names.index(view)]
 
 
 def _rejected(calibration: Calibration) -> str:
@@ -242,21 +221,12 @@ def _rejected(calibration: Calibration) -> str:
                 [printable(name), printable(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
             )
     views = [["view", "reason"], *([printable(name), why] for name, why in rejected.views.items())]
-    return section(
-        "Left out",
-        table(views) if len(views) > 1 else "",
-        table(rows, sortable=True) if len(rows) > 1 else "",
-    )
+    return section("Left out", table(views), table(rows, sortable=True))
 
 
 def _warnings(warnings: tuple[str, ...]) -> str:
     entries = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
     return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
-
-
-def _size(calibration: Calibration) -> str:
-    size = calibration.image_size
-    return "images of unknown size" if size is None else f"images of {size[0]} x {size[1]} px"
 
 
 def _options(calibration: Calibration) -> str:

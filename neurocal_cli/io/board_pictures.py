@@ -54,7 +54,7 @@ def board_svg(sheet: Sheet) -> str:
 def board_pdf(sheet: Sheet) -> bytes:
     """Write the sheet as a PDF of one page of its size."""
 
-    def place(point: tuple[float, float] | Array) -> str:
+    def place(point: Array) -> str:
         return f"{point[0] * _POINT:.5f} {(sheet.height - point[1]) * _POINT:.5f}"
 
     content = ["0 g 0 G"]
@@ -99,13 +99,7 @@ def _pdf(objects: list[bytes]) -> bytes:
 
 
 def board_png(sheet: Sheet, dpi: float) -> bytes:
-    """Write the sheet as a grey PNG with its resolution.
-
-    Raises
-    ------
-    InputError
-        The picture has more than 200 million pixels.
-    """
+    """Write the sheet as a grey PNG with its resolution; raise an InputError beyond 200 million pixels."""
     pixels = dpi / 25.4  # per millimetre
     width, height = round(sheet.width * pixels), round(sheet.height * pixels)
     if width * height > _MOST_PIXELS:
@@ -127,13 +121,12 @@ def board_png(sheet: Sheet, dpi: float) -> bytes:
 
 
 def _dashes(line: Line) -> list[tuple[Array, Array]]:
-    start, end = np.array(line.start), np.array(line.end)
     if not line.dashed:
-        return [(start, end)]
-    length = float(np.linalg.norm(end - start))
-    along = (end - start) / length
+        return [(line.start, line.end)]
+    length = float(np.linalg.norm(line.end - line.start))
+    along = (line.end - line.start) / length
     marks = np.arange(0.0, length, 2 * _DASH)
-    return [(start + a * along, start + min(a + _DASH, length) * along) for a in marks]
+    return [(line.start + a * along, line.start + min(a + _DASH, length) * along) for a in marks]
 
 
 def _cover(ink: NDArray[np.float32], low: Array, high: Array) -> None:

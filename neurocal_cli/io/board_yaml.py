@@ -35,7 +35,7 @@ def read_board(path: str | Path) -> Board:
     FormatError
         The file cannot be read or is not a board; the message names the file and the key.
     """
-    return _board(Field(*read_yaml(path)))
+    return _board(read_yaml(path))
 
 
 def parse_board(content: str, source: str = "board") -> Board:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,16 +11,15 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.calibration_blocks import read_rejected, read_target, read_verdict, read_views
+from neurocal_cli.io.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
 from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.observations_yaml import read_observations
-from neurocal_cli.io.optional_blocks import read_rejected, read_target, read_verdict
 from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
@@ -27,31 +27,27 @@ _SAME = 1e-6
 
 
 def calibration_from_field(root: Field) -> Calibration:
-    """Read a whole calibration.
-
-    Parameters
-    ----------
-    root : Field
-        The file, or the part ``left`` or ``right`` of a rig.
-
-    Raises
-    ------
-    FormatError
-        A key is missing or wrong.
-    """
+    """Read a whole calibration from a file, or from the part ``left`` or ``right`` of a rig."""
     block = neurocal_block(root)
     views = read_views(block["views"])
     fit = block["fit"]
-    points = _points(root, block, set(views), fit["n_points"].integer() == 0)
-    if fit["n_points"].integer() != len(points):
+    n_points = fit["n_points"].integer()
+    points = _points(root, block, set(views), n_points == 0)
+    if n_points != len(points):
         root.refuse(
-            f"fit.n_points is {fit['n_points'].integer()}, but there are {len(points)} observations: the "
-            "file is incomplete; calibrate again"
+            f"fit.n_points is {n_points}, but there are {len(points)} observations: the file is incomplete; "
+            "calibrate again"
         )
     rejected = read_rejected(block.get("rejected"), points.unit)
     if fit["n_rejected"].integer() != len(rejected):
         fit["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
-    names, covariance = _covariance(block)
+    kind = block["type"].integer()
+    if kind not in (1, 2, 3, 4):
+        block["type"].fail("1, 2, 3 or 4")
+    stated = block.get("covariance", {"names": []})
+    names = tuple(stated["names"].texts())
+    size = len(names), len(names)
+    covariance = stated["data"].array(*size, unknown=True) if names else np.zeros(size)
     model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
     return Calibration(
@@ -60,7 +56,7 @@ def calibration_from_field(root: Field) -> Calibration:
         fixed=fixed,
         views=views,
         points=points,
-        type=_type(block["type"]),
+        type=kind,
         method=block["method"].text(),
         trainer=block["trainer"].text(),
         seed=block["seed"].integer(),
@@ -100,11 +96,9 @@ def neurocal_block(root: Field) -> Field:
             )
         root.refuse("has no neurocal block; give a file that calibrate wrote")
     block = root["neurocal"]
-    if block["format"].integer() not in FORMATS:
-        root.refuse(
-            f"{block.path}.format is {block['format'].integer()}, not {' or '.join(map(str, FORMATS))}; "
-            "update neurocal"
-        )
+    form = block["format"].integer()
+    if form not in FORMATS:
+        root.refuse(f"{block.path}.format is {form}, not {' or '.join(map(str, FORMATS))}; update neurocal")
     return block
 
 
@@ -112,14 +106,9 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     """Read the intrinsic parameters of a neurocal file, their standard deviations, and the fixed names."""
     parameters = neurocal_block(root)["parameters"]
     values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
-    std = {}
-    fixed = set()
-    for name, parameter in parameters.entries().items():
-        entry = parameter.entries()
-        if "std" in entry:
-            std[name] = entry["std"].number_or_nan()
-        if parameter.get("fixed", False).boolean():
-            fixed.add(name)
+    entries = parameters.entries()
+    std = {name: entry["std"].number_or_nan() for name, entry in entries.items() if "std" in entry.entries()}
+    fixed = frozenset(name for name, entry in entries.items() if entry.get("fixed", False).boolean())
     try:
         intrinsics = Intrinsics(*values)
     except InputError as error:
@@ -128,43 +117,20 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
         K = root["camera_matrix"]["data"].array(9).reshape(3, 3)
         if np.abs(K - intrinsics.A).max() > _SAME * np.abs(intrinsics.A).max():
             root.refuse(f"camera_matrix and {parameters.path} disagree; correct the one that was edited")
-    return intrinsics, std, frozenset(fixed)
+    return intrinsics, std, fixed
 
 
 def read_extrinsics(path: str | Path, unit: str) -> dict[str, Pose]:
-    """Read the pose of each view of a neurocal calibration; ``-`` is stdin.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read or has no poses, or they are in another unit than `unit`.
-    """
+    """Read the pose of each view of a neurocal calibration; refuse poses in another unit than `unit`."""
     block = neurocal_block(read_tree(path))
     views, own = read_views(block["views"]), _unit(block)
     if own != unit:
-        raise FormatError(
-            f"its poses are in {own}, but the points in {unit}; give both in one unit", block.source
-        )
+        block.refuse(f"its poses are in {own}, but the points in {unit}; give both in one unit")
     return {name: view.pose for name, view in views.items()}
 
 
 def _unit(block: Field) -> str:
     return block.get("unit", "mm").text()
-
-
-def _type(field: Field) -> int:
-    number = field.integer()
-    if number not in (1, 2, 3, 4):
-        field.fail("1, 2, 3 or 4")
-    return number
-
-
-def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
-    field = block.get("covariance", {"names": []})
-    names = tuple(field["names"].texts())
-    if not names:
-        return (), np.zeros((0, 0))
-    return names, field["data"].array(len(names), len(names), unknown=True)
 
 
 def distortion_from_field(root: Field) -> tuple[str, Array]:
@@ -180,19 +146,15 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
 
 
 def _network(field: Field) -> NetworkRecord:
+    numbers: dict[str, Any] = {name: field[name].integer() for name in NETWORK_COUNTS}
+    numbers |= {name: field[name].number_or_nan() for name in NETWORK_ERRORS}
     return NetworkRecord(
         W=field["W"].array(3, 3),
         V=_matrices(field["V"], 3, 4),
         S1=field["S1"].array(3, 3),
         S2=_matrices(field["S2"], 4, 4),
-        starts=field["starts"].integer(),
-        agreed=field["agreed"].integer(),
-        iterations=field["iterations"].integer(),
-        refine_iterations=field["refine_iterations"].integer(),
-        loss=field["loss"].number_or_nan(),
-        rmse_before=field["rmse_before"].number_or_nan(),
-        rmse_after=field["rmse_after"].number_or_nan(),
         curve=tuple(field["curve"].array(-1, unknown=True).tolist()),
+        **numbers,
     )
 
 
@@ -222,8 +184,7 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
     unit = _unit(block)
     center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
     points = read_observations(observations, unit, image_size(root), center, none)
-    strange = set() if points.view is None else set(points.view_names) - views
-    if strange:
+    if strange := set() if points.view is None else set(points.view_names) - views:
         root.refuse(
             f"{observations.path}: the view {min(strange)[:60]!r} is not in {block.path}.views; "
             "calibrate again or correct its name"

@@ -11,7 +11,8 @@ see `text_columns`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
@@ -20,41 +21,25 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.geometry import Array
+from neurocal_cli.io import calibration_blocks as blocks
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.observations_yaml import observation_lines
-from neurocal_cli.io.optional_blocks import rejected_lines, target_lines, verdict_lines
 from neurocal_cli.io.text_columns import column_lines, named_lines
-from neurocal_cli.io.views_yaml import have_same_std, view_lines
-from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from neurocal_cli.io.yaml_text import block, boolean, flow, flows, list_lines, mapping, number, quoted, text
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
 
 # OpenCV 4 opens no YAML file without these two lines; 1.1 is the version that PyYAML and ROS read.
 HEADER = ("%YAML 1.1", "---")
 
+NETWORK_COUNTS = ("starts", "agreed", "iterations", "refine_iterations")
+NETWORK_ERRORS = ("loss", "rmse_before", "rmse_after")
 _MOST_VIEWS = 100
 _MOST_POINTS = 5000
 
 
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
-    """Text of a calibration file.
-
-    The same calibration gives the same text, without dates and paths.
-
-    Parameters
-    ----------
-    cal : Calibration
-    by_rows : bool
-        Whether even long tables have a row for each view and point.
-
-    Raises
-    ------
-    InputError
-        A name cannot be encoded as UTF-8.
-    """
+    """Text of a calibration file, without dates and paths; if `by_rows`, long tables have rows, too."""
     return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
 
 
@@ -86,33 +71,24 @@ def read_calibration(path: str | Path) -> Calibration:
 def calibration_lines(
     cal: Calibration, rectified: tuple[Array, Array] | None = None, by_rows: bool = False
 ) -> Iterator[str]:
-    """Lines of the file without its header and without line ends.
-
-    Parameters
-    ----------
-    cal : Calibration
-    rectified : (3, 3) and (3, 4) arrays, optional
-        Rectification and projection matrix of a camera on a rig, as ROS defines them.
-    by_rows : bool
-        See `format_calibration`.
-    """
+    """Lines of a file without header; see `camera_info_lines` and, for `by_rows`, `format_calibration`."""
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and have_same_std(cal.views)
+    long = large and not by_rows and blocks.have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
-    yield "neurocal:"
-    for lines in (
-        _record_lines(cal, long),
-        _parameter_lines(cal),
-        view_lines(cal.views, cal.K, long),
-        _network_lines(cal.network, long),
-        verdict_lines(cal.verdict),
-        rejected_lines(cal.rejected, long),
-        target_lines(cal.target, long),
-    ):
-        yield from (f"  {line}" for line in lines)
-    if cal.straight_lines is not None:
-        yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
-    yield from (f"  {line}" for line in observation_lines(cal.points, long))
+    yield from block(
+        "neurocal",
+        chain(
+            _record_lines(cal, long),
+            _parameter_lines(cal),
+            blocks.view_lines(cal.views, cal.K, long),
+            ["network: null"] if cal.network is None else block("network", _network_lines(cal.network, long)),
+            blocks.verdict_lines(cal.verdict),
+            blocks.rejected_lines(cal.rejected, long),
+            blocks.target_lines(cal.target, long),
+            _straight_lines(cal.straight_lines),
+            observation_lines(cal.points, long),
+        ),
+    )
 
 
 def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
@@ -122,7 +98,7 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
     yield f"method: {text(cal.method)}"
     yield f"trainer: {text(cal.trainer)}"
     yield f"seed: {cal.seed}"
-    yield f"converged: {str(bool(cal.converged)).lower()}"
+    yield f"converged: {boolean(cal.converged)}"
     yield f"stop_reason: {text(str.__str__(cal.stop_reason))}"
     yield f"unit: {text(cal.unit)}"
     yield f"distortion: {text(cal.distortion_model)}"
@@ -158,37 +134,32 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
     yield from list_lines("warnings", map(quoted, cal.warnings))
 
 
-def _network_lines(network: NetworkRecord | None, long: bool) -> Iterator[str]:
-    if network is None:
-        yield "network: null"
-        return
-    yield "network:"
+def _network_lines(network: NetworkRecord, long: bool) -> Iterator[str]:
     yield from _matrix_lines("V", network.V, long)
-    yield f"  W: {flow(network.W)}"
-    yield f"  S1: {flow(network.S1)}"
+    yield f"W: {flow(network.W)}"
+    yield f"S1: {flow(network.S1)}"
     yield from _matrix_lines("S2", network.S2, long)
-    for name in ("starts", "agreed", "iterations", "refine_iterations"):
-        yield f"  {name}: {int(getattr(network, name))}"
-    for name in ("loss", "rmse_before", "rmse_after"):
-        yield f"  {name}: {number(getattr(network, name))}"
-    yield f"  curve: {flow(np.array(network.curve, dtype=float))}"
+    for name in NETWORK_COUNTS:
+        yield f"{name}: {int(getattr(network, name))}"
+    for name in NETWORK_ERRORS:
+        yield f"{name}: {number(getattr(network, name))}"
+    yield f"curve: {flow(np.array(network.curve, dtype=float))}"
 
 
-def _straight_lines(found: StraightLines) -> str:
-    return mapping(
-        n_lines=str(found.n_lines),
-        n_points=str(found.n_points),
-        center=flow(np.array(found.centre)),
-        rms_before_px=number(found.rms_before),
-        rms_after_px=number(found.rms_after),
-    )
+def _straight_lines(found: StraightLines | None) -> Iterator[str]:
+    if found is not None:
+        yield "straight_lines: " + mapping(
+            n_lines=str(found.n_lines),
+            n_points=str(found.n_points),
+            center=flow(np.array(found.centre)),
+            rms_before_px=number(found.rms_before),
+            rms_after_px=number(found.rms_after),
+        )
 
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> Iterator[str]:
     stack = np.array(list(matrices.values()))
-    if long:
-        yield f"  {name}:"
-        columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
-        yield from (f"    {line}" for line in column_lines(columns))
-    else:
-        yield from (f"  {line}" for line in named_lines(name, matrices, flows(stack)))
+    if not long:
+        return named_lines(name, matrices, flows(stack))
+    columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
+    return block(name, column_lines(columns))

@@ -30,13 +30,7 @@ _FORMULAS = {
 
 
 def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
-    """Find ROS's name of one of our models, and pad its coefficients with zeros.
-
-    Raises
-    ------
-    InputError
-        The model is unknown, or does not have these coefficients.
-    """
+    """Find ROS's name of one of our models, and pad its coefficients, which must fit, with zeros."""
     own = own_length(model)
     name = _ROS.get(model, model if model in (*WIDE, *WITH_PRISM) else "plumb_bob")
     length = _LENGTHS.get(name, own)
@@ -51,14 +45,9 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
 
 
 def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
-    """Find our name of a ROS (or OpenCV) model and its coefficients.
+    """Find our name of a ROS (or OpenCV) model and its coefficients; an InputError lists the known ones.
 
     All zeros mean no distortion, except for a fisheye, for which they mean an equidistant projection.
-
-    Raises
-    ------
-    InputError
-        The model or its number of coefficients is unknown; the message lists the known ones.
     """
     values = np.asarray(coefficients, dtype=float).ravel()
     if name in ("equidistant", "fisheye") and values.size:
@@ -95,14 +84,7 @@ def own_length(model: str) -> int:
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
-    """Lines of the file, without line ends.
-
-    Parameters
-    ----------
-    camera : Camera
-    rectified : (3, 3) and (3, 4) arrays, optional
-        Rectification and projection matrix of a camera on a rig; by default those of a single camera.
-    """
+    """Lines of the file; `rectified` are R (3, 3) and P (3, 4) of a camera on a rig, as ROS defines them."""
     R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
     width, height = camera.image_size or (0, 0)  # ROS's readers require numbers
     model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)

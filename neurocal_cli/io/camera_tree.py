@@ -37,43 +37,27 @@ _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 
 
 def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
-    """Read a camera.
+    """Read a camera from the tree of a file.
 
-    Parameters
-    ----------
-    root : Field
-        The whole file.
-    side : str
-        Suffix of the keys of one camera of several, such as ``1`` of M1 and D1.
-    whole : bool
-        Whether the file has only this camera, so that all its keys are checked.
-
-    Raises
-    ------
-    InputError, FormatError
-        There is no valid camera matrix, or the distortion cannot be read.
+    `side` is the suffix of the keys of one camera of several, such as ``1`` of M1 and D1. If the file has
+    only this camera (`whole`), all its keys are checked.
     """
     if "projection" in root and "f" in root:
         raise InputError("is the file of an undistorted panorama; give the camera of the original images")
     intrinsics = _intrinsics(root, side)
     model, coefficients = _distortion(root, side, whole)
-    name = next((root[key].text() for key in _ended(("camera_name",), side) if key in root), "camera")
+    stated = _find(root, ("camera_name",), side)
+    name = "camera" if stated is None else stated.text()
     return Camera(intrinsics, Distortion(model, coefficients), image_size(root, side), name)
 
 
 def has_matrix(root: Field, side: str = "") -> bool:
     """Whether the tree has a camera matrix under one of the usual names."""
-    return _first(root, _ended(_MATRIX_KEYS, side)) is not None
+    return _find(root, _MATRIX_KEYS, side) is not None
 
 
 def boofcv_camera(root: Field) -> Camera:
-    """Read a camera of BoofCV.
-
-    Raises
-    ------
-    InputError, FormatError
-        The distortion model is unknown.
-    """
+    """Read a camera of BoofCV."""
     pinhole = root["pinhole"]
     model = root.get("model", "").text()
     omni = model == "omnidirectional_universal"
@@ -102,18 +86,12 @@ def boofcv_camera(root: Field) -> Camera:
 
 
 def matrix_data(field: Field, length: int) -> Array:
-    """Read a matrix in row order: as rows, cols and data, as nested lists or as one list.
-
-    Parameters
-    ----------
-    field : Field
-    length : int
-        Required number of entries, 9 for a 3 x 3 matrix; -1 allows any.
-    """
+    """Read a matrix in row order: rows, cols and data, nested lists or a list; any `length` if it is -1."""
     if isinstance(field.value, dict):
         data = field["data"].array(-1)
         rows, cols = field["rows"].integer(), field["cols"].integer()
-        channels = _channels(field)
+        head = str(field["dt"].value)[:-1] if "dt" in field else ""
+        channels = int(head) if head.isdigit() else 1  # dt: "2f" has two
         if rows * cols * channels != len(data) or (length == 9 and rows != 3):
             raise InputError(f"{field.path} has {rows} rows, {cols} cols and {len(data)} numbers; correct it")
     elif isinstance(field.value, list) and field.value and isinstance(field.value[0], list):
@@ -128,26 +106,16 @@ def matrix_data(field: Field, length: int) -> Array:
     return data
 
 
-def _channels(field: Field) -> int:
-    """Number of channels of an OpenCV matrix; ``dt: "2f"`` has two."""
-    head = str(field["dt"].value)[:-1] if "dt" in field else ""
-    return int(head) if head.isdigit() else 1
-
-
-def _ended(keys: tuple[str, ...], side: str) -> tuple[str, ...]:
-    """Keys of one camera of several, with the suffix, with or without an underscore."""
+def _find(root: Field, keys: tuple[str, ...], side: str) -> Field | None:
+    """Value of the first of these keys; those of one camera of several end in its side, or _ and its side."""
     if not side:
-        return keys
+        return root.first(keys)
     # The key k is left out, because k1 is a distortion coefficient in other files.
-    return tuple(form for key in keys if key != "k" for form in (f"{key}{side}", f"{key}_{side}"))
-
-
-def _first(root: Field, keys: tuple[str, ...]) -> Field | None:
-    return next((root[key] for key in keys if key in root), None)
+    return root.first(form for key in keys if key != "k" for form in (f"{key}{side}", f"{key}_{side}"))
 
 
 def _intrinsics(root: Field, side: str) -> Intrinsics:
-    field = _first(root, _ended(_MATRIX_KEYS, side))
+    field = _find(root, _MATRIX_KEYS, side)
     if field is None:
         raise InputError(
             f"holds no camera matrix; give a file with the key {', '.join(_MATRIX_KEYS[:2])} or K"
@@ -164,24 +132,21 @@ def _intrinsics(root: Field, side: str) -> Intrinsics:
 
 
 def _distortion(root: Field, side: str, whole: bool) -> tuple[str, Array]:
-    field = _first(root, _ended(_DISTORTION_KEYS, side))
+    field, xi = _find(root, _DISTORTION_KEYS, side), _find(root, ("xi",), side)
     if field is None:
         if whole:
             _refuse_unread(root)
-        if _first(root, _ended(("xi",), side)) is not None:
+        if xi is not None:
             raise InputError("has xi of an omnidirectional camera without its distortion; add D, or zeros")
         return "none", np.zeros(0)
     coefficients = matrix_data(field, -1)
-    stated = _first(root, (*_ended(("distortion_model",), side), "distortion_model"))
-    xi = _first(root, _ended(("xi",), side))
+    stated = _find(root, ("distortion_model",), side) or root.first(["distortion_model"])
     if xi is not None:
         return _omnidirectional(xi, coefficients, "omnidir" if stated is None else stated.text())
     if stated is not None:
-        model = stated.text() or "plumb_bob"
-    else:
-        fisheye = "fisheye_model" in root and root["fisheye_model"].value in (1, True)
-        model = "equidistant" if fisheye else "plumb_bob"
-    return from_ros(model, coefficients)
+        return from_ros(stated.text() or "plumb_bob", coefficients)
+    fisheye = "fisheye_model" in root and root["fisheye_model"].value in (1, True)
+    return from_ros("equidistant" if fisheye else "plumb_bob", coefficients)
 
 
 def _omnidirectional(xi: Field, coefficients: Array, model: str) -> tuple[str, Array]:
@@ -207,13 +172,11 @@ def _refuse_unread(root: Field) -> None:
 
 def image_size(root: Field, side: str = "") -> tuple[int, int] | None:
     """Width and height [px] under one of their usual names; None if they are unknown."""
-    width, height = (
-        _first(root, (*(_ended(keys, side) if side else ()), *keys)) for keys in (_WIDTH_KEYS, _HEIGHT_KEYS)
-    )
+    width, height = (_find(root, keys, side) or root.first(keys) for keys in (_WIDTH_KEYS, _HEIGHT_KEYS))
     if width is not None and height is not None:
         size = width.integer(), height.integer()
     else:
-        field = _first(root, (*(_ended(_SIZE_KEYS, side) if side else ()), *_SIZE_KEYS))
+        field = _find(root, _SIZE_KEYS, side) or root.first(_SIZE_KEYS)
         if field is None:
             return None
         values = list(field.items())

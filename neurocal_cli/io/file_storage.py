@@ -22,13 +22,7 @@ _PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousa
 
 
 def read_tree(path: str | Path) -> Field:
-    """Read a YAML, JSON or XML file; the format is recognised by the content.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read or has a syntax error.
-    """
+    """Read a YAML, JSON or XML file; the format is recognised by the content."""
     return parse_tree(*read_text(path, "a camera file"))
 
 
@@ -101,15 +95,7 @@ def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any
 
 
 def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
-    """Write names and values as a FileStorage.
-
-    Parameters
-    ----------
-    entries : dict
-        Strings, numbers, lists of strings, and matrices: (rows, cols) or (rows, cols, channels) arrays.
-    ending : str
-        ``.xml`` or ``.json``; YAML otherwise.
-    """
+    """Write texts, numbers, lists of texts and (rows, cols[, channels]) arrays as .xml, .json or YAML."""
     if ending == ".xml":
         body = "\n".join(_xml(key, value) for key, value in entries.items())
         return f'<?xml version="1.0"?>\n<opencv_storage>\n{body}\n</opencv_storage>\n'

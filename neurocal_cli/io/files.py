@@ -8,13 +8,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.io.outputs import held_back
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
@@ -29,32 +27,15 @@ _KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
 @contextmanager
 def repeatable_stdin() -> Iterator[None]:
     """Keep what is read from stdin, so that several readers can look at it in turn."""
-    token = _KEPT.set(None)
+    token = _KEPT.set(read_bytes("-")[0])
     try:
-        _KEPT.set(read_bytes("-")[0])
         yield
     finally:
         _KEPT.reset(token)
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Read a whole file, or stdin for ``-``.
-
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    data : bytes
-    source : str
-        Name for messages; ``<stdin>`` for stdin.
-
-    Raises
-    ------
-    FormatError
-        The file is missing, is a folder, or may not be read.
-    """
+    """Read a whole file, or stdin for ``-``, and its name for messages."""
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
@@ -66,10 +47,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
-    """Read a file, or stdin for ``-``, in blocks of whole lines of about `size` bytes; see `read_bytes`.
-
-    A file without line ends is one block.
-    """
+    """Read a file in blocks of whole lines of about `size` bytes; without line ends it is one block."""
     if str(path) == "-":
         _protect_stdin()
         with _stdin_failures():
@@ -134,12 +112,12 @@ def reading_failures(source: str) -> Iterator[None]:
 
 
 @contextmanager
-def value_failures(source: str, where: str = "") -> Iterator[None]:
+def value_failures(source: str, where: str = "", line: int | None = None) -> Iterator[None]:
     """Turn errors about values into messages that name the file and the place in it."""
     try:
         yield
     except InputError as error:
-        raise FormatError(f"{where}{error}", source) from error
+        raise FormatError(f"{where}{error}", source, line) from error
 
 
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
@@ -149,30 +127,17 @@ def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
 
 
 def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
-    """Decode UTF-8, with or without a byte order mark.
-
-    Parameters
-    ----------
-    data : bytes
-    source : str
-        Name for messages.
-    kind : str
-        Expected kind of file, for the message about a binary file.
-    instead : str
-        Appended to that message.
-
-    Raises
-    ------
-    FormatError
-        The data are UTF-16 or UTF-32 text, binary, or not UTF-8.
-    """
+    """Decode UTF-8; a message about a binary file names the `kind` that is wanted, and ends in `instead`."""
     if data.isascii() and b"\0" not in data:
         return data.decode("ascii")
     for mark, name in _WIDE_MARKS:
         if data.startswith(mark):
             raise FormatError(f"is {name} text; save it as UTF-8", source)
     if b"\0" in data:
-        if _alternates_with_nul(data):
+        # Is it ASCII text with two bytes per character and no byte order mark?
+        head = data[:1000]
+        even, odd = head[::2].count(0), head[1::2].count(0)
+        if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
         raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
@@ -203,10 +168,3 @@ def one_line(path: str | Path) -> str:
     """Make a path, or any text, printable on one line."""
     text = str(path)
     return text if text.isprintable() else repr(text)[1:-1]
-
-
-def _alternates_with_nul(data: bytes) -> bool:
-    """Whether the data are ASCII text with two bytes per character and no byte order mark."""
-    head = data[:1000]
-    even, odd = head[::2].count(0), head[1::2].count(0)
-    return max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0

@@ -40,22 +40,12 @@ _OTHERS = (
 
 @frozen_dataclass
 class Header:
-    """Size and orientation of a stored image.
+    """Size and orientation of a stored image."""
 
-    Attributes
-    ----------
-    kind : str
-        ``PNG``, ``JPEG``, ``TIFF``, ``BMP`` or ``PNM``.
-    width, height : int [px]
-        As stored, before the orientation is applied.
-    orientation : int
-        EXIF orientation: 1 upright, 2-8 mirrored or rotated.
-    """
-
-    kind: str
-    width: int
+    kind: str  # PNG, JPEG, TIFF, BMP or PNM
+    width: int  # px, as is the height; as stored, before the orientation is applied
     height: int
-    orientation: int = 1
+    orientation: int = 1  # of EXIF: 1 upright, 2-8 mirrored or rotated
 
 
 class _TruncatedError(Exception):
@@ -63,20 +53,7 @@ class _TruncatedError(Exception):
 
 
 def read_header(data: bytes, source: str) -> Header:
-    """Read the header of an image file, and check that the file is complete.
-
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    source : str
-        Its name, for messages.
-
-    Raises
-    ------
-    FormatError
-        The file is empty, not a known kind of image, truncated, damaged, or without pixels.
-    """
+    """Read the header of the bytes of a whole image file, and check that the file is complete."""
     if not data:
         raise FormatError("is empty; give an image", source)
     reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
@@ -146,14 +123,9 @@ def _other(data: bytes) -> str | None:
 
 
 def _png(data: bytes) -> Header:
-    width = height = 0
-    orientation = 1
-    for kind, body in _png_chunks(data):
-        if kind == b"IHDR":
-            width, height = struct.unpack_from(">II", body)
-        elif kind == b"eXIf":
-            orientation = _exif_orientation(body)
-    return Header("PNG", width, height, orientation)
+    chunks = dict(_png_chunks(data))
+    width, height = struct.unpack_from(">II", chunks.get(b"IHDR", bytes(8)))
+    return Header("PNG", width, height, _exif_orientation(chunks.get(b"eXIf", b"")))
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:

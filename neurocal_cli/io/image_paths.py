@@ -23,18 +23,10 @@ def is_image(path: str) -> bool:
 def find_images(words: Iterable[str]) -> tuple[str, ...]:
     """Find the files given by names, folders and patterns.
 
-    Parameters
-    ----------
-    words : iterable of str
-        A file (or ``-``) stands for itself, whether it exists or not. A folder stands for the images in it,
-        recognised by their extensions. A pattern such as ``left*.png``, which no shell expanded, stands for
-        the matching files. Files of folders and patterns are in natural order (1, 2, 10). So are all files if
-        the arguments are in alphabetical order.
-
-    Raises
-    ------
-    FormatError
-        A folder cannot be read or has no images, or nothing matches a pattern.
+    A file (or ``-``) stands for itself, whether it exists or not. A folder stands for the images in it,
+    recognised by their extensions. A pattern such as ``left*.png``, which no shell expanded, stands for the
+    matching files. Files of folders and patterns are in natural order (1, 2, 10). So are all files if the
+    arguments are in alphabetical order.
     """
     paths: list[str] = []
     for word in words:
@@ -57,13 +49,7 @@ def natural_order(name: str) -> list[tuple[int, str, int]]:
 
 
 def view_names(paths: Iterable[str]) -> tuple[str, ...]:
-    """Name a view after each file, without folder and extension; ``stdin`` for ``-``.
-
-    Raises
-    ------
-    InputError
-        Two files would have the same name.
-    """
+    """Name a view after each file, without folder and extension; InputError if two have the same name."""
     files = tuple(paths)
     names = tuple("stdin" if path == "-" else Path(path).stem for path in files)
     doubled = next((name for name, count in Counter(names).items() if count > 1), None)
@@ -75,6 +61,19 @@ def view_names(paths: Iterable[str]) -> tuple[str, ...]:
             raise InputError(f"{first} is given twice; give each image once")
         raise InputError(f"{first} and {second} would both be the view {doubled!r}; rename one of them")
     return names
+
+
+def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
+    """Find the image of each view in a folder or by a pattern: the file with its name, without extension."""
+    paths = find_images([word])
+    found = dict(zip(view_names(paths), paths, strict=True))
+    images = {view: found[view] for view in views if view in found}
+    if not images:
+        raise InputError(
+            f"{word}: no image has the name of a view, such as {views[0] if views else 'none'!s}; give the "
+            "folder of the images that were calibrated from"
+        )
+    return images
 
 
 def _in_folder(folder: str) -> list[str]:

@@ -1,11 +1,11 @@
-"""Read and write images as arrays."""
+"""Read and write images as arrays, and make thumbnails of them."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,27 +36,19 @@ _TURNS = {
 _SIXTEEN_BITS = (".png", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 _JPEG = (".jpg", ".jpeg", ".jpe")
 _QUALITY = 95
+_WIDEST = 960  # px; a page shows a photograph no wider
+_NARROWEST = 120
 _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # a process has only one stderr
 
 
 @frozen_dataclass(eq=False)
 class Image:
-    """A grey image.
+    """A grey image."""
 
-    Attributes
-    ----------
-    grey : (height, width) uint8 or uint16 array [DN]
-        From colours as in OpenCV: 0.299 R + 0.587 G + 0.114 B.
-    source : str
-        Name for messages.
-    notes : tuple of str
-        Changes of the pixels that a user may not expect.
-    """
-
-    grey: Pixels
-    source: str = "image"
-    notes: tuple[str, ...] = ()
+    grey: Pixels  # (height, width) [DN]; of colours 0.299 R + 0.587 G + 0.114 B, as in OpenCV
+    source: str = "image"  # name for messages
+    notes: tuple[str, ...] = ()  # changes of the pixels that a user may not expect
 
     @property
     def size(self) -> tuple[int, int]:
@@ -84,17 +76,7 @@ def read_image(path: str | Path) -> Image:
 
 
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
-    """Read an image with its colours; otherwise like `read_image`.
-
-    Returns
-    -------
-    pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
-        Colours in the order red, green, blue; transparency is dropped.
-    source : str
-        Name for messages.
-    notes : tuple of str
-        Changes of the pixels that a user may not expect.
-    """
+    """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
     data, source = read_bytes(path)
     pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return _reversed(pixels), source, notes
@@ -126,18 +108,7 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Encode a picture as PNG.
-
-    Parameters
-    ----------
-    picture : (height, width) or (height, width, 3) uint8 array
-        Colours in the order red, green, blue.
-
-    Raises
-    ------
-    InputError
-        The picture cannot be written as PNG.
-    """
+    """Encode a grey (height, width) or colour (height, width, 3; R, G, B) picture as PNG."""
     return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
 
 
@@ -156,32 +127,8 @@ def _reversed(picture: Pixels) -> Pixels:
     return picture[..., ::-1] if picture.ndim == 3 else picture
 
 
-def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
-    """Convert an (H, W) image to 8 bits, and reduce it to at most `width` pixels."""
-    eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
-    if eight.shape[1] <= width:
-        return eight
-    height = max(1, round(eight.shape[0] * width / eight.shape[1]))
-    return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Encode a picture as an image file.
-
-    Parameters
-    ----------
-    pixels : (height, width) or (height, width, 3) uint8 or uint16 array
-        Colours in the order red, green, blue.
-    ending : str
-        Extension of the file: .png, .tif and so on.
-    quality : int
-        Of a JPEG file, up to 100.
-
-    Raises
-    ------
-    InputError
-        This kind of file cannot hold such a picture.
-    """
+    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is of JPEG (100)."""
     if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
         raise InputError(
             f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
@@ -191,6 +138,40 @@ def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
     return _encoded(
         pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
     )
+
+
+def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
+    """Encode images, by name, as small JPEG files with a limit on their total size.
+
+    All must have the `size` [px] if it is known. Only images of the least width may exceed the limit.
+    """
+    small: dict[str, NDArray[np.uint8]] = {}
+    for name, path in images.items():
+        image = read_image(path)
+        if size is not None and image.size != size:
+            raise FormatError(
+                f"has {image.size[0]} x {image.size[1]} px, but the camera {size[0]} x {size[1]}; give the "
+                "images that were calibrated from",
+                image.source,
+            )
+        small[name] = _shrunk(image.grey, _WIDEST)
+    width = _WIDEST
+    while True:
+        files = {name: encode_image(_shrunk(grey, width), ".jpg", 70) for name, grey in small.items()}
+        total = sum(map(len, files.values()))
+        if total <= most_bytes or width == _NARROWEST:
+            return files
+        # A thumbnail of half the width takes a little more than a quarter of the bytes.
+        width = max(_NARROWEST, int(width * min(0.9, (most_bytes / total) ** 0.6)))
+
+
+def _shrunk(grey: Pixels, width: int) -> NDArray[np.uint8]:
+    """Convert an (H, W) image to 8 bits, and reduce it to at most `width` pixels."""
+    eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
+    if eight.shape[1] <= width:
+        return eight
+    height = max(1, round(eight.shape[0] * width / eight.shape[1]))
+    return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:

@@ -20,8 +20,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.reading import read_intrinsics
 from neurocal_cli.io.files import read_bytes
-from neurocal_cli.io.points_csv import POINTS, format_points
-from neurocal_cli.io.points_join import correspondences
+from neurocal_cli.io.points_csv import POINTS, correspondences, format_points
 from neurocal_cli.io.table import Table, parse_table
 from neurocal_cli.io.table_header import Schema
 from neurocal_cli.io.writing import write_whole
@@ -134,13 +133,7 @@ def _header(data: bytes) -> set[str]:
 
 
 def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> LensCameras:
-    """Read known cameras from pairs of file content and name.
-
-    Raises
-    ------
-    FormatError, InputError
-        A file cannot be read, a setting is missing, or the cameras are not of one lens.
-    """
+    """Read known cameras from pairs of file content and name."""
     tables = [
         parse_table(data, source, _TABLE if "alpha_u" in _header(data) else _LIST)
         for data, source in contents
@@ -218,13 +211,7 @@ def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array
 
 
 def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
-    """Names of the controls, which all files must share.
-
-    Raises
-    ------
-    FormatError
-        There are none, or the files differ.
-    """
+    """Names of the controls, at least one, which all files must share."""
     names = [set(table.numbers) & set(CONTROLS) for table in tables]
     for found, table in zip(names, tables, strict=True):
         if not found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.calibration_blocks import read_target, target_lines
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.optional_blocks import read_target, target_lines
 from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import block, boolean, flow, list_lines, mapping, number, quoted, text, words
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
@@ -32,18 +32,16 @@ _MOST_UNITS = 1000
 
 
 def format_lens(lens: ZoomLens) -> str:
-    """Text of a lens file.
-
-    Raises
-    ------
-    InputError
-        A unit or reason cannot be encoded as UTF-8.
-    """
-    lines = [f"{_BLOCK}:"]
-    parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
-    for part in (*parts, target_lines(lens.target, long=False), _coupling_lines(lens)):
-        lines += [f"  {line}" for line in part]
-    return "\n".join([*lines, ""])
+    """Text of a lens file."""
+    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
+    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
+    settings = block("settings", table_lines(columns, long=False, indent=2))
+    parts = [_record_lines(lens), settings, _member_lines(lens), _tables_lines(lens)]
+    parts.append(target_lines(lens.target, long=False))
+    if lens.target_coupling is not None:
+        coupling = lens.target_coupling.reshape(len(lens.settings), -1)
+        parts.append(iter([f"target_coupling: {flow(coupling)}"]))
+    return "\n".join([*block(_BLOCK, chain.from_iterable(parts)), ""])
 
 
 def write_lens(lens: ZoomLens, path: str | Path) -> None:
@@ -59,11 +57,10 @@ def read_lens(path: str | Path) -> ZoomLens:
     FormatError
         The file cannot be read, is another kind of file, or a key is missing or wrong.
     """
-    tree, source = read_yaml(path)
-    root = Field(tree, source)
-    if not isinstance(tree, dict) or _BLOCK not in root:
-        kind = "is a camera" if isinstance(tree, dict) and "camera_matrix" in root else "is not a lens"
-        raise FormatError(f"{kind}; give a file that `neurocal lens fit` wrote", source)
+    root = read_yaml(path)
+    if _BLOCK not in root:
+        kind = "is a camera" if "camera_matrix" in root else "is not a lens"
+        root.refuse(f"{kind}; give a file that `neurocal lens fit` wrote")
     return lens_from_field(root)
 
 
@@ -73,26 +70,18 @@ def lens_from_field(root: Field) -> ZoomLens:
         return _lens(root[_BLOCK])
 
 
-def _bool(value: bool) -> str:
-    return "true" if value else "false"
-
-
-def _words(names: tuple[str, ...]) -> str:
-    return f"[{', '.join(map(text, names))}]"
-
-
 def _record_lines(lens: ZoomLens) -> Iterator[str]:
     width, height = lens.image_size or (0, 0)
     yield f"format: {_FORMAT}"
     yield f"version: {text(__version__)}"
-    yield f"controls: {_words(lens.controls)}"
-    yield f"parameters: {_words(lens.names)}"
+    yield f"controls: {words(lens.controls)}"
+    yield f"parameters: {words(lens.names)}"
     yield f"distortion: {text(lens.model)}"
     yield f"camera: {'known' if lens.known else 'still' if lens.still else 'moving'}"
-    yield f"skew: {_bool(lens.free_theta)}"
+    yield f"skew: {boolean(lens.free_theta)}"
     yield f"training: {text(lens.training)}"
     yield f"seed: {lens.seed}"
-    yield f"converged: {_bool(lens.converged)}"
+    yield f"converged: {boolean(lens.converged)}"
     yield f"unit: {text(lens.unit)}"
     yield f"image_width: {width}"
     yield f"image_height: {height}"
@@ -109,25 +98,6 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
     ]
     yield from list_lines("rejected", rejected)
     yield from list_lines("warnings", map(quoted, lens.warnings))
-
-
-def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
-    if lens.target_coupling is not None:
-        yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
-
-
-def _coupling(field: Field, S: int, size: int) -> Array:
-    flat = field.array(S, -1)
-    if flat.shape[1] % size:
-        field.fail(f"rows of a multiple of {size} numbers")
-    return flat.reshape(S, size, -1)
-
-
-def _setting_lines(lens: ZoomLens) -> Iterator[str]:
-    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
-    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
-    yield "settings:"
-    yield from (f"  {line}" for line in table_lines(columns, long=False, indent=2))
 
 
 def _member_lines(lens: ZoomLens) -> Iterator[str]:
@@ -183,6 +153,9 @@ def _lens(block: Field) -> ZoomLens:
     width, height = block["image_width"].integer(), block["image_height"].integer()
     fit = block["fit"]
     Q = {"known": 0, "still": 6, "moving": 1}[camera]
+    coupling = block.read("target_coupling", lambda field: field.array(S, -1))
+    if coupling is not None and coupling.shape[1] % (L + Q):
+        block["target_coupling"].fail(f"rows of a multiple of {L + Q} numbers")
     return ZoomLens(
         controls=controls,
         settings=settings,
@@ -211,7 +184,7 @@ def _lens(block: Field) -> ZoomLens:
         unit=block["unit"].text(),
         warnings=tuple(block["warnings"].texts()),
         target=block.read("target", read_target),
-        target_coupling=block.read("target_coupling", lambda field: _coupling(field, S, L + Q)),
+        target_coupling=None if coupling is None else coupling.reshape(S, L + Q, -1),
     )
 
 

@@ -26,25 +26,7 @@ _MOST_BYTES = 500_000_000  # unpacked
 
 
 def read_variables(data: bytes, source: str) -> dict[str, Any]:
-    """Read the variables of a file.
-
-    Parameters
-    ----------
-    data : bytes
-    source : str
-        Name for messages.
-
-    Returns
-    -------
-    dict
-        Arrays of numbers, strings, lists for cells, dictionaries for structs. Objects of MATLAB's classes are
-        left out, because only MATLAB can read them.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged.
-    """
+    """Read arrays, strings, lists for cells and dicts for structs; objects of classes are left out."""
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise FormatError("is no .mat file of version 5 to 7; save it again with -v7", source)
@@ -104,7 +86,11 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
         raise ValueError("no shape")
     name = parts[2][1].decode("ascii")
     if kind == _CHAR:
-        return name, _text(parts[3], order) if len(parts) > 3 else ""
+        form, content = parts[3] if len(parts) > 3 else (1, b"")
+        encoding = _TEXT_TYPES[form]
+        if encoding == "utf-16":
+            encoding += "-le" if order == "<" else "-be"
+        return name, content.decode(encoding)
     if kind == _CELL:
         return name, [_matrix(content, order, depth - 1)[1] for _, content in parts[3 : 3 + count]]
     if kind == _STRUCT:
@@ -125,11 +111,3 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
 def _values(part: tuple[int, bytes], order: str) -> np.ndarray[Any, Any]:
     kind, content = part
     return np.frombuffer(content, dtype=np.dtype(order + _TYPES[kind]))
-
-
-def _text(part: tuple[int, bytes], order: str) -> str:
-    kind, content = part
-    encoding = _TEXT_TYPES[kind]
-    if encoding == "utf-16":
-        encoding += "-le" if order == "<" else "-be"
-    return content.decode(encoding)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.distances import Distance
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import value_failures
-from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, value_columns
+from neurocal_cli.io.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.io.text_columns import (
     LONGEST,
     column_lines,
@@ -30,7 +30,7 @@ from neurocal_cli.io.text_columns import (
     read_ranges,
 )
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, number, quoted
+from neurocal_cli.io.yaml_text import flow, indented, number, quoted
 from neurocal_cli.points import Correspondences
 
 _MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
@@ -50,7 +50,7 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     if len(points) == 0:
         yield "  rows: []"
     elif long:
-        yield from (f"  {line}" for line in _long_lines(points, np.hstack(blocks)))
+        yield from indented(_long_lines(points, np.hstack(blocks)))
     else:
         yield "  rows:"
         yield from _rows(points, np.hstack([points.world, *blocks]))
@@ -72,7 +72,7 @@ def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
     labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
     coordinates = {name: points.world[first, k] for k, name in enumerate(PLACE)}
     yield "places:  # each place of the target once; its columns"
-    yield from (f"  {line}" for line in column_lines({**labels, **coordinates}))
+    yield from indented(column_lines({**labels, **coordinates}))
     words = [number_words(column) for column in values.T]
     characters = sum(len(word) + 1 for column in words for word in column)
     packed = characters > _MOST_CHARACTERS
@@ -109,22 +109,7 @@ def read_observations(
     image_center: tuple[float, float] | None,
     none: bool,
 ) -> Correspondences:
-    """Read the block ``observations`` in either form.
-
-    Parameters
-    ----------
-    observations : Field
-    unit : str
-    image_size : (width, height) or None [px]
-    image_center : (u0, v0) or None [px]
-    none : bool
-        Whether the block may be empty.
-
-    Raises
-    ------
-    FormatError
-        The table does not have the written form.
-    """
+    """Read the block ``observations`` in either form; it may be empty if `none`."""
     if "places" in observations:
         columns, stands = _long_columns(observations), f"{observations.path}.views"
     else:

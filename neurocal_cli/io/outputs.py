@@ -47,13 +47,7 @@ class Outputs:
         self._inputs.add((status.st_dev, status.st_ino))
 
     def check(self, shown: str, former: os.stat_result | None) -> None:
-        """Refuse to overwrite an input.
-
-        Raises
-        ------
-        UsageError
-            The output is an input.
-        """
+        """Refuse to overwrite an input, with a UsageError."""
         if former is not None and (former.st_dev, former.st_ino) in self._inputs:
             raise UsageError(f"{shown} is an input and would be overwritten; give another output")
 
@@ -113,12 +107,8 @@ def held_back() -> Outputs | None:
 def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outputs]:
     """Hold back all outputs until the end of the block, and discard them if it fails.
 
-    A nested block is a part of the outer one.
-
-    Parameters
-    ----------
-    finishing : exception types
-        Exceptions that end the block successfully.
+    An exception of one of the types `finishing` ends the block successfully. A nested block is a part of the
+    outer one.
     """
     outer = _CURRENT.get()
     if outer is not None:
@@ -177,8 +167,7 @@ def remove_stale(folder: str) -> None:
         return
     _seen.add(folder)
     with suppress(OSError):
-        names = [name for name in os.listdir(folder or ".") if name.startswith(".neurocal-")]
-        for name in names:
+        for name in os.listdir(folder or "."):
             match = re.fullmatch(_NAME, name)
             if match and match[1] == _computer() and not _runs(int(match[2])):
                 with suppress(OSError):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration import Calibration, Rejected
@@ -18,35 +19,17 @@ from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from neurocal_cli.stereo.rig import Rig
 
 
 def write_result(
     result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:
-    """Write a calibration or a rig, whole or not at all; ``-`` is stdout.
+    """Write a calibration or a rig, whole or not at all.
 
-    Parameters
-    ----------
-    result : Calibration or Rig
-    path : str or Path
-        ``.json`` gives JSON, ``.xml`` gives XML; all other extensions give YAML.
-    lean : bool
-        Whether points, poses and the record of the network are left out.
-    alpha : float, optional
-        Of a rig's rectification, see `rectify`.
-
-    Returns
-    -------
-    losses : tuple of str
-        What the file cannot represent exactly, such as skew in XML.
-
-    Raises
-    ------
-    InputError
-        An XML file is wanted, but OpenCV does not have the camera's distortion model.
+    The extension ``.json`` gives JSON, ``.xml`` gives XML; all others give YAML. A `lean` file lacks points,
+    poses and the record of the network. `alpha` is that of a rig's rectification, see `rectify`. Returns what
+    the file cannot represent exactly, such as skew in XML.
     """
     if lean:
         result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
@@ -67,7 +50,11 @@ def write_result(
         text = format_rig(result, alpha, by_rows)
     else:
         text = format_calibration(result, by_rows)
-    write_whole(path, _as_json(text) if by_rows else text)
+    if by_rows:
+        from neurocal_cli.io.yaml_tree import parse_yaml
+
+        text = _lines(parse_yaml(text, "the calibration"), 3) + "\n"
+    write_whole(path, text)
     return ()
 
 
@@ -96,14 +83,8 @@ def lean_rig(rig: Rig) -> Rig:
     )
 
 
-def _as_json(text: str) -> str:
-    """Convert YAML text to JSON, with one entry of the upper levels per line."""
-    from neurocal_cli.io.yaml_tree import parse_yaml
-
-    return _lines(parse_yaml(text, "the calibration"), 3) + "\n"
-
-
 def _lines(value: Any, depth: int, indent: str = "") -> str:
+    """JSON with one entry of the upper levels per line."""
     inner = indent + "  "
     if depth and isinstance(value, dict) and value:
         parts = [f"{inner}{json.dumps(key)}: {_lines(part, depth - 1, inner)}" for key, part in value.items()]

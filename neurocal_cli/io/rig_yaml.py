@@ -7,6 +7,7 @@ of the rectified pair. ``stereo`` has the rest.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,34 +15,31 @@ import numpy as np
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
+from neurocal_cli.io.calibration_blocks import POSE_GROUPS, read_verdict, verdict_lines
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
-from neurocal_cli.io.optional_blocks import read_verdict, verdict_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import block, boolean, flow, list_lines, mapping, number, quoted, text, words
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
 FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
-_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 # E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
 _SAME = 1e-6
 
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
-    """Text of a rig file; the same rig gives the same text.
-
-    Parameters
-    ----------
-    rig : Rig
-    alpha : float, optional
-        Of the rectification, see `rectify`.
-    by_rows : bool
-        Whether even long tables have a row for each view and point.
-    """
-    return "\n".join([*HEADER, *_rig_lines(rig, rectify(rig, alpha), by_rows), ""])
+    """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
+    rectified = rectify(rig, alpha)
+    pairs: tuple[tuple[Array, Array] | None, ...] = (None, None)
+    if rectified is not None:
+        pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
+    cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
+    parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
+    lines = chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
+    return "\n".join([*HEADER, *lines, ""])
 
 
 def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
@@ -55,13 +53,7 @@ def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
 
 
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
-    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres.
-
-    Raises
-    ------
-    InputError
-        The unit is not a known length, or the images have no common known size.
-    """
+    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
     if rig.unit not in METRES:
         raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
     rectified = rectify(rig, alpha)
@@ -76,17 +68,6 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     return first, second
 
 
-def _rig_lines(rig: Rig, rectified: Rectification | None, by_rows: bool) -> Iterator[str]:
-    matrices: tuple[tuple[Array, Array] | None, ...] = (None, None)
-    if rectified is not None:
-        matrices = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
-    for name, camera, pair in zip(("left", "right"), (rig.left, rig.right), matrices, strict=True):
-        yield f"{name}:"
-        yield from (f"  {line}" for line in calibration_lines(camera, pair, by_rows))
-    yield "stereo:"
-    yield from (f"  {line}" for line in _stereo_lines(rig, rectified))
-
-
 def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
     yield f"format: {FORMAT}"
     yield f"unit: {text(rig.unit)}"
@@ -95,26 +76,26 @@ def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
     yield f"baseline: {number(rig.baseline)}"
     yield f"baseline_std: {number(rig.std['baseline'])}"
     values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
-    for group, members in _GROUPS:
+    for group, members in POSE_GROUPS:
         entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
         yield f"{group}: {mapping(**entries)}"
-    parameters = f"[{', '.join(POSE_NAMES)}]"
-    yield f"covariance: {mapping(names=parameters, data=flow(rig.covariance))}"
+    yield f"covariance: {mapping(names=words(POSE_NAMES), data=flow(rig.covariance))}"
     yield f"rmse_px: {number(rig.rmse_px)}"
     yield f"max_px: {number(rig.max_px)}"
-    yield f"converged: {str(bool(rig.converged)).lower()}"
+    yield f"converged: {boolean(rig.converged)}"
     yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
     yield f"iterations: {rig.iterations}"
     if rectified is not None:
-        yield "rectification:"
-        for key in ("R1", "R2", "P1", "P2", "Q"):
-            yield f"  {key}: {flow(getattr(rectified, key))}"
-    names = {pair: f"{quoted(pair[0])}, {quoted(pair[1])}" for pair in (*rig.pairs, *rig.left_out)}
-    yield from list_lines("pairs", [f"[{names[pair]}]" for pair in rig.pairs])
-    left_out = [f"[{names[pair]}, {quoted(reason)}]" for pair, reason in rig.left_out.items()]
-    yield from list_lines("left_out", left_out)
+        matrices = {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
+        yield from block("rectification", (f"{key}: {flow(matrix)}" for key, matrix in matrices.items()))
+    yield from list_lines("pairs", map(_quoted, rig.pairs))
+    yield from list_lines("left_out", (_quoted((*pair, reason)) for pair, reason in rig.left_out.items()))
     yield from list_lines("warnings", map(quoted, rig.warnings))
     yield from verdict_lines(rig.verdict)
+
+
+def _quoted(names: tuple[str, ...]) -> str:
+    return f"[{', '.join(map(quoted, names))}]"
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -130,7 +111,7 @@ def read_rig(path: str | Path) -> Rig:
 
 def rig_from_field(root: Field) -> Rig:
     """Read a rig; see `read_rig`."""
-    if not isinstance(root.value, dict) or "stereo" not in root:
+    if "stereo" not in root:
         if "neurocal" in root:
             root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
         root.refuse(
@@ -147,11 +128,12 @@ def rig_from_field(root: Field) -> Rig:
         pose = Pose(block["R"].array(3, 3), block["t"].array(3))
     except InputError as error:
         raise FormatError(f"stereo: {error}; correct it", root.source) from error
+    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
     rig = Rig(
         left,
         right,
         pose,
-        _std(block),
+        std | {"baseline": block["baseline_std"].number_or_nan()},
         block["covariance"]["data"].array(6, 6, unknown=True),
         tuple(_names(entry, 2) for entry in block["pairs"].items()),  # type: ignore[misc]
         {_names(entry, 3)[:2]: _names(entry, 3)[2] for entry in block["left_out"].items()},  # type: ignore[misc]
@@ -167,11 +149,6 @@ def rig_from_field(root: Field) -> Rig:
     return rig
 
 
-def _std(block: Field) -> dict[str, float]:
-    std = {name: block[group][name]["std"].number_or_nan() for group, names in _GROUPS for name in names}
-    return std | {"baseline": block["baseline_std"].number_or_nan()}
-
-
 def _names(entry: Field, count: int) -> tuple[str, ...]:
     names = tuple(entry.texts())
     if len(names) != count:
@@ -181,7 +158,7 @@ def _names(entry: Field, count: int) -> tuple[str, ...]:
 
 def _check_consistent(rig: Rig, block: Field) -> None:
     """Refuse a file with contradicting values, of which one was edited."""
-    values = [block[g][n]["value"].number() for g, names in _GROUPS for n in names]
+    values = [block[g][n]["value"].number() for g, names in POSE_GROUPS for n in names]
     stated = (
         ("E", block["E"].array(3, 3), rig.E),
         ("F", block["F"].array(3, 3), rig.F),

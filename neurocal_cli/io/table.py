@@ -13,12 +13,13 @@ import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.errors import FormatError
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import decode, one_line, read_blocks, read_bytes
@@ -33,9 +34,6 @@ from neurocal_cli.io.table_header import (
     split_fields,
 )
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 _BLOCK = 1 << 22  # bytes of a stream read at a time, some ten thousand rows
 # Printable ASCII without quotes, with tabs and line ends: characters that both readers treat alike.
 _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
@@ -43,28 +41,14 @@ _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
 
 @frozen_dataclass(eq=False)
 class Table:
-    """Columns of one file, or of a part of it.
+    """Columns of one file, or of a part of it."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the file for messages.
-    numbers : dict of (N,) arrays by column name
-    labels : dict of (N,) str arrays by column name
-    lines : (N,) int array
-        Line number of each row.
-    metadata : Metadata
-        From the lines that begin with ``#``.
-    unknown : tuple of str
-        Names of ignored columns.
-    """
-
-    source: str
-    numbers: dict[str, Array]
-    labels: dict[str, NDArray[Any]]
-    lines: NDArray[np.int64]
-    metadata: Metadata
-    unknown: tuple[str, ...]
+    source: str  # name of the file, for messages
+    numbers: dict[str, Array]  # (N,) arrays by column name
+    labels: dict[str, NDArray[Any]]  # (N,) arrays of str
+    lines: NDArray[np.int64]  # line number of each row
+    metadata: Metadata  # from the lines that begin with #
+    unknown: tuple[str, ...]  # names of ignored columns
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -79,27 +63,14 @@ class Table:
 
     def note_unknown(self, notes: list[str]) -> None:
         """Append remarks that name the ignored columns and misspelt metadata."""
-        notes += self.metadata.misspelt
+        notes += [f"{self.source}:{remark}" for remark in self.metadata.misspelt]
         if self.unknown:
             names = ", ".join(repr(name[:40]) for name in self.unknown)
             notes.append(f"{self.source}: column{'s' * (len(self.unknown) > 1)} not used: {names}")
 
 
 def read_table(path: str | Path, schema: Schema) -> Table:
-    """Read one file.
-
-    Parameters
-    ----------
-    path : str or Path
-        ``-`` is stdin.
-    schema : Schema
-        Known columns.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or a line of it is wrong; the message names the line.
-    """
+    """Read one file."""
     return parse_table(*read_bytes(path), schema)
 
 
@@ -116,18 +87,8 @@ def parse_table(data: bytes, source: str, schema: Schema) -> Table:
 def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Iterator[Table]:
     """Read a file that need not fit into memory, as tables with some of its rows each; see `read_table`.
 
-    Parameters
-    ----------
-    path : str or Path
-        ``-`` is stdin.
-    schema : Schema
-    block : int
-        Bytes to read at a time; the lines above the header must fit into them.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, or a line of it is wrong; earlier blocks have been yielded by then.
+    It reads `block` bytes at a time, into which the lines above the header must fit. Before an error in a
+    line, earlier blocks have been yielded.
     """
     source = "<stdin>" if str(path) == "-" else one_line(path)
     layout, rows = None, False
@@ -164,17 +125,7 @@ def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Tabl
 
 
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:
-    r"""Read the rows below a header by NumPy; None if NumPy may read them wrongly.
-
-    Parameters
-    ----------
-    data : bytes
-        The whole file, ``\n`` line ends.
-    source : str
-        Name for messages.
-    schema : Schema
-    layout : Layout
-    """
+    """Read the rows below a header by NumPy; None if NumPy may read them wrongly."""
     if not _is_plain(data, schema, layout):
         return None
     n_lines = data.count(b"\n", layout.offset) + (not data.endswith(b"\n"))
@@ -228,69 +179,59 @@ def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
 
 
 def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) -> Table:
-    """Read the rows below a header, in any form that the format allows; see `read_in_bulk`.
-
-    Raises
-    ------
-    FormatError
-        A line is wrong; the message names the first one.
-    """
+    """Read the rows below a header, in any form that the format allows; errors name the first wrong line."""
     places = [(name, k) for k, name in enumerate(layout.names) if name in schema.known]
     columns: dict[str, list[Any]] = {name: [] for name, _ in places}
     lines: list[int] = []
-    for number, fields in _rows(data, source, layout):
-        for name, k in places:
-            value = _label if name in schema.labels else _number
-            columns[name].append(value(fields[k], name, source, number))
-        lines.append(number)
+    text = data[layout.offset :].decode("utf-8")
+    number = layout.line
+    try:
+        for number, line in enumerate(text.split("\n"), start=layout.line + 1):
+            if fields := _fields(line, number, layout):
+                for name, k in places:
+                    value = _label if name in schema.labels else _number
+                    columns[name].append(value(fields[k], name))
+                lines.append(number)
+    except InputError as error:
+        raise FormatError(str(error), source, number) from error
     labels = {name: np.array(columns.pop(name), dtype=np.str_) for name in schema.labels & columns.keys()}
     numbers = {name: np.array(column, dtype=float) for name, column in columns.items()}
-    line = np.array(lines, dtype=np.int64)
-    return Table(source, numbers, labels, line, layout.metadata, layout.unknown(schema))
+    rows = np.array(lines, dtype=np.int64)
+    return Table(source, numbers, labels, rows, layout.metadata, layout.unknown(schema))
 
 
-def _rows(data: bytes, source: str, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """Iterate over line number and fields of each row; metadata lines among them are read."""
-    expected = len(layout.names)
-    text = data[layout.offset :].decode("utf-8")
-    for number, line in enumerate(text.split("\n"), start=layout.line + 1):
-        line = line.strip(" \t") if layout.separator != "\t" else line.strip(" ")
-        if not line.strip("\t"):
-            continue
-        if line.startswith("#"):
-            layout.metadata.take(line, source, number)
-            continue
-        fields = split_fields(line, layout.separator, source, number)
-        if len(fields) != expected:
-            advice = decimal_commas(len(fields), expected, layout.separator) or "complete or remove the row"
-            raise FormatError(
-                f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
-                f"{advice}",
-                source,
-                number,
-            )
-        yield number, fields
+def _fields(line: str, number: int, layout: Layout) -> list[str]:
+    """Fields of a row; none of a blank line, or of metadata, which are read."""
+    line = line.strip(" \t") if layout.separator != "\t" else line.strip(" ")
+    if not line.strip("\t"):
+        return []
+    if line.startswith("#"):
+        layout.metadata.take(line, number)
+        return []
+    fields, expected = split_fields(line, layout.separator), len(layout.names)
+    if len(fields) != expected:
+        advice = decimal_commas(len(fields), expected, layout.separator) or "complete or remove the row"
+        raise InputError(
+            f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
+            f"{advice}"
+        )
+    return fields
 
 
-def _label(text: str, name: str, source: str, line: int) -> str:
+def _label(text: str, name: str) -> str:
     if not text:
-        raise FormatError(f"{name} is empty; fill it in or leave the column out", source, line)
+        raise InputError(f"{name} is empty; fill it in or leave the column out")
     return text
 
 
-def _number(text: str, name: str, source: str, line: int) -> float:
-    if is_number(text):
-        value = float(text)
-        if math.isfinite(value):
-            return value
-    raise FormatError(_complaint(text, name), source, line)
-
-
-def _complaint(text: str, name: str) -> str:
+def _number(text: str, name: str) -> float:
+    if is_number(text) and math.isfinite(value := float(text)):
+        return value
     if not text:
-        return f"{name} is empty; fill it in or remove the row"
+        raise InputError(f"{name} is empty; fill it in or remove the row")
     if is_decimal_comma(text):
-        return f"{name} is {text[:40]!r}, with a decimal comma; write {text[:40].replace(',', '.')}"
+        point = text[:40].replace(",", ".")
+        raise InputError(f"{name} is {text[:40]!r}, with a decimal comma; write {point}")
     if is_number(text) or text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
-        return f"{name} is {text[:40]}, but must be a finite number; correct or remove the row"
-    return f"{name} is {text[:40]!r}, not a number; correct or remove the row"
+        raise InputError(f"{name} is {text[:40]}, but must be a finite number; correct or remove the row")
+    raise InputError(f"{name} is {text[:40]!r}, not a number; correct or remove the row")

@@ -13,7 +13,7 @@ from typing import Any
 from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.io.files import one_line
+from neurocal_cli.io.files import one_line, value_failures
 
 # Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
@@ -30,27 +30,14 @@ _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 @frozen_dataclass
 class Schema:
-    """Columns of a kind of table.
+    """Columns of a kind of table."""
 
-    Attributes
-    ----------
-    kind : str
-        Name of the rows, in the plural.
-    required, optional : tuple of str
-    labels : frozenset of str
-        The columns that contain text; all others contain numbers.
-    instead : str
-        Advice for files of another kind, for messages.
-    headerless : tuple of str
-        Columns of a file without a header; if empty, the header is required.
-    """
-
-    kind: str
+    kind: str  # name of the rows, in the plural
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
-    labels: frozenset[str] = frozenset()
-    headerless: tuple[str, ...] = ()
-    instead: str = ""
+    labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
+    headerless: tuple[str, ...] = ()  # columns of a file without a header; if empty, the header is required
+    instead: str = ""  # advice for files of another kind
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -60,41 +47,29 @@ class Schema:
 
 @dataclass
 class Metadata:
-    """Metadata from the ``#`` lines of a file, collected line by line.
+    """Metadata from the ``#`` lines of a file, collected line by line."""
 
-    Attributes
-    ----------
-    image_size : (width, height), optional [px]
-    image_center : (u0, v0), optional [px]
-    unit : str, optional
-    distances : tuple of Distance, optional
-    misspelt : list of str
-        Remarks about lines that are nearly metadata.
-    """
-
-    image_size: tuple[int, int] | None = None
-    image_center: tuple[float, float] | None = None
+    image_size: tuple[int, int] | None = None  # px
+    image_center: tuple[float, float] | None = None  # px
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
-    misspelt: list[str] = field(default_factory=list)
+    misspelt: list[str] = field(default_factory=list)  # numbers of lines that are nearly metadata, and hints
 
-    def take(self, line: str, source: str, number: int) -> None:
+    def take(self, line: str, number: int) -> None:
         """Read a ``# key: value`` line; other comments are ignored."""
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
-            key = _meant(line)
-            if key:
-                self.misspelt.append(
-                    f"{source}:{number}: {line[:40]!r} is not used; for {key}, write {_VALUES[key][1]}"
-                )
+            if key := _meant(line):
+                hint = f"{line[:40]!r} is not used; for {key}, write {_VALUES[key][1]}"
+                self.misspelt.append(f"{number}: {hint}")
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
         read, hint = _VALUES[key]
         value = read(text)
         if value is None:
-            raise FormatError(f"{key} is {text[:40]!r}; write {hint}", source, number)
+            raise InputError(f"{key} is {text[:40]!r}; write {hint}")
         if getattr(self, key) not in (None, value):
-            raise FormatError(f"{key} is given twice and differs; keep one", source, number)
+            raise InputError(f"{key} is given twice and differs; keep one")
         setattr(self, key, value)
 
 
@@ -140,26 +115,12 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
 
 @frozen_dataclass
 class Layout:
-    """Position of a table's rows, and how to split them.
+    """Position of a table's rows, and how to split them."""
 
-    Attributes
-    ----------
-    separator : str or None
-        None for blanks.
-    names : tuple of str
-        Names of the columns, in the file's order.
-    offset : int
-        Offset of the first byte below the header.
-    line : int
-        Number of the last line above that byte.
-    metadata : Metadata
-        From the lines above.
-    """
-
-    separator: str | None
-    names: tuple[str, ...]
-    offset: int
-    line: int
+    separator: str | None  # None for blanks
+    names: tuple[str, ...]  # of the columns, in the file's order
+    offset: int  # of the first byte below the header
+    line: int  # number of the last line above that byte
     metadata: Metadata = field(default_factory=Metadata)
 
     def unknown(self, schema: Schema) -> tuple[str, ...]:
@@ -168,52 +129,36 @@ class Layout:
 
 
 def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
-    r"""Read the metadata and the header at the top of a file.
-
-    Parameters
-    ----------
-    data : bytes
-        UTF-8 with ``\\n`` line ends.
-
-    Raises
-    ------
-    FormatError
-        The file is empty, a column is missing or appears twice, or metadata are malformed.
-    """
+    """Read the metadata and the header at the top of a file."""
     metadata = Metadata()
     comments: list[str] = []
     for number, start, end, line in _lines(data):
-        if line.startswith("#"):
-            metadata.take(line, source, number)
-            comments.append(line)
-        elif line:
-            separator = _find_separator(line)
-            fields = split_fields(line, separator, source, number)
-            if all(is_number(text) for text in fields):
-                names = _headerless_names(fields, separator, comments, source, number, schema)
-                return Layout(separator, names, start, number - 1, metadata)
-            for text in fields:
-                if is_decimal_comma(text):
-                    problem = f"{text[:40]!r} has a decimal comma; write {text[:40].replace(',', '.')}"
-                    raise FormatError(problem, source, number)
-            _check_names(fields, source, number, schema)
-            return Layout(separator, tuple(fields), end, number, metadata)
+        with value_failures(source, line=number):
+            if line.startswith("#"):
+                metadata.take(line, number)
+                comments.append(line)
+            elif line:
+                separator = _find_separator(line)
+                fields = split_fields(line, separator)
+                if all(is_number(text) for text in fields):
+                    names = _headerless_names(fields, separator, comments, schema)
+                    return Layout(separator, names, start, number - 1, metadata)
+                for text in filter(is_decimal_comma, fields):
+                    point = text[:40].replace(",", ".")
+                    raise InputError(f"{text[:40]!r} has a decimal comma; write {point}")
+                _check_names(fields, schema)
+                return Layout(separator, tuple(fields), end, number, metadata)
     raise FormatError(
         f"is empty: there are no {schema.kind}; give a header {','.join(schema.required)} and rows", source
     )
 
 
-def split_fields(line: str, separator: str | None, source: str, number: int) -> list[str]:
+def split_fields(line: str, separator: str | None) -> list[str]:
     """Split a line at its separators, outside quotes.
 
     Blanks around a field are dropped unless they are inside quotes; ``""`` in quotes is a quote. The csv
     module is not used, because it would continue an unclosed quote in the next line, and keep blanks after a
     quote.
-
-    Raises
-    ------
-    FormatError
-        A quote is not closed.
     """
     line = line.strip(" \t") if separator != "\t" else line.strip(" ")
     if '"' not in line:
@@ -228,7 +173,7 @@ def split_fields(line: str, separator: str | None, source: str, number: int) -> 
     while True:
         match = token.match(line, position)
         if match is None or (match[2] or "").startswith('"'):
-            raise FormatError('a quote (") is not closed; close it', source, number)
+            raise InputError('a quote (") is not closed; close it')
         fields.append(match[2].strip(" \t") if match[1] is None else match[1].replace('""', '"'))
         if match[3] is None:
             return fields
@@ -269,43 +214,34 @@ def decimal_commas(found: int, expected: int, separator: str | None) -> str:
 
 
 def _headerless_names(
-    fields: list[str], separator: str | None, comments: list[str], source: str, number: int, schema: Schema
+    fields: list[str], separator: str | None, comments: list[str], schema: Schema
 ) -> tuple[str, ...]:
     expected = schema.headerless
     if not expected:
-        raise FormatError(f"the header is missing; begin with {','.join(schema.required)}", source, number)
+        raise InputError(f"the header is missing; begin with {','.join(schema.required)}")
     if len(fields) != len(expected):
-        advice = (
-            decimal_commas(len(fields), len(expected), separator) or "add a header that names the columns"
-        )
-        raise FormatError(
+        points = decimal_commas(len(fields), len(expected), separator)
+        raise InputError(
             f"there is no header, so {len(expected)} columns {','.join(expected)} are expected, found "
-            f"{len(fields)}; {advice}",
-            source,
-            number,
+            f"{len(fields)}; {points or 'add a header that names the columns'}"
         )
     for comment in comments:  # numpy.savetxt writes its header as a comment
         words = re.split(r"[\s,;]+", comment.strip("# \t"))
         if sorted(words) == sorted(expected) and words != list(expected):
-            raise FormatError(f"the header {','.join(words)} is a comment; remove its #", source, number)
+            raise InputError(f"the header {','.join(words)} is a comment; remove its #")
     return expected
 
 
-def _check_names(names: list[str], source: str, number: int, schema: Schema) -> None:
+def _check_names(names: list[str], schema: Schema) -> None:
     numbers = [text for text in names if is_number(text)]
     if len(numbers) >= len(schema.required) > 0 and set(names).isdisjoint(schema.required):
-        line = one_line(",".join(names))[:60]
-        raise FormatError(
-            f"there is no header, but {line!r}; add one that names the columns {','.join(schema.required)} "
-            f"and all others{schema.instead}",
-            source,
-            number,
+        raise InputError(
+            f"there is no header, but {one_line(','.join(names))[:60]!r}; add one that names the columns "
+            f"{','.join(schema.required)} and all others{schema.instead}"
         )
     for name, count in Counter(names).items():
         if name and count > 1:
-            raise FormatError(
-                f"the column {one_line(name[:40])} appears twice; rename or remove one", source, number
-            )
+            raise InputError(f"the column {one_line(name[:40])} appears twice; rename or remove one")
     missing = [name for name in schema.required if name not in names]
     if not missing:
         return
@@ -317,10 +253,7 @@ def _check_names(names: list[str], source: str, number: int, schema: Schema) -> 
         hint += f", and name the column{'s' * (len(others) > 1)} {','.join(others)}"
     if len(missing) == len(schema.required) and not similar:
         hint += schema.instead
-    found = ",".join(names)
-    raise FormatError(
+    raise InputError(
         f"column{'s' * (len(missing) > 1)} {', '.join(missing)} missing from the header "
-        f"{found[:60]!r}; {hint}",
-        source,
-        number,
+        f"{','.join(names)[:60]!r}; {hint}"
     )

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flows, quoted, text
+from neurocal_cli.io.yaml_text import block, flows, indented, quoted, text
 
 LONGEST = 160  # numbers in a text, each with at most 24 characters
 
@@ -54,8 +54,7 @@ def table_lines(
 ) -> Iterator[str]:
     """Lines of a table: ``columns`` and ``rows``, or only ``columns`` if it is long."""
     if long:
-        yield "columns:"
-        yield from (f"  {line}" for line in column_lines(columns))
+        yield from block("columns", column_lines(columns))
         return
     cells = [
         number_words(values) if isinstance(values, np.ndarray) else map(quoted, values)
@@ -63,17 +62,11 @@ def table_lines(
     ]
     yield f"columns: [{', '.join(columns)}]"
     yield "rows:"
-    yield from (f"{' ' * indent}- [{', '.join(row)}]" for row in zip(*cells, strict=True))
+    yield from indented((f"- [{', '.join(row)}]" for row in zip(*cells, strict=True)), indent)
 
 
 def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
-    """Read either form of a table as columns, each a list of values.
-
-    Raises
-    ------
-    FormatError
-        Rows or columns have different lengths.
-    """
+    """Read either form of a table as columns, each a list of values."""
     if isinstance(field["columns"].value, dict):
         table = read_columns(field["columns"], labels)
     else:
@@ -88,13 +81,7 @@ def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
 
 
 def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
-    """Read a table back: numbers (None for null), and text in the columns called `labels`.
-
-    Raises
-    ------
-    FormatError
-        A value is not a column, or columns have different lengths.
-    """
+    """Read a table back: numbers (None for null), and text in the columns called `labels`."""
     columns: dict[str, list[Any]] = {
         name: column.texts() if name in labels else read_numbers(list(column.items()))
         for name, column in field.entries().items()
@@ -115,13 +102,7 @@ def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:
-    """Read the numbers of texts, None for null; they may be infinite.
-
-    Raises
-    ------
-    FormatError
-        A text contains anything but numbers.
-    """
+    """Read the numbers of texts, None for null; they may be infinite."""
     for entry in texts:
         if not _NUMBERS(entry.text()):
             entry.fail("numbers with commas between them")
@@ -138,13 +119,7 @@ def packed_text(values: NDArray[Any]) -> str:
 
 
 def read_packed(entry: Field) -> list[float]:
-    """Read the numbers of `packed_text`; they may be infinite.
-
-    Raises
-    ------
-    FormatError
-        The text has other characters, or too few.
-    """
+    """Read the numbers of `packed_text`; they may be infinite."""
     codes = np.frombuffer(entry.text().encode("utf-32-le", "surrogatepass"), dtype="<u4")
     if len(codes) % 4 or np.any(codes >> 16 != _PRIVATE >> 16):
         entry.fail("packed numbers, four characters from U+F0000 on for each")
@@ -160,13 +135,7 @@ def join_ranges(numbers: NDArray[np.int64]) -> str:
 
 
 def read_ranges(field: Field, below: int) -> list[int]:
-    """Read ranges back.
-
-    Raises
-    ------
-    FormatError
-        The text has another form, or a number is not below the limit.
-    """
+    """Read ranges of whole numbers below a limit back."""
     text = field.text()
     if not _RANGES(text):
         field.fail("whole numbers and ranges such as 0-92")
@@ -180,35 +149,19 @@ def read_ranges(field: Field, below: int) -> list[int]:
 
 
 def named_lines(key: str, names: Iterable[str], values: Iterable[str]) -> Iterator[str]:
-    """Lines of a key whose value has an entry for each name.
-
-    Parameters
-    ----------
-    key : str
-    names : iterable of str
-    values : iterable of str
-        As YAML flow text.
-    """
+    """Lines of a key whose value has an entry for each name; `values` are YAML flow texts."""
     names = list(names)
     pairs = zip(names, values, strict=True)
     if not names:
         yield f"{key}: {{}}"
     elif all(_KEY(name) and text(name) == name for name in names):
-        yield f"{key}:"
-        yield from (f"  {name}: {value}" for name, value in pairs)
+        yield from block(key, (f"{name}: {value}" for name, value in pairs))
     else:
-        yield f"{key}:"
-        yield from (f"  - [{quoted(name)}, {value}]" for name, value in pairs)
+        yield from block(key, (f"- [{quoted(name)}, {value}]" for name, value in pairs))
 
 
 def read_named(field: Field) -> dict[str, Field]:
-    """Read either form back.
-
-    Raises
-    ------
-    FormatError
-        The value has neither form, or a name appears twice.
-    """
+    """Read either form back; no name may appear twice."""
     if isinstance(field.value, dict):
         return field.entries()
     found: dict[str, Field] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -19,17 +19,7 @@ _NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 
 class Field:
-    """A value in a tree, with its path.
-
-    Parameters
-    ----------
-    value : object
-        As returned by `yaml_tree.parse_yaml` or a JSON parser.
-    source : str
-        Name of the file.
-    path : str
-        Keys from the root, separated by dots.
-    """
+    """A value in a tree of a file, with its path: the keys from the root, separated by dots."""
 
     __slots__ = ("path", "source", "value")
 
@@ -64,6 +54,10 @@ class Field:
             self.fail("a mapping (key: value)")
         found = self.value.get(key)
         return Field(default if found is None else found, self.source, self._below(key))
+
+    def first(self, keys: Iterable[str]) -> Field | None:
+        """Value of the first of these keys that is there and not null; None without any."""
+        return next((self[key] for key in keys if key in self), None)
 
     def read(self, key: str, reader: Callable[[Field], T]) -> T | None:
         """Apply a function to the value of a key; None if the key is missing or null."""
@@ -129,14 +123,7 @@ class Field:
         return self.value
 
     def array(self, *shape: int, unknown: bool = False) -> Array:
-        """Value as an array, from nested lists of finite numbers; -1 in the shape allows any length.
-
-        Parameters
-        ----------
-        *shape : int
-        unknown : bool
-            Whether null is allowed for unknown numbers; it becomes NaN.
-        """
+        """Value as an array of finite numbers; -1 in the shape is any length, and null NaN if `unknown`."""
         words = " x ".join("n" if s < 0 else str(s) for s in shape)
         expected = f"{words} finite numbers{' or null' * unknown}"
         try:

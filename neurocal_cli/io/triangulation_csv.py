@@ -32,13 +32,7 @@ _ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%s"])
 
 @frozen_dataclass(eq=False)
 class Matches:
-    """Some rows of a file.
-
-    Attributes
-    ----------
-    left, right : (N, 2) arrays [px]
-    point : (N,) str array or None
-    """
+    """Some rows of a file: pixels (N, 2) in the left and the right image, and (N,) names of the points."""
 
     left: Array
     right: Array
@@ -49,19 +43,7 @@ class Matches:
 
 
 def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[Matches]:
-    """Read matches in batches of some ten thousand; ``-`` is stdin.
-
-    Parameters
-    ----------
-    path : str or Path
-    notes : list of str, optional
-        Remarks about ignored columns are appended with the first batch.
-
-    Raises
-    ------
-    FormatError, InputError
-        The file cannot be read, or a line of it is wrong; the message names the line.
-    """
+    """Read matches in batches of some ten thousand; remarks of the first are appended to `notes`."""
     for k, table in enumerate(stream_table(path, MATCHES)):
         if k == 0 and notes is not None:
             table.note_unknown(notes)
@@ -79,18 +61,10 @@ def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[M
 def format_space_points(
     batches: Iterable[tuple[Triangulated, NDArray[Any] | None]], *, unit: str, sigma: float, limit: float
 ) -> Iterator[str]:
-    """Text of a file, one part per batch; the first part includes the header.
+    """Text of a file, one part per batch of optimally triangulated points and their labels.
 
-    Parameters
-    ----------
-    batches : iterable of (Triangulated, labels or None)
-        Triangulated by the optimal method.
-    unit : str
-        Of the points.
-    sigma : float [px]
-        Standard deviation of the pixels; scales the covariances.
-    limit : float [px]
-        Epipolar error beyond which a point is flagged.
+    The first part includes the header. `sigma` [px], the standard deviation of the pixels, scales the
+    covariances. Points whose epipolar error is beyond `limit` [px] are flagged.
     """
     header = [
         "# frame: left camera; X right, Y down, Z forward, the centre of its lens at 0",
@@ -102,16 +76,12 @@ def format_space_points(
         if k == 0:
             names = COLUMNS if labels is None else ("point", *COLUMNS)
             yield "\n".join([*header, ",".join(names), ""])
-        yield _rows(found, labels, sigma, limit)
-
-
-def _rows(found: Triangulated, labels: NDArray[Any] | None, sigma: float, limit: float) -> str:
-    assert found.covariance is not None
-    numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
-    numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
-    flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
-    columns: list[list[Any]] = [*numbers.T.tolist(), flags]
-    row = _ROW
-    if labels is not None:
-        columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
-    return "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
+        assert found.covariance is not None
+        numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
+        numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
+        flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
+        columns: list[list[Any]] = [*numbers.T.tolist(), flags]
+        row = _ROW
+        if labels is not None:
+            columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
+        yield "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"

@@ -29,13 +29,7 @@ def is_video(path: str) -> bool:
 
 
 def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
-    """Iterate over the frames of a video as grey images.
-
-    Raises
-    ------
-    FormatError
-        OpenCV cannot decode the video.
-    """
+    """Iterate over the frames of a video as grey images."""
     with captured_stderr():
         capture = cv2.VideoCapture(path)
     count = 0

@@ -11,38 +11,30 @@ import stat
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
 from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_name
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
 STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
+_FAILURES = {
+    IsADirectoryError: "is a folder; give the name of a file",
+    FileNotFoundError: "its folder does not exist; create it first",
+    PermissionError: "may not be written; change the permissions of it or its folder",
+}
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write a whole file or, on any failure, nothing.
+    """Write a whole file or, on any failure, nothing; text is written as UTF-8.
 
     The content is written to a temporary file in the same folder, which then replaces the file. An existing
     file keeps its permissions. A symbolic link is kept, and its target is replaced. Pipes and devices are
-    written directly; ``-`` is stdout. While a command holds its outputs back (`outputs.all_or_none`), the
-    file is replaced at the end of the command.
-
-    Parameters
-    ----------
-    path : str or Path
-    content : str or bytes
-        Text is written as UTF-8.
-
-    Raises
-    ------
-    NeurocalError
-        The file cannot be written. If the reader closes a pipe, the BrokenPipeError is passed on, because
-        commands then end quietly.
+    written directly. While a command holds its outputs back (`outputs.all_or_none`), the file is replaced at
+    the end of the command. If the reader closes a pipe, the BrokenPipeError is passed on, because commands
+    then end quietly.
     """
     data, outputs = _encode(content), held_back()
     if outputs is not None and str(path) in STDOUT_NAMES:
@@ -79,15 +71,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
 
 
 def make_folder(folder: str) -> None:
-    """Make a folder for outputs, and the folders that it is in; it may exist.
-
-    While a command holds its outputs back, new folders are removed again if it fails.
-
-    Raises
-    ------
-    NeurocalError
-        It cannot be made.
-    """
+    """Make a folder for outputs and those that it is in, unless they exist; see `Outputs.make_folder`."""
     try:
         (held_back() or Outputs()).make_folder(folder)
     except (OSError, ValueError) as error:
@@ -97,19 +81,10 @@ def make_folder(folder: str) -> None:
 
 
 def check_places(*paths: str | None) -> None:
-    """Refuse outputs that cannot be written, before any work is done.
+    """Refuse outputs that cannot be written, before any work is done; None is left out.
 
-    Parameters
-    ----------
-    paths : str or None
-        None is left out.
-
-    Raises
-    ------
-    UsageError
-        An output is an input of the command (`Outputs.protect`), or two outputs are the same file or stdout.
-    NeurocalError
-        A folder does not exist or may not be written to.
+    A UsageError says that an output is an input of the command (`Outputs.protect`), or that two outputs are
+    the same file or stdout.
     """
     outputs, taken = held_back(), set[str]()
     for path in paths:
@@ -150,7 +125,9 @@ def _writing_failures(path: str | Path) -> Iterator[None]:
     except (BrokenPipeError, NeurocalError):
         raise
     except (OSError, ValueError) as error:
-        raise NeurocalError(f"{one_line(path)}: {_write_failure(error)}") from error
+        other = f"cannot be written ({reason(error)}); give another place"
+        said = next((text for kind, text in _FAILURES.items() if isinstance(error, kind)), other)
+        raise NeurocalError(f"{one_line(path)}: {said}") from error
 
 
 def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
@@ -218,27 +195,12 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
             file.flush()
             os.fsync(file.fileno())
         if former is not None:
-            _take_over(temporary, former)
+            if hasattr(os, "chown"):
+                with suppress(OSError):  # only root may give files away
+                    os.chown(temporary, former.st_uid, former.st_gid)
+            os.chmod(temporary, stat.S_IMODE(former.st_mode))
     except BaseException:  # includes interrupts
         with suppress(OSError):
             os.unlink(temporary)
         raise
     return temporary
-
-
-def _take_over(temporary: str, former: os.stat_result) -> None:
-    """Copy permissions and, if allowed, owner of the file that is to be replaced."""
-    if hasattr(os, "chown"):
-        with suppress(OSError):
-            os.chown(temporary, former.st_uid, former.st_gid)
-    os.chmod(temporary, stat.S_IMODE(former.st_mode))
-
-
-def _write_failure(error: Exception) -> str:
-    if isinstance(error, IsADirectoryError):
-        return "is a folder; give the name of a file"
-    if isinstance(error, FileNotFoundError):
-        return "its folder does not exist; create it first"
-    if isinstance(error, PermissionError):
-        return "may not be written; change the permissions of it or its folder"
-    return f"cannot be written ({reason(error)}); give another place"

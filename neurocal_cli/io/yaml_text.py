@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -34,14 +34,18 @@ def number(value: float) -> str:
     return _with_point(repr(value))
 
 
+def nested(array: Array) -> Any:
+    """Nested lists of an array's numbers; None for those that are not finite."""
+    if np.isfinite(array).all():
+        return array.tolist()
+    entries = array.astype(object)
+    entries[~np.isfinite(array)] = None
+    return entries.tolist()
+
+
 def flow(values: Array) -> str:
     """Write an array as nested flow sequences on one line, ``[[1.0, 2.0], [3.0, 4.0]]``."""
-    array = np.asarray(values, dtype=float)
-    entries: Any = array
-    if not np.isfinite(array).all():
-        entries = array.astype(object)
-        entries[~np.isfinite(array)] = None
-    return _with_point(json.dumps(entries.tolist()))
+    return _with_point(json.dumps(nested(np.asarray(values, dtype=float))))
 
 
 def flows(stack: Array) -> list[str]:
@@ -57,6 +61,27 @@ def list_lines(key: str, entries: Iterable[str]) -> list[str]:
     return [f"{key}:", *lines] if lines else [f"{key}: []"]
 
 
+def indented(lines: Iterable[str], by: int = 2) -> Iterator[str]:
+    """Lines with some blanks before each."""
+    return (f"{' ' * by}{line}" for line in lines)
+
+
+def block(key: str, lines: Iterable[str]) -> Iterator[str]:
+    """Lines of a key whose value are these lines."""
+    yield f"{key}:"
+    yield from indented(lines)
+
+
+def boolean(value: bool) -> str:
+    """Write true or false."""
+    return "true" if value else "false"
+
+
+def words(names: Iterable[str]) -> str:
+    """Write names as a flow sequence, each like `text`."""
+    return f"[{', '.join(map(text, names))}]"
+
+
 def mapping(**entries: str) -> str:
     """Write entries, already as text, as a flow mapping ``{a: 1, b: 2}``."""
     return "{" + ", ".join(f"{key}: {value}" for key, value in entries.items()) + "}"
@@ -70,23 +95,13 @@ def text(value: str) -> str:
 
 
 def quoted(value: str) -> str:
-    """Write text in double quotes, on one line, valid as YAML and as JSON.
-
-    Raises
-    ------
-    InputError
-        The text contains half of a surrogate pair, which UTF-8 cannot encode.
-    """
+    """Write text in double quotes, on one line, valid as YAML and JSON; InputError if UTF-8 cannot."""
     quoted = _encode(value)
     if quoted.isascii() and "\x7f" not in quoted:
         return quoted
     if re.search(_SURROGATE, value):
         raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
-    return re.sub(_UNSAFE, _escaped, quoted)
-
-
-def _escaped(match: re.Match[str]) -> str:
-    return f"\\u{ord(match[0]):04x}"
+    return re.sub(_UNSAFE, lambda match: f"\\u{ord(match[0]):04x}", quoted)
 
 
 def _with_point(numbers: str) -> str:

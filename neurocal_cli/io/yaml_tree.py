@@ -22,6 +22,7 @@ import yaml
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.files import read_text
+from neurocal_cli.io.tree_fields import Field
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
@@ -49,26 +50,14 @@ _LABELS = frozenset(("view", "point"))
 _CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
-def read_yaml(path: str | Path) -> tuple[Any, str]:
-    """Read a YAML file as a tree, and its name for messages; see `parse_yaml`."""
+def read_yaml(path: str | Path) -> Field:
+    """Read a YAML file as a tree; see `parse_yaml`."""
     text, source = read_text(path, "a YAML file")
-    return parse_yaml(text, source), source
+    return Field(parse_yaml(text, source), source)
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None.
-
-    Parameters
-    ----------
-    text : str
-    source : str
-        Name for messages.
-
-    Raises
-    ------
-    FormatError
-        The text is not YAML, or has aliases, duplicate keys or more than one document.
-    """
+    """Parse YAML text to dicts with text keys, lists, str, int, float, bool and None; without aliases."""
     if source == "<stdin>" and not text.strip():
         raise FormatError("is empty; check the command before it", source)
     text = text.replace("\r\n", "\n")
@@ -122,7 +111,9 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
         if kind is yaml.ScalarEvent:
             value: Any = event.value
             if type(containers[-1]) is dict and keys[-1] is None:
-                keys[-1] = _new_key(value, containers[-1], event, source)
+                if value in containers[-1]:
+                    _fail(f"the key {value[:60]!r} appears twice; remove one", event, source)
+                keys[-1] = value
                 continue
             if not event.style:
                 value = value if str(event.tag).endswith(":str") else plain_value(value)
@@ -162,12 +153,6 @@ def plain_value(text: str) -> Any:
         if _INTEGER(text):
             return int(text)
     return _WORDS.get(text, text)
-
-
-def _new_key(key: str, container: dict[str, Any], event: Any, source: str) -> str:
-    if key in container:
-        _fail(f"the key {key[:60]!r} appears twice; remove one", event, source)
-    return key
 
 
 def _fail(problem: str, event: Any, source: str) -> NoReturn:

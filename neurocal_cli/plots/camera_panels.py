@@ -1,20 +1,20 @@
-"""Panels of a camera: residuals, their scatter, coverage, uncertainty, errors by view, learning curve."""
+"""Panels of a camera: residuals, scatter, coverage, uncertainty, poses, errors by view, learning curve."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.evaluation import CameraEvaluation, evaluate_camera
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, plain, say, style
-from neurocal_cli.plots.space import draw_poses
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.evidence import Evidence
@@ -30,21 +30,16 @@ _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
 _CELLS = 6  # across and down, as in the verdict
 _MOST_DOTS = 5000
 _LEVELS = 12
+_FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
+_MOST_NAMES = 8
+_SIZE = 0.12  # of a drawn camera, relative to the scene
+_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+_HERE = Pose(np.eye(3), np.zeros(3))
 
 
 @frozen_dataclass
 class Subject:
-    """A camera, points and their errors.
-
-    Attributes
-    ----------
-    camera : Camera
-    points : Correspondences
-    evaluation : CameraEvaluation
-        Of the camera on these points.
-    calibration : Calibration or None
-        The calibration of the camera, if known.
-    """
+    """A camera, points, the camera's errors on them, and its calibration if known."""
 
     camera: Camera
     points: Correspondences
@@ -174,12 +169,8 @@ def draw_learning(axes: Axes, subject: Subject) -> None:
     axes.semilogy(
         np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK, label="error of the network"
     )
-    axes.axhline(
-        max(network.rmse_after, _ZERO),
-        color=ACCENT,
-        linewidth=1.2,
-        label=f"error after bundle adjustment, {network.rmse_after:.4g} px",
-    )
+    label = f"error after bundle adjustment, {network.rmse_after:.4g} px"
+    axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2, label=label)
     axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
     axes.legend(loc="upper right", frameon=False)
 
@@ -224,14 +215,89 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     axes.grid(False)
 
 
+def draw_poses(
+    axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
+) -> None:
+    """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs."""
+    space: Any = axes
+    style(axes, "Poses")
+    if calibration is None or not calibration.views or not len(calibration.points):
+        space.text2D(0.5, 0.5, "known only of a calibration", ha="center", transform=space.transAxes)
+        space.set_axis_off()
+        return
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    points = calibration.points
+    errors = np.array([calibration.views[name].rmse_px for name in points.view_names])
+    known = errors[np.isfinite(errors)]
+    colour = ScalarMappable(Normalize(0, float(known.max()) if known.size else 1.0), colormaps["viridis"])
+    extent = [np.zeros((1, 3))]
+    for k, name in enumerate(points.view_names):
+        world = points.world[points.view_index == k]
+        outline = calibration.views[name].pose.to_camera(_outline(world))
+        extent.append(outline)
+        shade = colour.to_rgba(errors[k])
+        flat = len(outline) < len(world)
+        closed = np.vstack([outline, outline[:1]]) if flat else outline
+        space.plot(*_turned(closed).T, "-" if flat else ".", color=shade, linewidth=1.3, markersize=2)
+        if len(points.view_names) <= _MOST_NAMES:
+            space.text(*_turned(outline[:1])[0], name[-12:].replace("$", r"\$"), fontsize=7, color="0.3")
+    size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
+    for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
+        corners = (_frustum(camera, size) - pose.t) @ pose.R
+        extent.append(corners)
+        centre, *ends = _turned(corners)
+        for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
+            space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
+    everything = _turned(np.vstack(extent))
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    space.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=1.1)
+    unit = calibration.unit.replace("$", r"\$")
+    space.set(xlabel=f"X right [{unit}]", ylabel=f"Z forward [{unit}]", zlabel=f"Y down [{unit}]")
+    space.locator_params(nbins=5)
+    space.invert_zaxis()
+    space.view_init(elev=22, azim=-60)
+    axes.figure.colorbar(colour, ax=axes, label="rms [px]", shrink=0.6, pad=0.16)
+
+
+def _turned(points: Array) -> Array:
+    """Reorder coordinates to X, Z, Y, because the third axis of the plot is the height."""
+    return points[:, [0, 2, 1]]
+
+
+def _outline(world: Array) -> Array:
+    """Corners of a flat target's convex hull, in order; all points of other targets."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    centred = world - world.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    if len(world) < 4 or sizes[-1] > _FLAT * sizes[0]:
+        return world
+    try:
+        return np.asarray(world[ConvexHull(centred @ axes[:2].T).vertices])
+    except QhullError:  # points on a line
+        return world
+
+
+def _frustum(camera: Camera, size: float) -> Array:
+    """Centre and corners of a camera's frustum in its own frame."""
+    width, height = camera.image_size or (2 * camera.intrinsics.u0, 2 * camera.intrinsics.v0)
+    pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])
+    rays = pixels @ np.linalg.inv(camera.intrinsics.A).T
+    return np.vstack([np.zeros(3), size * rays])
+
+
 def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
     """Functions that draw the panels of a camera, by their names in `plots.CAMERA_PANELS`."""
-    return {
-        "residuals": lambda axes: draw_residuals(axes, subject),
-        "coverage": lambda axes: draw_coverage(axes, subject),
-        "uncertainty": lambda axes: draw_uncertainty(axes, subject),
-        "scatter": lambda axes: draw_scatter(axes, subject),
-        "poses": lambda axes: draw_poses(axes, subject.calibration),
-        "learning": lambda axes: draw_learning(axes, subject),
-        "views": lambda axes: draw_views(axes, subject),
+    panels = {
+        "residuals": draw_residuals,
+        "coverage": draw_coverage,
+        "uncertainty": draw_uncertainty,
+        "scatter": draw_scatter,
+        "poses": lambda axes, subject: draw_poses(axes, subject.calibration),
+        "learning": draw_learning,
+        "views": draw_views,
     }
+    return {name: partial(draw, subject=subject) for name, draw in panels.items()}

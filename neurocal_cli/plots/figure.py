@@ -16,13 +16,7 @@ INK, ACCENT = "#1f4e79", "#c0392b"
 
 
 def check_available() -> None:
-    """Check that plots can be drawn.
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
-    """
+    """Raise a NeurocalError if matplotlib is not installed."""
     try:
         import matplotlib  # noqa: F401 - only tests whether it is installed
     except ImportError as error:

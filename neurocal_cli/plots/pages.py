@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.plots.camera_panels import Subject, panels_of
+from neurocal_cli.plots.camera_panels import Subject, draw_poses, panels_of
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
-from neurocal_cli.plots.space import draw_poses
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 
@@ -27,39 +26,20 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw the residuals, coverage, uncertainty, poses and learning curve of a camera.
-
-    Parameters
-    ----------
-    subject : Subject
-    kind : {"png", "pdf", "svg"}
-    panel : str, optional
-        One of `plots.CAMERA_PANELS`; by default all on one page.
-
-    Returns
-    -------
-    picture : bytes
-        The same subject gives the same bytes.
-
-    Raises
-    ------
-    NeurocalError
-        matplotlib is not installed.
-    """
+    """Draw all panels of a camera, or one of `plots.CAMERA_PANELS`; the same subject gives the same bytes."""
     panels = panels_of(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
-    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, _title(subject), _PAGE, kind)
+    evaluation = subject.evaluation
+    title = (
+        f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
+        f"{evaluation.n_points} points, {len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
+    )
+    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, title, _PAGE, kind)
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw both cameras of a rig side by side; see `draw_camera`.
-
-    Parameters
-    ----------
-    panel : str, optional
-        One of `plots.RIG_PANELS`, for both cameras.
-    """
+    """Draw both cameras of a rig side by side, or one of `plots.RIG_PANELS` for both; see `draw_camera`."""
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
         f"{side} {name}": _with_side(side, draw)
@@ -93,16 +73,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 def draw_points_in_space(
     evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
-    """Draw the errors of triangulated points; see `draw_camera`.
-
-    Parameters
-    ----------
-    evaluation : StereoEvaluation
-    rig : Rig or None
-        Both cameras, if known, for the panel of poses.
-    panel : str, optional
-        One of `plots.SPACE_PANELS`.
-    """
+    """Draw the errors of triangulated points, or one of `plots.SPACE_PANELS`; see `draw_camera`."""
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     unit = plain(evaluation.unit)
     errors = found.errors[np.isfinite(found.errors[:, 0])]
@@ -122,14 +93,6 @@ def draw_points_in_space(
         f"epipolar rms {found.epipolar_px:.3g} px"
     )
     return _page(rows, (1, 1), panels, title, (16.0, 9.0), kind)
-
-
-def _title(subject: Subject) -> str:
-    evaluation = subject.evaluation
-    return (
-        f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
-        f"{evaluation.n_points} points, {len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
-    )
 
 
 def _page(

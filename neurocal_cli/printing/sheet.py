@@ -37,21 +37,21 @@ _LONGEST = 200.0  # ruler [mm]
 _COLS, _ROWS = 9, 6  # of the board that is made without being asked for: one count is odd, one even
 
 
-@frozen_dataclass
+@frozen_dataclass(eq=False)
 class Line:
-    """A thin line; ends in mm."""
+    """A thin line; ends (2,) in mm."""
 
-    start: tuple[float, float]
-    end: tuple[float, float]
+    start: Array
+    end: Array
     width: float = 0.2
     dashed: bool = False
 
 
-@frozen_dataclass
+@frozen_dataclass(eq=False)
 class Text:
-    """A text whose base line begins, or whose middle is, at a place in mm."""
+    """A text whose base line begins, or whose middle is, at a place (2,) in mm."""
 
-    place: tuple[float, float]
+    place: Array
     content: str
     size: float = 3.0
     middle: bool = False
@@ -59,54 +59,27 @@ class Text:
 
 @frozen_dataclass(eq=False)
 class Sheet:
-    """What is printed.
-
-    Attributes
-    ----------
-    width, height : float [mm]
-        Of the paper; the origin is its top-left corner, y is downwards.
-    squares : (N, 4, 2) array [mm]
-        Corners of the black squares and parts of squares.
-    lines, texts : tuples
-    laid : list of Laid
-        The planes on the sheet, in the board's unit, before they were scaled and moved.
-    scale : float
-        Millimetres of a unit of the board.
-    origin : (2,) array [mm]
-        Where the origin of `laid` is on the paper.
-    """
+    """What is printed, in mm; the origin is the paper's top-left corner, y is downwards."""
 
     width: float
     height: float
-    squares: Array
+    squares: Array  # (N, 4, 2) corners of the black squares and parts of squares
     lines: tuple[Line, ...]
     texts: tuple[Text, ...]
-    laid: tuple[Laid, ...]
-    scale: float
-    origin: Array
+    laid: tuple[Laid, ...]  # the planes in the board's unit, before they were scaled and moved
+    scale: float  # mm of a unit of the board
+    origin: Array  # (2,) where the origin of `laid` is on the paper
 
 
 def millimetres(unit: str) -> float:
-    """Millimetres of one unit.
-
-    Raises
-    ------
-    InputError
-        A unit that is no length we know.
-    """
+    """Millimetres of one unit."""
     if unit not in _MILLIMETRES:
         raise InputError(f"the unit {unit[:20]!r} is no known length; use one of {', '.join(_MILLIMETRES)}")
     return _MILLIMETRES[unit]
 
 
 def paper_size(name: str) -> tuple[float, float]:
-    """Width and height of a paper by its name, or of ``420x297`` [mm].
-
-    Raises
-    ------
-    UsageError
-        No such paper.
-    """
+    """Width and height of a paper by its name, or of ``420x297`` [mm]; UsageError if there is none."""
     for known, size in PAPERS.items():
         if name.lower() == known.lower():
             return size
@@ -119,15 +92,7 @@ def paper_size(name: str) -> tuple[float, float]:
 
 
 def default_board(paper: tuple[float, float]) -> Board:
-    """A board of 9 x 6 inner vertices whose squares are as large as fits on a paper, in whole mm.
-
-    Of 10 x 7 squares, so that it does not look the same after a turn of 180 degrees.
-
-    Raises
-    ------
-    InputError
-        Paper too small for squares of 5 mm.
-    """
+    """A board of 9 x 6 inner vertices, which looks different turned, with the largest squares in whole mm."""
     room = _room(max(paper), min(paper))
     square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
     if square < 5:
@@ -136,18 +101,7 @@ def default_board(paper: tuple[float, float]) -> Board:
 
 
 def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
-    """Lay a board out on paper, upright or lying, whichever it fits.
-
-    Parameters
-    ----------
-    board : Board
-    paper : (width, height) [mm]
-
-    Raises
-    ------
-    InputError
-        A board larger than the paper, an unknown unit, planes that cannot be laid flat.
-    """
+    """Lay a board out on paper (width, height) [mm], upright or lying; an InputError if neither fits."""
     scale = millimetres(board.unit)
     laid, folds = unfolded(board)
     outlines = scale * np.concatenate([one.outline for one in laid])
@@ -168,7 +122,13 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
     lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
     rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
-    text = Text((_EDGE + _RULER + _QUIET, height - _EDGE), _caption(board), 2.8)
+    sizes = [
+        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
+        f"{plane.square:g} {board.unit}"
+        for plane in board.planes
+    ]
+    caption = f"{', '.join(sizes)}. Print at 100 %, then measure the rulers."
+    text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), caption, 2.8)
     return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
 
 
@@ -194,7 +154,7 @@ def _beside(start: Array, end: Array) -> list[Line]:
     """Dashes of a fold: 4 mm at either end, beside the pattern, where they change none of its edges."""
     along = (end - start) / np.linalg.norm(end - start)
     return [
-        Line(_pair(place + 0.7 * way), _pair(place + (_QUIET - 0.5) * way), dashed=True)
+        Line(place + 0.7 * way, place + (_QUIET - 0.5) * way, dashed=True)
         for place, way in ((start, -along), (end, along))
     ]
 
@@ -207,27 +167,14 @@ def _rulers(corner: Array, size: Array, height: float) -> tuple[list[Line], list
     for axis, start in ((0, np.array([corner[0], below])), (1, np.array([beside, corner[1]]))):
         length = _TICK * np.floor(min(_LONGEST, float(size[axis])) / _TICK)
         along, across = np.eye(2)[axis], np.eye(2)[1 - axis]
-        lines.append(Line(_pair(start), _pair(start + length * along)))
+        lines.append(Line(start, start + length * along))
         for mark in np.arange(0.0, length + 1, _TICK):
             tall = 2.5 if mark % (5 * _TICK) == 0 else 1.5
             place = start + mark * along
-            lines.append(Line(_pair(place), _pair(place + tall * across)))
+            lines.append(Line(place, place + tall * across))
             if mark % (5 * _TICK) == 0:
                 shift = np.array([0.0, 5.5]) if axis == 0 else np.array([3.2, 0.9])
                 last = axis == 0 and mark + 5 * _TICK > length
                 shown = f"{mark:.0f}{' mm' if last else ''}"
-                texts.append(Text(_pair(place + shift), shown, 2.5, middle=axis == 0))
+                texts.append(Text(place + shift, shown, 2.5, middle=axis == 0))
     return lines, texts
-
-
-def _caption(board: Board) -> str:
-    sizes = ", ".join(
-        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
-        f"{plane.square:g} {board.unit}"
-        for plane in board.planes
-    )
-    return f"{sizes}. Print at 100 %, then measure the rulers."
-
-
-def _pair(point: Array) -> tuple[float, float]:
-    return float(point[0]), float(point[1])

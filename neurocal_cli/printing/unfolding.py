@@ -6,6 +6,8 @@ to the right and y downwards, in the board's unit.
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
@@ -20,23 +22,12 @@ _REACH = 1.0  # squares of the pattern beyond the outer vertices, one whole
 
 @frozen_dataclass(eq=False)
 class Laid:
-    """A plane on the sheet.
-
-    Attributes
-    ----------
-    plane : Plane
-    origin : (2,) array
-        Vertex (0, 0).
-    axes : (2, 2) array
-        Rows: x_axis and y_axis on the sheet, unit vectors.
-    reach : (2, 2) array [squares]
-        How far the pattern extends beyond the outer vertices, ``[axis, low or high]``.
-    """
+    """A plane on the sheet."""
 
     plane: Plane
-    origin: Array
-    axes: Array
-    reach: Array
+    origin: Array  # (2,) vertex (0, 0)
+    axes: Array  # (2, 2) rows: x_axis and y_axis on the sheet, unit vectors
+    reach: Array  # (2, 2) [squares] of the pattern beyond the outer vertices, [axis, low or high]
 
     def at(self, grid: Array) -> Array:
         """Places on the sheet of grid coordinates (..., 2) [squares]."""
@@ -67,24 +58,11 @@ class _Map:
 
 
 def unfolded(board: Board) -> tuple[list[Laid], list[Array]]:
-    """Lay the planes of a board flat.
+    """Lay the planes of a board flat: one, or several that meet in lines beside them.
 
-    Parameters
-    ----------
-    board : Board
-        Of one plane, or of planes that meet in lines beside them, as the faces of a corner.
-
-    Returns
-    -------
-    laid : list of Laid
-        In the order of the planes.
-    folds : list of (2, 2) arrays
-        Ends of the lines along which the sheet is folded, from end to end of the pattern.
-
-    Raises
-    ------
-    InputError
-        Planes that do not meet in such a line, or that would lie on each other on the sheet.
+    Returns them in the order of the planes, and the ends (2, 2) of the lines along which the sheet is folded,
+    from end to end of the pattern. An InputError names planes that do not meet in such a line, or that would
+    lie on each other on the sheet.
     """
     planes = board.planes
     maps, folds = [_first_map(planes)], []
@@ -93,7 +71,14 @@ def unfolded(board: Board) -> tuple[list[Laid], list[Array]]:
         maps.append(new)
         folds.append(fold)
     laid = [_laid(plane, place, planes) for plane, place in zip(planes, maps, strict=True)]
-    _check_apart(laid)
+    for first, second in combinations(laid, 2):
+        a, b = first.outline, second.outline
+        gap = np.maximum(b.min(axis=0) - a.max(axis=0), a.min(axis=0) - b.max(axis=0))
+        if (gap < -_SAME * second.plane.square).all():
+            raise InputError(
+                f"the planes {first.plane.name!r} and {second.plane.name!r} would lie on each other on the "
+                "sheet; print them one by one"
+            )
     return laid, folds
 
 
@@ -119,7 +104,8 @@ def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[
         inward, opposite = (_across(p, point, along) for p in (plane, other))
         B = np.outer(place.B @ along, along) - np.outer(place.B @ opposite, inward)
         new = _Map(B, place(point) - B @ point)
-        marks = np.concatenate([p.at(_corners(p)) for p in (plane, other)])
+        corners = [[[-1, -1], [p.cols, -1], [p.cols, p.rows], [-1, p.rows]] for p in (plane, other)]  # uncut
+        marks = np.concatenate([plane.at(corners[0]), other.at(corners[1])])
         lengths = (marks - point) @ along
         return new, place(point + np.outer([lengths.min(), lengths.max()], along))
     raise InputError(
@@ -129,11 +115,6 @@ def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[
 
 def _middle(plane: Plane) -> Array:
     return plane.at(np.array([plane.cols - 1, plane.rows - 1]) / 2)
-
-
-def _corners(plane: Plane) -> Array:
-    """Grid coordinates of the corners of the pattern, uncut."""
-    return np.array([[-1, -1], [plane.cols, -1], [plane.cols, plane.rows], [-1, plane.rows]], dtype=float)
 
 
 def _meeting(a: Plane, b: Plane) -> tuple[Array, Array] | None:
@@ -180,15 +161,3 @@ def _laid(plane: Plane, place: _Map, planes: tuple[Plane, ...]) -> Laid:
         reach[axis, side] = min(reach[axis, side], room)
     axes = np.array([plane.x_axis, plane.y_axis]) @ place.B.T
     return Laid(plane, place(np.array(plane.origin)), axes, reach)
-
-
-def _check_apart(laid: list[Laid]) -> None:
-    boxes = [(one.outline.min(axis=0), one.outline.max(axis=0)) for one in laid]
-    for k, (low, high) in enumerate(boxes):
-        for n in range(k):
-            gap = np.maximum(low - boxes[n][1], boxes[n][0] - high)
-            if (gap < -_SAME * laid[k].plane.square).all():
-                raise InputError(
-                    f"the planes {laid[n].plane.name!r} and {laid[k].plane.name!r} would lie on each other "
-                    "on the sheet; print them one by one"
-                )

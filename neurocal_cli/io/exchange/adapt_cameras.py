@@ -8,7 +8,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -24,47 +24,23 @@ _Adaptation = tuple[Camera, NearestCamera | None, str]  # None and "" if there i
 
 @frozen_dataclass(eq=False)
 class AdaptedCameras:
-    """Cameras adapted to a format.
-
-    Attributes
-    ----------
-    cameras : CameraSet
-    losses : tuple of str
-        Changes of the cameras and the resulting shifts of pixels, for warnings.
-    remarks : tuple of str
-        Data that are not in the file, for notes.
-    moved : tuple of Distance or None
-        Shifts of the pixels of each camera, as numbers.
-    """
+    """Cameras adapted to a format."""
 
     cameras: CameraSet
-    losses: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    moved: tuple[Distance | None, ...] = ()
+    losses: tuple[str, ...] = ()  # changes of the cameras and the shifts of pixels, for warnings
+    remarks: tuple[str, ...] = ()  # data that are not in the file, for notes
+    moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
 
 
 def adapt_cameras(
     cameras: CameraSet, target: Format, force: bool, model: str | None = None
 ) -> AdaptedCameras:
-    """Adapt cameras to a format, and to a distortion model if one is given.
+    """Adapt cameras to a format, and to a distortion model (one of `MODELS`) if one is given.
 
     If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
-    nearest camera without skew moves pixels less than ignoring the skew.
-
-    Parameters
-    ----------
-    cameras : CameraSet
-    target : Format
-    force : bool
-        Whether the nearest camera of another distortion model is accepted.
-    model : str, optional
-        One of `MODELS`: the cameras are replaced by the nearest ones with this distortion model.
-
-    Raises
-    ------
-    InputError
-        The format cannot represent the distortion model (unless forced), the number of cameras, or an unknown
-        unit or image size.
+    nearest camera without skew moves pixels less than ignoring the skew. An InputError says that the format
+    cannot represent the distortion model (unless `force` accepts the nearest one of another model), the
+    number of cameras, or an unknown unit or image size.
     """
     if len(cameras.cameras) > target.most_cameras:
         raise InputError(
@@ -73,14 +49,22 @@ def adapt_cameras(
         )
     if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):
         raise InputError(f"a file of {target.program} needs the size of the images; give --image-size W H")
-    views = {} if target.poses else {name: pose for name, pose in cameras.poses.items() if _tells(pose)}
+    # ROS and mrcal write the pose of a camera in its own frame, which tells nothing.
+    poses = () if target.poses else cameras.poses.values()
+    n_views = sum(not np.array_equal(pose.D, np.eye(3, 4)) for pose in poses)
     if target.metres:
         cameras = (cameras if target.poses else replace(cameras, poses={})).in_metres()
     if model is not None and model not in target.models:
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
     losses, remarks, adapted, moved = [], [], [], []
-    for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
+    # Pixels of the points with which each camera was calibrated.
+    seen: list[Array | None] = [None] * len(cameras.cameras)
+    if cameras.origin is not None:
+        origin = cameras.origin
+        parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
+        seen = [part.points.pixels for part in parts]
+    for camera, points in zip(cameras.cameras, seen, strict=True):
         if model is None:
             new, near, loss = _adapted(camera, target, force, points)
         else:
@@ -96,27 +80,11 @@ def adapt_cameras(
             if not own
             else "the new camera has no standard deviations, points and verdict"
         )
-    if views:
-        count = f"{len(views)} view{'s' * (len(views) != 1)}"
+    if n_views:
+        count = f"{n_views} view{'s' * (n_views != 1)}"
         remarks.append(f"a file of {target.program} has no place for the poses of {count}")
-    origin = cameras.origin if own and not changed else None
-    return AdaptedCameras(
-        replace(cameras, cameras=tuple(adapted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
-    )
-
-
-def _tells(pose: Pose) -> bool:
-    """Whether a pose is known, not that of a camera in its own frame, as ROS and mrcal write it."""
-    return not np.array_equal(pose.D, np.eye(3, 4))
-
-
-def _pixels_of(cameras: CameraSet) -> list[Array | None]:
-    """Pixels of the points with which each camera was calibrated; None if unknown."""
-    origin = cameras.origin
-    if origin is None:
-        return [None] * len(cameras.cameras)
-    parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
-    return [part.points.pixels for part in parts]
+    found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else cameras.origin)
+    return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
 
 
 def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Adaptation:
@@ -136,14 +104,11 @@ def _adapted(camera: Camera, target: Format, force: bool, points: Array | None) 
         near = nearest_camera(camera, model, False, points)
         if near.over_image.max_px < _NO_SKEW:
             return _straightened(near.camera), None, ""
-        return (
-            _straightened(near.camera),
-            near,
-            (
-                f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
-                f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
-            ),
+        what = (
+            f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
+            f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
         )
+        return _straightened(near.camera), near, what
     nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
     # Prefer a simpler model if it is nearly as good.

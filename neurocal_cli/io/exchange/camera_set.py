@@ -1,15 +1,21 @@
-"""Contents of a camera file of any program, and properties of the formats."""
+"""Contents of a camera file of any program, poses in the forms of these programs, and properties of formats.
+
+SciPy gets copies of rotations, because older versions refuse read-only arrays.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 
+import numpy as np
+
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.rig import Rig
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
@@ -17,29 +23,14 @@ METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.
 
 @frozen_dataclass(eq=False)
 class CameraSet:
-    """One camera, or several that are fixed to each other.
-
-    Attributes
-    ----------
-    cameras : tuple of Camera
-    relative : tuple of Pose
-        From the first camera to each further one: ``X_k = R X_0 + t``; one less than the cameras.
-    poses : dict of Pose by view
-        From the world to the first camera.
-    unit : str, optional
-        Of the translations; None if the file does not state it.
-    origin : Calibration or Rig, optional
-        The whole contents of a neurocal file.
-    program : str
-        Name of the program that wrote the file, for messages.
-    """
+    """One camera, or several that are fixed to each other."""
 
     cameras: tuple[Camera, ...]
-    relative: tuple[Pose, ...] = ()
-    poses: Mapping[str, Pose] = field(default_factory=dict)
-    unit: str | None = None
-    origin: Calibration | Rig | None = None
-    program: str = "OpenCV"
+    relative: tuple[Pose, ...] = ()  # from the first camera to each further one, X_k = R X_0 + t
+    poses: Mapping[str, Pose] = field(default_factory=dict)  # of views, from the world to the first camera
+    unit: str | None = None  # of the translations; None if the file does not state it
+    origin: Calibration | Rig | None = None  # the whole contents of a neurocal file
+    program: str = "OpenCV"  # that wrote the file, for messages
 
     def __post_init__(self) -> None:
         if len(self.relative) != len(self.cameras) - 1:
@@ -54,13 +45,7 @@ class CameraSet:
         return bool(self.relative or self.poses)
 
     def in_metres(self) -> CameraSet:
-        """Convert the translations to metres.
-
-        Raises
-        ------
-        InputError
-            The unit is unknown or not a length.
-        """
+        """Convert the translations to metres; raise an InputError if the unit is unknown or not a length."""
         if not self.has_lengths:
             return self
         if self.unit not in METRES:
@@ -80,33 +65,53 @@ class CameraSet:
 
 @frozen_dataclass
 class Format:
-    """Capabilities of a file format, and the function that writes it.
+    """Capabilities of a file format, and the function that writes cameras which fit it."""
 
-    Attributes
-    ----------
-    program : str
-        Name for messages.
-    models : tuple of str
-        Our names of its distortion models, the simplest first.
-    skew : bool
-        Whether its programs support skew.
-    poses : bool
-        Whether it contains the poses of views.
-    most_cameras : int
-    metres : bool
-        Whether lengths are in metres.
-    needs_size : bool
-        Whether the image size must be known.
-    text : callable
-        Returns the contents of the files by name; "" is the name of a single file. The arguments are the
-        cameras, which must fit the format, and the extension of the output, such as ".xml".
-    """
-
-    program: str
-    models: tuple[str, ...]
-    skew: bool
-    poses: bool
+    program: str  # name for messages
+    models: tuple[str, ...]  # our names of its distortion models, the simplest first
+    skew: bool  # whether its programs support skew
+    poses: bool  # whether it contains the poses of views
     most_cameras: int
-    metres: bool
-    needs_size: bool
+    metres: bool  # whether lengths are in metres
+    needs_size: bool  # whether the image size must be known
+    # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
+
+
+def to_vector(R: Array) -> Array:
+    """Rotation vector (axis times angle [rad]) of a rotation (3, 3), like ``cv2.Rodrigues``; also near pi."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(np.array(R)).as_rotvec())
+
+
+def from_vector(r: Array) -> Array:
+    """Rotation (3, 3) of a rotation vector (axis times angle [rad])."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.array(r, dtype=float).reshape(3)).as_matrix())
+
+
+def to_quaternion(R: Array) -> Array:
+    """Unit quaternion w, x, y, z of a rotation (3, 3), with w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat()
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def from_quaternion(q: Array) -> Array:
+    """Rotation (3, 3) of a quaternion w, x, y, z of any non-zero length."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(np.roll(np.asarray(q, dtype=float), -1)).as_matrix())
+
+
+def inverse(pose: Pose) -> Pose:
+    """Inverse of a pose."""
+    return Pose(pose.R.T, -pose.R.T @ pose.t)
+
+
+def after(second: Pose, first: Pose) -> Pose:
+    """Compose two poses: ``X'' = R2 (R1 X + t1) + t2``."""
+    return Pose(second.R @ first.R, second.R @ first.t + second.t)

@@ -17,8 +17,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quaternion
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.io.files import read_text, value_failures
 from neurocal_cli.io.yaml_text import number
 
@@ -55,13 +54,7 @@ def is_folder(name: str) -> bool:
 
 
 def read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model with their relative poses and the poses of the images.
-
-    Raises
-    ------
-    FormatError
-        The folder is not a text model.
-    """
+    """Read the cameras of a model with their relative poses and the poses of the images."""
     path = os.path.join(folder, "cameras.txt")
     if not os.path.exists(path):
         if os.path.exists(os.path.join(folder, "cameras.bin")):
@@ -78,13 +71,7 @@ def read_folder(folder: str) -> CameraSet:
 
 
 def parse(text: str, source: str) -> CameraSet:
-    """Read ``cameras.txt`` with one camera.
-
-    Raises
-    ------
-    FormatError, InputError
-        A line is not a camera, its model is unknown, or there are several cameras.
-    """
+    """Read ``cameras.txt`` with one camera."""
     return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
 
 

@@ -18,21 +18,7 @@ from neurocal_cli.points import Correspondences
 
 
 def corner_text(points: Correspondences, target: str, ending: str) -> str | bytes:
-    """Write points for a program.
-
-    Parameters
-    ----------
-    points : Correspondences
-    target : str
-        ``neurocal, opencv, matlab, json, npz`` or ``mrcal``.
-    ending : str
-        Extension of the output, such as ".xml".
-
-    Raises
-    ------
-    InputError
-        The program reads no files of points, or cannot represent these points.
-    """
+    """Write points for ``neurocal, opencv, matlab, json, npz`` or ``mrcal``; an `ending` is ".xml"."""
     if target == "neurocal":
         return format_points(points)
     if target not in _TEXTS:

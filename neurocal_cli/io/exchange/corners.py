@@ -50,35 +50,22 @@ _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 def read_corners(
     paths: Sequence[str | Path], board: Board | None, notes: list[str], unit: str | None = None
 ) -> Correspondences | None:
-    """Read points from files of any program.
+    """Read points from files of any program; None if the first file has no points.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        One file; or a file of board points and then a file for each view. ``-`` is stdin, which has to be
-        repeatable (`repeatable_stdin`).
-    board : Board, optional
-        Gives the board points if the files do not.
-    notes : list of str
-        Remarks about ignored columns are appended.
-    unit : str, optional
-        Of the board points in a file.
-
-    Returns
-    -------
-    Correspondences, or None if the first file has no points.
-
-    Raises
-    ------
-    FormatError
-        A file cannot be read, or its corners are not those of the board.
+    The files are one, or board points and then a file for each view; stdin has to be repeatable
+    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not. Remarks
+    about ignored columns are appended to `notes`.
     """
     names = [str(path) for path in paths]
     data, source = read_bytes(names[0])
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
-        return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
+        try:
+            array = np.load(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+        return _corners(Field({"corners": array.tolist()}, source), board, unit)
     if data.startswith(b"PK\x03\x04"):
-        return _dictionary(Field(arrays_of(data, source), source), board, unit)
+        return _corners(Field(arrays_of(data, source), source), board, unit)
     if data.startswith(b"MATLAB 5.0 MAT-file"):
         return _matlab(data, source, board, unit)
     if b"\0" in data:
@@ -103,45 +90,27 @@ def read_corners(
         return points
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
     if named or text.lstrip()[:1] in ("{", "<", "%"):
-        return _dictionary(parse_tree(text, source), board, unit)
+        return _corners(parse_tree(text, source), board, unit)
     return None
-
-
-def _npy(data: bytes, source: str) -> Any:
-    try:
-        return np.load(io.BytesIO(data), allow_pickle=False).tolist()
-    except (ValueError, OSError, EOFError) as error:
-        raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
-
-
-def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspondences | None:
-    if not isinstance(root.value, dict) or not any(name in root for name in _IMAGE):
-        return None
-    return _corners(root, board, unit)
 
 
 def _corners(
     root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
-) -> Correspondences:
-    """Read the points of a dictionary.
+) -> Correspondences | None:
+    """Read the points of a dictionary, if it has any; `first` is the coordinate of its first pixel.
 
-    Parameters
-    ----------
-    root : Field
-    board : Board, optional
-    unit : str, optional
-    first : float
-        Coordinate of the first pixel.
-    down : bool
-        Whether corners without board points run along the columns of the board, one after the other.
+    Without board points, `down` tells that the corners run along the columns of the board.
     """
-    field = next(root[name] for name in _IMAGE if name in root)
+    field = root.first(_IMAGE)
+    if field is None:
+        return None
     pixels = _stack(field, 2) - first
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
     if "view_names" in root:
         names = root["view_names"].names(views)
-    world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
+    places = root.first(_WORLD)
+    world = None if places is None else _stack(places, 3)
     stated = root["unit"].text() if "unit" in root else unit
     ids = root.read("points", Field.texts)
     if world is None:
@@ -224,19 +193,18 @@ def _assembled(
 
 def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
     tree = read_variables(data, source)
-    if not any(name in tree for name in _IMAGE):
+    field = next((name for name in _IMAGE if name in tree), None)
+    if field is None:
         return None
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
     root = Field(plain, source)
-    field = next(name for name in _IMAGE if name in tree)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
         root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
     root.value.setdefault("unit", unit_of(tree))
     stack = np.asarray(tree[field], dtype=float)
     if stack.ndim == 4:  # M x 2 x P x cameras
         raise FormatError(
-            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart",
-            source,
+            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart", source
         )
     if stack.ndim == 3:  # M x 2 x P
         root.value[field] = np.moveaxis(stack, 2, 0).tolist()

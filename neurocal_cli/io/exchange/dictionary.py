@@ -21,11 +21,11 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_info import to_ros
 from neurocal_cli.io.camera_tree import camera_from_tree, has_matrix, matrix_data
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.io.exchange.neurocal import as_rig
-from neurocal_cli.io.exchange.rotations import from_vector, to_vector
 from neurocal_cli.io.file_storage import storage_text
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import nested
 from neurocal_cli.stereo.rectification import rectify
 
 _SIDES = (("1", "2"), ("_left", "_right"), ("L", "R"), ("_l", "_r"))
@@ -35,27 +35,18 @@ _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 
 def is_part(root: Field) -> bool:
     """Whether the tree is one of the two files of OpenCV's stereo sample: the cameras, or their pose."""
-    if not isinstance(root.value, dict):
-        return False
     cameras = _sides(root) is not None
-    return cameras != any(key in root for key in _TRANSLATIONS) and (cameras or not has_matrix(root))
+    return cameras != (root.first(_TRANSLATIONS) is not None) and (cameras or not has_matrix(root))
 
 
 def from_tree(root: Field) -> CameraSet:
-    """Read one camera or two.
-
-    Raises
-    ------
-    InputError, FormatError
-        A key is missing or wrong.
-    """
+    """Read one camera or two."""
     unit = root.read("unit", Field.text)
     sides = _sides(root)
     if sides is None:
         return CameraSet((camera_from_tree(root),), (), _poses(root), unit)
     cameras = tuple(camera_from_tree(root, side, whole=False) for side in sides)
-    R = next((root[key] for key in _ROTATIONS if key in root), None)
-    t = next((root[key] for key in _TRANSLATIONS if key in root), None)
+    R, t = root.first(_ROTATIONS), root.first(_TRANSLATIONS)
     if R is None or t is None:
         raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
@@ -63,13 +54,7 @@ def from_tree(root: Field) -> CameraSet:
 
 
 def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """Read the arrays of an ``.npz`` file as nested lists.
-
-    Raises
-    ------
-    FormatError
-        The data are not such a file, or contain Python objects.
-    """
+    """Read the arrays of an ``.npz`` file as nested lists; Python objects are refused."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
@@ -163,16 +148,9 @@ def _opencv(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
 
 def json_text(tree: Mapping[str, Any]) -> str:
     """Write the dictionary as JSON, one entry per line; unknown numbers are null."""
-    lines = ",\n".join(f"  {json.dumps(key)}: {_json_value(value)}" for key, value in tree.items())
-    return f"{{\n{lines}\n}}\n"
-
-
-def _json_value(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        known = value.astype(object)
-        known[~np.isfinite(value)] = None
-        value = known.tolist()
-    return json.dumps(value, allow_nan=False)
+    plain = {key: nested(value) if isinstance(value, np.ndarray) else value for key, value in tree.items()}
+    lines = [f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in plain.items()]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def npz_bytes(tree: Mapping[str, Any]) -> bytes:

@@ -13,8 +13,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import after, inverse
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, text
 
@@ -44,13 +43,7 @@ def is_tree(root: Field) -> bool:
 
 
 def from_tree(root: Field) -> CameraSet:
-    """Read a chain of cameras.
-
-    Raises
-    ------
-    InputError, FormatError
-        The camera model or distortion model is unknown, or a key is missing.
-    """
+    """Read a chain of cameras."""
     if "cam0" not in root:
         return CameraSet((_camera(root, "camera"),), unit="m", program="Kalibr")
     cameras, relative = [_camera(root["cam0"], "cam0")], [Pose(np.eye(3), np.zeros(3))]

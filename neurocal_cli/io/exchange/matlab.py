@@ -18,8 +18,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import from_vector
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, from_vector
 from neurocal_cli.io.mat_file import read_variables
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
@@ -27,13 +26,7 @@ _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 
 def read_mat(data: bytes, source: str) -> CameraSet:
-    """Read a ``.mat`` file of up to version 7.
-
-    Raises
-    ------
-    FormatError, InputError
-        The file is damaged, or has no camera outside objects of MATLAB's classes, which only MATLAB can read.
-    """
+    """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
     tree = read_variables(data, source)
     for name in _STRUCTS:
         if isinstance(tree.get(name), dict):

@@ -17,8 +17,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import from_vector, to_vector
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import number
 
@@ -28,6 +27,7 @@ _NAMES = {
     "none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8",
     "thin_prism": "OPENCV12",
 }  # fmt: skip
+_BY_LENGTH = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
 _START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
 
 
@@ -37,13 +37,7 @@ def is_text(text: str) -> bool:
 
 
 def parse(text: str, source: str) -> CameraSet:
-    """Read a camera model.
-
-    Raises
-    ------
-    FormatError, InputError
-        The text is malformed, or the lens model is unknown.
-    """
+    """Read a camera model."""
     try:
         tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
@@ -56,7 +50,9 @@ def parse(text: str, source: str) -> CameraSet:
             "mrcal-convert-lensmodel LENSMODEL_OPENCV8"
         )
     values = _numbers(root["intrinsics"], 4 + _LENGTHS[model])
-    lens = _distortion(values[4:])
+    k = values[4:]
+    k = k[:8] if len(k) == 12 and not k[8:].any() else k
+    lens = Distortion(_BY_LENGTH[len(k)], k) if k.any() else Distortion()
     width, height = _numbers(root["imagersize"], 2)
     key = "rt_cam_ref" if "rt_cam_ref" in root else "extrinsics"
     rt = _numbers(root[key], 6)
@@ -68,15 +64,6 @@ def _numbers(field: Field, count: int) -> Array:
     """Read the numbers of a list or a tuple."""
     values = list(field.value) if isinstance(field.value, tuple) else field.value
     return Field(values, field.source, field.path).array(count)
-
-
-def _distortion(k: Array) -> Distortion:
-    if len(k) == 12 and not k[8:].any():
-        k = k[:8]
-    if not k.any():
-        return Distortion()
-    names = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
-    return Distortion(names[len(k)], k)
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
@@ -94,21 +81,18 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 def _model(camera: Camera, pose: Pose) -> str:
     a, _, b, u0, v0 = camera.entries
     width, height = camera.image_size or (0, 0)
-    values = [a, b, u0, v0, *camera.distortion.coefficients.tolist()]
+    values = map(number, [a, b, u0, v0, *camera.distortion.coefficients.tolist()])
+    placed = map(number, [*to_vector(pose.R), *pose.t])
     return (
         "{\n"
         f"    'lensmodel':  'LENSMODEL_{_NAMES[camera.distortion.model]}',\n"
         "    # fx, fy, cx, cy, and the coefficients of the distortion\n"
-        f"    'intrinsics': [ {_list(values)} ],\n"
+        f"    'intrinsics': [ {', '.join(values)} ],\n"
         "    # rotation vector and translation from the world to the camera\n"
-        f"    'extrinsics': [ {_list([*to_vector(pose.R), *pose.t])} ],\n"
+        f"    'extrinsics': [ {', '.join(placed)} ],\n"
         f"    'imagersize': [ {width}, {height} ],\n"
         "}\n"
     )
-
-
-def _list(values: list[float]) -> str:
-    return ", ".join(number(value) for value in values)
 
 
 FORMAT = Format("mrcal", tuple(_NAMES), False, False, 99, False, True, _text)

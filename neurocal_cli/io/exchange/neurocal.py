@@ -26,13 +26,7 @@ _UNKNOWN = "unknown"  # unit of lengths if no file states it
 
 
 def from_tree(root: Field, whole: bool) -> CameraSet:
-    """Read a calibration or a rig, with poses and points only if `whole`.
-
-    Raises
-    ------
-    FormatError
-        A key is missing or wrong.
-    """
+    """Read a calibration or a rig, with poses and points only if `whole`."""
     if "neurocal" not in root:
         if not whole:
             root.refuse("is a stereo rig; give the file of one camera")
@@ -56,13 +50,7 @@ def camera_set(result: Calibration | Rig) -> CameraSet:
 
 
 def as_rig(cameras: CameraSet) -> Rig:
-    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal.
-
-    Raises
-    ------
-    InputError
-        The baseline is zero.
-    """
+    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal."""
     if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
         return cameras.origin
     (pose,) = cameras.relative

@@ -11,8 +11,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
-from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.exchange.rotations import after, inverse
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.io.file_storage import parse_tree
 from neurocal_cli.io.files import decode, one_line, read_bytes, value_failures
 from neurocal_cli.io.tree_fields import Field
@@ -33,21 +32,12 @@ _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \
 
 
 def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
-    """Read the cameras of a file, or of two files that belong together.
+    """Read the cameras of a file of a known program, or of two files that belong together.
 
-    Parameters
-    ----------
-    paths : sequence of str or Path
-        One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder
-        that holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left
-        and the right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. ``-`` is stdin.
-    whole : bool
-        Whether all of a neurocal file is read; otherwise its poses and points are ignored.
-
-    Raises
-    ------
-    FormatError
-        A file cannot be read, is of an unknown kind, or has a camera that neurocal cannot represent.
+    One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder that
+    holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left and the
+    right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. Poses and points of a neurocal
+    file are read only if `whole`.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
@@ -64,18 +54,7 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
 
 
 def read_intrinsics(path: str | Path) -> Camera:
-    """Read a camera without its poses.
-
-    Parameters
-    ----------
-    path : str or Path
-        A neurocal calibration or the file of another program, see `read_cameras`; ``-`` is stdin.
-
-    Raises
-    ------
-    FormatError
-        There is no valid camera matrix, or more than one camera.
-    """
+    """Read a single camera without its poses, from any file of `read_cameras`."""
     found = read_cameras([path], whole=False)
     if len(found.cameras) > 1:
         source = "<stdin>" if str(path) == "-" else one_line(path)
@@ -106,22 +85,17 @@ def _opened(name: str) -> CameraSet | Field:
 def _cameras(opened: CameraSet | Field, whole: bool) -> CameraSet:
     if isinstance(opened, CameraSet):
         return opened
-    with value_failures(opened.source):
-        return _from_tree(opened, whole)
-
-
-def _from_tree(root: Field, whole: bool) -> CameraSet:
-    if not isinstance(root.value, dict):
-        raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
-    if "neurocal" in root or ("left" in root and "right" in root):
-        return neurocal.from_tree(root, whole)
-    if kalibr.is_tree(root):
-        return kalibr.from_tree(root)
-    if "pinhole" in root:
-        return CameraSet((boofcv_camera(root),), program="BoofCV")
-    if ros.is_tree(root):
-        return ros.from_tree(root)
-    return dictionary.from_tree(root)
+    root = opened
+    with value_failures(root.source):
+        if not isinstance(root.value, dict):
+            raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
+        if "neurocal" in root or ("left" in root and "right" in root):
+            return neurocal.from_tree(root, whole)
+        if kalibr.is_tree(root):
+            return kalibr.from_tree(root)
+        if "pinhole" in root:
+            return CameraSet((boofcv_camera(root),), program="BoofCV")
+        return ros.from_tree(root) if ros.is_tree(root) else dictionary.from_tree(root)
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:
@@ -139,8 +113,5 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
     # mrcal's poses are relative to one world.
     first, second = (part.poses[mrcal.REFERENCE] for part in (left, right))
     return replace(
-        left,
-        cameras=(left.cameras[0], right.cameras[0]),
-        relative=(after(second, inverse(first)),),
-        poses={},
+        left, cameras=(left.cameras[0], right.cameras[0]), relative=(after(second, inverse(first)),), poses={}
     )

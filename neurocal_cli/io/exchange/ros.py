@@ -39,13 +39,7 @@ def from_tree(root: Field) -> CameraSet:
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:
-    """Join the cameras of two files to a rig.
-
-    Raises
-    ------
-    InputError
-        The files are not those of a rectified pair.
-    """
+    """Join the cameras of two files to a rig; an InputError if they are no rectified pair."""
     first, second = (part.poses.get(_RECTIFIED) for part in (left, right))
     if first is None or second is None or not second.t.any() or first.t.any():
         raise InputError(
