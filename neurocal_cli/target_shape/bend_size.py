@@ -1,4 +1,4 @@
-"""Size of the bends of single views by empirical Bayes, and the bend of each view, for given common points.
+"""Size of the bends of single views by empirical Bayes, for given common points.
 
 The bends of a view are unknowns besides its pose (`information`), with a Gaussian prior of the same size in
 all views. The size maximises the evidence, with cameras, poses and bends integrated out.
@@ -75,17 +75,3 @@ def evidence_by_precision(info: Information) -> Callable[[float], float]:
         return log_evidence(info.spare, cost, logdet + by_bends)
 
     return evidence
-
-
-def bends_of(info: Information, camera_step: Array, offsets: Array) -> Array:
-    """(P, 3) most probable bends [world unit], given the step of the cameras (f,) and the offsets (n, 3).
-
-    Parameters
-    ----------
-    info : Information
-        With its prior; see `Information.held`.
-    """
-    right = (
-        info.pose_right - info.pose_camera @ camera_step - np.einsum("pqni,ni->pq", info.pose_point, offsets)
-    )
-    return np.asarray(np.linalg.solve(info.pose, right[..., None])[:, 6:, 0])

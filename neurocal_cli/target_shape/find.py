@@ -21,9 +21,15 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
-from neurocal_cli.target_shape.bend_size import bends_of, most_probable_precision
+from neurocal_cli.target_shape.bend_size import most_probable_precision
 from neurocal_cli.target_shape.bend_validation import bends_are_valid
-from neurocal_cli.target_shape.information import Information, Sight, information_of, of_views
+from neurocal_cli.target_shape.information import (
+    Information,
+    Sight,
+    information_of,
+    of_views,
+    steps_of_poses,
+)
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
 from neurocal_cli.target_shape.target_validation import passes_cross_validation
@@ -36,6 +42,7 @@ _FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
 _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
+_STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
 # estimated target below the first limit may move slightly beyond it when the lens is selected again.
@@ -215,6 +222,7 @@ class Search:
     def run(self, least_gain: float) -> Found | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
+        last = np.inf
         for step in range(_STEPS):
             here = self.information()
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
@@ -224,14 +232,17 @@ class Search:
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                found = posterior(info, self.prior, self.sizes, self.flat, noise)
+                found = posterior(info, self.prior, self.sizes, self.flat, noise, step < _STRETCH_STEPS)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
-            settled = known and bool((np.abs(found.camera_step) < _SETTLED * std).all())
+            length = float((np.abs(found.camera_step) / std).max(initial=0.0))
+            # The next step would be shorter than this one by the same factor as this one than the last.
+            settled = known and length * min(1.0, length / last) < _SETTLED
+            last = length
             if not self._move(found, info):
                 return None
             if settled:
@@ -290,16 +301,30 @@ class Search:
     def _move(self, found: Posterior, info: Information) -> bool:
         if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
             return False
+        own = steps_of_poses(info, found.camera_step, found.offsets)
         if self.surface is not None:
-            self.bends = bends_of(info, found.camera_step, found.offsets)
+            self.bends = own[:, 6:]
             bent = self.surface.offsets(self._common()) @ self.bends.T
             if not np.abs(bent).max() < _LARGEST * self.prior.size:
                 return False
         self.offsets, self.sizes = found.offsets, found.sizes
-        self.fits = [
-            at_world(*fit, in_pixels(fit[0], fit[1].state), self._world(k)) for k, fit in enumerate(self.fits)
-        ]
+        moved = self._predicted(found.camera_step, own[:, :6])
+        self.fits = [at_world(*self.fits[k], state, self._world(k)) for k, state in enumerate(moved)]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
+
+    def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
+        """The state of each camera in pixels after these steps, (f,) and (P, 6), of all."""
+        states, first, view = [], 0, 0
+        for problem, adjusted in self.fits:
+            free, V = np.flatnonzero(problem.free_camera), problem.views.n_views
+            by_camera, by_pose = np.zeros((1, len(problem.free_camera))), np.zeros((V, 6))
+            by_camera[0, free] = camera_step[first : first + len(free)]
+            if problem.free_poses:
+                by_pose[:] = pose_steps[view : view + V]
+                view += V
+            first += len(free)
+            states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
+        return states
 
     def _align(self) -> None:
         """Rotate, shift and scale the target to be nearest to the given one, which changes no pixel.

@@ -186,6 +186,12 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     return found.around_straight(np.concatenate(bends)) if bends else found
 
 
+def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
+    """(P, p) steps of the poses, and whole bends, given the step of the cameras (f,) and the offsets (n, 3)."""
+    right = info.pose_right - info.pose_camera @ camera_step - info.pose_by(offsets)
+    return np.asarray(np.linalg.solve(info.pose, right[..., None])[..., 0])
+
+
 def joined(parts: Sequence[Information]) -> Information:
     """Sum over parts of the views of the same cameras."""
 

@@ -86,7 +86,7 @@ _NOTHING = 1e-7  # size of an absent part over the target's size
 _SETTLED = 0.03  # relative change of the sizes
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.017 standard deviations rms
 # from those with 1e-5; 24 draws of each kind by tests/support/simulated_targets.py.
-_NO_GAIN = 0.001
+_NO_GAIN = 0.05
 _NO_GAIN_YET = 0.1  # the same from arbitrary initial sizes, around a target that will still move
 _FARTHEST = 8.0  # largest multiple of MacKay's step
 _HALVINGS = 6
@@ -143,6 +143,7 @@ def posterior(
     sizes: Mapping[str, float] | None = None,
     flat: bool = False,
     variance: float | None = None,
+    with_stretch: bool = True,
 ) -> Posterior:
     """Estimate the sizes of the parts, and the offsets.
 
@@ -158,6 +159,8 @@ def posterior(
     variance : float, optional [px^2]
         Initial noise variance. It is needed with initial sizes, because then the errors on the given target
         are no noise.
+    with_stretch : bool
+        Whether the stretch may be switched on or off.
 
     Raises
     ------
@@ -168,7 +171,7 @@ def posterior(
     noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
     start = parts.start() if sizes is None else parts.allowed(sizes)
     now = parts.climbed(parts.at({name: size / noise for name, size in start.items()}))
-    if "stretch" in now.ratios:
+    if with_stretch and "stretch" in now.ratios:
         other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
         now = other if other.evidence > now.evidence else now
     return parts.posterior(now)
