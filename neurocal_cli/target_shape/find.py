@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bends import N_SHAPES, Bends, surface_of
-from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
@@ -42,6 +42,7 @@ _FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
 _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
+_ITERATIONS = 1  # of a camera on a target that will still move
 _STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
@@ -222,7 +223,7 @@ class Search:
     def run(self, least_gain: float) -> Found | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
-        last = np.inf
+        last = 0.0
         for step in range(_STEPS):
             here = self.information()
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
@@ -241,7 +242,7 @@ class Search:
             known = self.still or self.sizes is not None
             length = float((np.abs(found.camera_step) / std).max(initial=0.0))
             # The next step would be shorter than this one by the same factor as this one than the last.
-            settled = known and length * min(1.0, length / last) < _SETTLED
+            settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
             last = length
             if not self._move(found, info):
                 return None
@@ -309,7 +310,9 @@ class Search:
                 return False
         self.offsets, self.sizes = found.offsets, found.sizes
         moved = self._predicted(found.camera_step, own[:, :6])
-        self.fits = [at_world(*self.fits[k], state, self._world(k)) for k, state in enumerate(moved)]
+        self.fits = [
+            at_world(*self.fits[k], state, self._world(k), _ITERATIONS) for k, state in enumerate(moved)
+        ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
     def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
@@ -327,11 +330,12 @@ class Search:
         return states
 
     def _align(self) -> None:
-        """Rotate, shift and scale the target to be nearest to the given one, which changes no pixel.
+        """Rotate, shift and scale the target to be nearest to the given one, and adjust the cameras to it.
 
         Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
+            self.fits = [(problem, problem.adjust(adjusted)) for problem, adjusted in self.fits]
             return
         world = self._common()
         s, R, t = nearest_similarity(world, self.given)
@@ -373,11 +377,15 @@ def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> S
 
 
 def at_world(
-    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+    problem: Problem,
+    adjusted: Adjusted,
+    state: CameraState,
+    world: Array,
+    iterations: int = OPTIONS.max_iterations,
 ) -> tuple[Problem, Adjusted]:
     """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
     if not problem.free_distortion and state.model != "none":
         # The state contains the given distortion, but `with_points` has removed it from the pixels.
         new = new.with_seen_pixels()
-    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))
+    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)), iterations)

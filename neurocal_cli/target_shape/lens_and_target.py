@@ -7,12 +7,14 @@ evidence enough. If none does, the next simpler one is tried as long as it hardl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.open_coefficients import log_prior, radius
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
@@ -77,18 +79,28 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
         ),
         default=len(POLYNOMIAL_MODELS),
     )
+    least = 0.5 * (evidence_as_given(fits) + found.evidence)
     for model in POLYNOMIAL_MODELS[simplest + 1 :]:
-        richer = [
-            _adjusted_with(*fit, model) if free and _is_simpler(fit[1].state.model, model) else fit
-            for fit, free in zip(fits, estimated, strict=True)
+        moved = [
+            free and _is_simpler(fit[1].state.model, model) for fit, free in zip(fits, estimated, strict=True)
         ]
-        added = sum(
-            log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
-            for (_, before), (problem, after) in zip(fits, richer, strict=True)
-        )
-        if evidence_as_given(richer) + added > found.evidence:
+        # A linear prediction that reaches less than half of the found target's gain settles it.
+        for richer_of, wanted in ((_linearised_with, least), (_adjusted_with, found.evidence)):
+            richer = [richer_of(*fit, model) if move else fit for fit, move in zip(fits, moved, strict=True)]
+            if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > wanted:
+                break
+        else:
             return True
     return False
+
+
+def _log_prior_of_added(
+    fits: Sequence[tuple[Problem, Adjusted]], richer: Sequence[tuple[Problem, Adjusted]]
+) -> float:
+    return sum(
+        log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
+        for (_, before), (problem, after) in zip(fits, richer, strict=True)
+    )
 
 
 def _is_simpler(model: str, other: str) -> bool:
@@ -98,3 +110,9 @@ def _is_simpler(model: str, other: str) -> bool:
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
     new = problem.with_model(model)
     return new, new.adjust(adjusted.state.with_model(model))
+
+
+def _linearised_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    state = adjusted.state.with_model(model)
+    normal, _ = normal_blocks(problem.views.batches, state)
+    return problem.with_model(model), replace(adjusted, state=state, normal=normal)

@@ -45,29 +45,46 @@ class Posterior:
         Of the cameras' free parameters.
     camera : (f, f) array
         Covariance of these in units of the noise variance, with the offsets marginalised.
-    followed : (f, n, 3) array
-        S_cd S_dd^-1: regression of the cameras' scores on those of the offsets.
-    std : (n, 3) array [world unit]
-        Of the offsets, along each point's axes.
     sizes : dict of float by name [world unit]
     determined : float
         Effective number of the offsets' unknowns that the data determine.
     evidence : float
         Log evidence, with a flat prior on the cameras' normalised parameters.
-    poses : (P, 6, 6) array, optional
-        Covariance of each pose in units of the noise variance, if the points are surveyed.
+    solved : (Solved, Prior, (3 n, g) array), optional
+        The solution, its prior and the gauge; None if the points stay as given.
     """
 
     offsets: Array
     variance: float
     camera_step: Array
     camera: Array
-    followed: Array
-    std: Array
     sizes: dict[str, float]
     determined: float
     evidence: float
-    poses: Array | None = None
+    solved: tuple[Solved, Prior, Array] | None = None
+
+    @property
+    def followed(self) -> Array:
+        """(f, n, 3) S_cd S_dd^-1: regression of the cameras' scores on those of the offsets."""
+        whole = np.zeros((len(self.camera), *self.offsets.shape))
+        if self.solved is None or not len(whole):
+            return whole
+        solved, prior, _ = self.solved
+        along = solved.camera_root.T @ solved.offset_root(prior)
+        return np.asarray(-np.linalg.solve(self.camera, along).reshape(whole.shape))
+
+    @property
+    def std(self) -> Array:
+        """(n, 3) standard deviations of the offsets, along each point's axes [world unit]."""
+        if self.solved is None:
+            return np.zeros_like(self.offsets)
+        solved, *rest = self.solved
+        return np.sqrt(self.variance * np.maximum(solved.offset_variance(*rest), 0.0))
+
+    @property
+    def poses(self) -> Array | None:
+        """(P, 6, 6) covariance of each pose in units of the noise variance; see `Solved`."""
+        return None if self.solved is None else self.solved[0].poses
 
 
 _SINGLE = {"place": [0, 1], "height": [2]}  # axes of the parts of single points
@@ -86,8 +103,8 @@ _NOTHING = 1e-7  # size of an absent part over the target's size
 _SETTLED = 0.03  # relative change of the sizes
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.017 standard deviations rms
 # from those with 1e-5; 24 draws of each kind by tests/support/simulated_targets.py.
-_NO_GAIN = 0.05
-_NO_GAIN_YET = 0.1  # the same from arbitrary initial sizes, around a target that will still move
+_NO_GAIN = 0.003
+_NO_GAIN_YET = 0.5  # the same from arbitrary initial sizes, around a target that will still move
 _FARTHEST = 8.0  # largest multiple of MacKay's step
 _HALVINGS = 6
 _PASSES = 40
@@ -179,18 +196,15 @@ def posterior(
 
 def given_posterior(info: Information, prior: Prior) -> Posterior:
     """The posterior with zero offsets: the points stay as given."""
-    n, f = len(info.point), len(info.camera)
     S, g, cost, logdet = _poses_eliminated(info)
     inverse = np.linalg.inv(S)
     cost -= float(g @ inverse @ g)
     logdet += float(np.linalg.slogdet(S)[1]) - info.log_precision
     return Posterior(
-        offsets=np.zeros((n, 3)),
+        offsets=np.zeros((len(info.point), 3)),
         variance=cost / info.spare,
         camera_step=inverse @ g,
         camera=np.asarray(inverse, dtype=float),
-        followed=np.zeros((f, n, 3)),
-        std=np.zeros((n, 3)),
         sizes=dict.fromkeys((*prior.groups, *_SINGLE), _NOTHING * prior.size),
         determined=0.0,
         evidence=log_evidence(info.spare, cost, logdet),
@@ -211,9 +225,7 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     parts = _Parts(info, prior, flat=False)
     noise = np.sqrt(variance)
     found = parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
-    if prior.stated is None:
-        return found
-    return replace(found, variance=variance, std=found.std * np.sqrt(variance / found.variance))
+    return found if prior.stated is None else replace(found, variance=variance)
 
 
 def minimum_of(
@@ -312,32 +324,38 @@ class _Parts:
         place, height = (ratios[name] ** -2 for name in _SINGLE)
         return np.tile([place, place, height], (self.system.n, 1))
 
-    def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
-        """A part's coefficients, their variances, and the offset for a unit coefficient."""
-        if name in self.prior.groups:
-            places = self.prior.groups[name]
-            return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
-        if self.prior.stated is not None:
-            stated = self.prior.stated
-            return now.solved.single / stated, now.solved.single_variance / stated**2, 1.0
-        columns = _SINGLE[name]
-        return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
+    def _parts(self, now: _Solution) -> Iterator[tuple[str, float, int, float, float]]:
+        """Name, size, number, sum of squares and sum of variances of each part's coefficients."""
+        solved, prior = now.solved, self.prior
+        for name, places in prior.groups.items():
+            w = solved.smooth[places]
+            yield (
+                name, now.ratios[name] / prior.size, len(w), float(w @ w), solved.smooth_variance(places)
+            )  # fmt: skip
+        variance, squares = solved.single_variance(), solved.single**2
+        if prior.stated is not None:
+            squares, variance = squares / prior.stated**2, variance / prior.stated**2
+            yield _STATED, now.ratios[_STATED], squares.size, float(squares.sum()), float(variance.sum())
+            return
+        for name, columns in _SINGLE.items():
+            w2 = squares[:, columns]
+            yield name, now.ratios[name], w2.size, float(w2.sum()), float(variance[:, columns].sum())
 
     def renewed(self, now: _Solution) -> tuple[dict[str, float], dict[str, float]]:
         """MacKay's update of the sizes, and the slopes of the log evidence by the logarithms of the sizes.
 
         The step is lengthened for parts that the data hardly determine, where MacKay's step is too short.
         """
-        new, slope, noise = {}, {}, np.sqrt(now.variance)
-        for name, ratio in now.ratios.items():
-            w, var, unit = self._coefficients(now, name)
-            share = float(np.clip(1.0 - (unit / ratio) ** 2 * var.mean(), 1e-6, 1.0))
-            change = float((w**2).mean()) * (unit / ratio / noise) ** 2 / share
-            slope[name] = w.size * share * (change - 1.0)
+        new, slope, noise = {}, {}, math.sqrt(now.variance)
+        for name, size, number, squares, variance in self._parts(now):
+            share = min(max(1.0 - variance / (number * size**2), 1e-6), 1.0)
+            change = squares / number / (size * noise) ** 2 / share
+            slope[name] = number * share * (change - 1.0)
             least, most = self.least, self.prior.size
             if name == "stretch":
                 least, most = (self.stretch, _MOST * most) if self.is_stretched(now) else (least, least)
-            new[name] = float(np.clip(ratio * change ** (1.0 - 0.5 * share), least / noise, most / noise))
+            wanted = now.ratios[name] * change ** (1.0 - 0.5 * share)
+            new[name] = min(max(wanted, least / noise), most / noise)
         allowed = self.allowed({name: ratio * noise for name, ratio in new.items()})
         return {name: size / noise for name, size in allowed.items()}, slope
 
@@ -400,24 +418,15 @@ class _Parts:
         return float(max(abs(np.log(new[name] / old[name])) for name in old))
 
     def posterior(self, now: _Solution) -> Posterior:
-        n, f, prior, solved = self.system.n, self.system.f, self.prior, now.solved
-        determined = 0.0
-        for name, ratio in now.ratios.items():
-            w, var, unit = self._coefficients(now, name)
-            determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        rest = solved.rest()
-        along = rest.camera_offsets.reshape(f, 3 * n)
-        followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
-        noise = np.sqrt(now.variance)
+        prior, solved, noise = self.prior, now.solved, math.sqrt(now.variance)
+        determined = sum(number - variance / size**2 for _, size, number, _, variance in self._parts(now))
         return Posterior(
             offsets=(prior.basis @ solved.smooth) + solved.single,
             variance=now.variance,
             camera_step=solved.camera,
-            camera=solved.camera_covariance,
-            followed=followed.reshape(f, n, 3),
-            std=noise * np.sqrt(np.maximum(rest.offset_variance, 0.0)),
-            sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
+            camera=solved.camera_root.T @ solved.camera_root,
+            sizes={name: ratio * noise for name, ratio in now.ratios.items()},
             determined=determined,
             evidence=now.evidence,
-            poses=rest.poses,
+            solved=(solved, prior, self.system.gauge),
         )

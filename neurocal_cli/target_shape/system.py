@@ -6,9 +6,6 @@ remaining system is dense. So the work grows linearly with the number of views o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,6 +61,7 @@ class System:
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
         by_shared = [info.point_camera, by_basis]
         self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
+        self.rows = np.empty_like(self.by_point)  # large arrays are quicker to fill again than to allocate
 
     def _with_points(self, shared: Array, right: Array, pose_shared: Array) -> Array:
         """The bordered matrix of cameras, smooth parts and poses, before points are eliminated."""
@@ -138,47 +136,26 @@ class System:
         return M
 
     def _poses_first(self, smooth: Array, single: Array) -> Solved:
-        s, f = self.s, self.f
-        dim = s + 3 * self.n
         M = self._without_poses(smooth, single)
-        root, logdet = _root_of_inverse(M[:dim, :dim])
-        half = root @ M[:dim, -1]
-        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
-        cost = float(M[-1, -1] - half @ half)
-        var_single = variance[s:].reshape(self.n, 3)
-
-        def rest() -> Rest:
-            inverse = root.T @ root
-            cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
-            along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
-            return Rest(
-                self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3)),
-                self._variance(inverse[f:s, f:s], cross, var_single, along_gauge),
-                self._poses(inverse),
-            )
-
-        return Solved(
-            x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
-            variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest,
+        root, logdet = _root_of_inverse(M[:-1, :-1])
+        half = root @ M[:-1, -1]
+        poses = None
+        if self.prior.stated is not None:
+            own = np.linalg.inv(self.info.pose)
+            by_point = self.info.pose_point.reshape(self.P, self.p, -1)
+            gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2) @ root.T
+            poses = own + gain @ np.swapaxes(gain, 1, 2)
+        x, s = half @ root, self.s
+        return self._solved(
+            x, x[s:], root, root[:, s:], np.zeros((self.n, 3, 3)), float(M[-1, -1] - half @ half),
+            logdet + self.logdet_poses, poses,
         )  # fmt: skip
-
-    def _poses(self, inverse: Array) -> Array | None:
-        """(P, 6, 6) covariance of the poses from that of all other unknowns; only for surveyed points.
-
-        Without a survey it would include the gauge freedom of the target.
-        """
-        if self.prior.stated is None:
-            return None
-        own = np.linalg.inv(self.info.pose)
-        by_point = self.info.pose_point.reshape(self.P, self.p, -1)
-        gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2)
-        return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
         own = self.info.point + single[:, :, None] * np.eye(3)
         root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
-        rows = root @ self.by_point
+        rows = np.matmul(root, self.by_point, out=self.rows)
         flat = rows.reshape(3 * self.n, -1)
         M = self.bordered - flat.T @ flat
         at = np.arange(self.f, self.s)
@@ -186,79 +163,45 @@ class System:
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
-        s, f, n, P, p = self.s, self.f, self.n, self.P, self.p
-        dim = s + p * P
+        s, n, P, p = self.s, self.n, self.P, self.p
         M, own_root, rows = self._without_points(smooth, single)
-        root, logdet = _root_of_inverse(M[:dim, :dim])
-        half = root @ M[:dim, -1]
-        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
-        cost = float(M[-1, -1] - half @ half)
+        root, logdet = _root_of_inverse(M[:-1, :-1])
+        half = root @ M[:-1, -1]
+        x, back = half @ root, np.swapaxes(own_root, 1, 2)
         # Back-substitution of the points: their response to all other unknowns.
-        back = np.swapaxes(own_root, 1, 2)
-        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        follow = (back @ rows[:, :, :-1]).reshape(3 * n, dim)
-        by_root = follow @ root.T
-        var_single = np.diagonal(back @ own_root, axis1=1, axis2=2) + (
-            np.einsum("ij,ij->i", by_root, by_root).reshape(n, 3)
-        )
+        e = back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None]
+        follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
         logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
+        own = root[:, s:].T.reshape(P, p, len(x))[:, :6]
+        return self._solved(
+            x, e, root, root @ -follow.T, back @ own_root, float(M[-1, -1] - half @ half), logdet,
+            own @ np.swapaxes(own, 1, 2),
+        )  # fmt: skip
 
-        def rest() -> Rest:
-            inverse, spread = root.T @ root, by_root @ root
-            cross = -spread.T.reshape(dim, n, 3)
-            own = ((back @ own_root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
-            along_gauge = own + spread @ (follow.T @ self.gauge)
-            return Rest(
-                self._with_offsets(inverse[:f, f:s], cross[:f]),
-                self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1)),
-                inverse[s:, s:].reshape(P, p, P, p)[np.arange(P), :6, np.arange(P), :6],
-            )
-
+    def _solved(
+        self,
+        x: Array,
+        single: Array,
+        root: Array,
+        single_root: Array,
+        own: Array,
+        cost: float,
+        logdet: float,
+        poses: Array | None,
+    ) -> Solved:
+        f, s = self.f, self.s
         return Solved(
-            x[:f], x[f:s], e, cost, logdet, variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest
-        )
-
-    def _with_offsets(self, smooth: Array, single: Array) -> Array:
-        """(f, n, 3) covariance between the cameras and the whole offsets."""
-        return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
-
-    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
-        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
-
-        With G the orthonormal gauge directions, it is the diagonal of (I - G G^T) C (I - G G^T).
-        """
-        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
-        diagonal = (
-            ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
-        )
-        by_smooth = np.einsum("nim,nig->mg", basis, G)
-        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
-        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
-        inner = np.einsum("nig,nih->gh", G, C_G)
-        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
-
-
-class Rest(NamedTuple):
-    """Blocks of the covariance that are needed only for the final sizes.
-
-    Attributes
-    ----------
-    camera_offsets : (f, n, 3) array
-        Covariance between the cameras and the whole offsets.
-    offset_variance : (n, 3) array
-        Variance of the whole offsets, without the gauge.
-    poses : (P, 6, 6) array, optional
-        Covariance of each pose.
-    """
-
-    camera_offsets: Array
-    offset_variance: Array
-    poses: Array | None
+            x[:f], x[f:s], single.reshape(self.n, 3), cost, logdet,
+            root[:, :f], root[:, f:s], single_root, own, poses,
+        )  # fmt: skip
 
 
 @frozen_dataclass(eq=False)
 class Solved:
-    """The minimum of the quadratic, and blocks of the inverse of its matrix.
+    """The minimum of the quadratic, and the inverse of its matrix: the covariance for unit noise.
+
+    The covariance of two unknowns is the product of their columns in the roots. To that of single points,
+    `own` is added.
 
     Attributes
     ----------
@@ -271,10 +214,11 @@ class Solved:
     cost : float
     logdet : float
         Log determinant of the whole matrix.
-    smooth_variance, single_variance : (m,), (n, 3) array
-    camera_covariance : (f, f) array
-    rest : callable
-        Computes further blocks.
+    camera_root, smooth_root, single_root : (d, f), (d, m), (d, 3 n) array
+    own : (n, 3, 3) array
+    poses : (P, 6, 6) array, optional
+        Covariance of each pose. Without a survey it includes the gauge freedom of the target, and is given
+        only if the points are eliminated first.
     """
 
     camera: Array
@@ -282,10 +226,37 @@ class Solved:
     single: Array
     cost: float
     logdet: float
-    smooth_variance: Array
-    single_variance: Array
-    camera_covariance: Array
-    rest: Callable[[], Rest]
+    camera_root: Array
+    smooth_root: Array
+    single_root: Array
+    own: Array
+    poses: Array | None
+
+    def smooth_variance(self, places: NDArray[np.intp]) -> float:
+        """Sum of the variances of some coefficients."""
+        return float(np.square(self.smooth_root[:, places]).sum())
+
+    def single_variance(self) -> Array:
+        """(n, 3) variances of the single points' parts."""
+        by_root = np.einsum("ij,ij->j", self.single_root, self.single_root).reshape(-1, 3)
+        return by_root + np.diagonal(self.own, axis1=1, axis2=2)
+
+    def offset_root(self, prior: Prior) -> Array:
+        """(d, 3 n) root of the whole offsets."""
+        return self.single_root + self.smooth_root @ prior.basis.reshape(self.single.size, -1).T
+
+    def offset_variance(self, prior: Prior, gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
+
+        With G the orthonormal gauge directions (3 n, 7), it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        root = self.offset_root(prior)
+        root = root - (root @ gauge) @ gauge.T
+        G = gauge.reshape(*self.single.shape, -1)
+        own = self.own @ G
+        inner = np.einsum("nig,nih->gh", G, own)
+        by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
+        return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
