@@ -129,9 +129,9 @@ def camera_step_of(info: Information) -> Array:
 
 
 def camera_step(S: Array, g: Array) -> Array:
-    """Steps of the cameras, given their matrix (f, f) and right sides (f,) or (f, k)."""
+    """Steps of the cameras, given their matrices (..., f, f) and right sides (f,) or (..., f, k)."""
     scaled, scale = unit_diagonal(S)
-    inverse = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale
+    inverse = np.linalg.pinv(scaled, hermitian=True) * scale[..., :, None] * scale[..., None, :]
     return np.asarray(inverse @ g)
 
 

@@ -17,6 +17,8 @@ plane, represented by its largest eigenfunctions. A solid target warps in all di
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,6 +85,12 @@ def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
     plane : (n,) int array
         Index of each point's plane, from 0.
     """
+    return _prior_of(given.tobytes(), plane.tobytes())
+
+
+@lru_cache(maxsize=4)  # one calibration asks three times for the same target, a millisecond each
+def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
+    given, plane = np.frombuffer(given_bytes).reshape(-1, 3), np.frombuffer(plane_bytes, dtype=np.intp)
     n, planes = len(given), int(plane.max()) + 1
     size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
     axes = np.empty((n, 3, 3))

@@ -74,26 +74,25 @@ def passes_cross_validation(
     except np.linalg.LinAlgError:
         return True
     tried = np.stack([np.zeros_like(offsets), *estimated])
+    # Costs minimised over cameras and poses: without offsets, and with those from all but each fold.
     if by_parts:
-        terms = [WithoutPoses(part).at(tried) for part in parts]
-
-    def costs(which: NDArray[np.intp]) -> Array:
-        """Costs minimised over cameras and poses: without offsets, and with those from all but each fold."""
-        if not by_parts:
-            return _least(WithoutPoses(information(which)).at(tried))
-        some = [terms[fold] for fold in which]
-        return _least((sum(S for S, *_ in some), sum(g for _, g, _ in some), sum(c for *_, c in some)))
-
-    whole = costs(folds)
-    alone, together = 0.0, -n_folds * whole[0]
-    for fold in range(n_folds):
-        out, rest = costs(folds[folds == fold]), costs(folds[folds != fold])
-        alone += out[1 + fold] - out[0]
-        together += whole[1 + fold] - rest[1 + fold] + rest[0]
+        terms = [
+            np.stack(term) for term in zip(*(WithoutPoses(part).at(tried) for part in parts), strict=True)
+        ]
+        sums = [term.sum(axis=0) for term in terms]
+        whole = _least(*sums)
+        out = _least(*terms)
+        rest = _least(*(total - term for total, term in zip(sums, terms, strict=True)))
+    else:
+        whole = _least(*WithoutPoses(information(folds)).at(tried))
+        out = np.stack([_least(*WithoutPoses(part).at(tried)) for part in parts])
+        rest = np.stack([_least(*WithoutPoses(other).at(tried)) for other in others])
+    own = out[folds, 1 + folds], rest[folds, 1 + folds]
+    alone = (own[0] - out[:, 0]).sum()
+    together = (whole[1:] - own[1] + rest[:, 0]).sum() - n_folds * whole[0]
     return bool(alone < 0 or together < 0)
 
 
-def _least(terms: tuple[Array, Array, Array]) -> Array:
-    """Costs (k,) minimised over the cameras."""
-    S, g, cost = terms
-    return np.asarray(cost - (g * camera_step(S, g)).sum(axis=0))
+def _least(S: Array, g: Array, cost: Array) -> Array:
+    """Costs (..., k) minimised over the cameras."""
+    return np.asarray(cost - (g * camera_step(S, g)).sum(axis=-2))
