@@ -7,7 +7,7 @@ over views (`view_covariance`), and the model uncertainty of the selected distor
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,10 +26,38 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
 
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.open_coefficients import OpenCoefficients
+
+
+@frozen_dataclass(eq=False)
+class CovarianceBasis:
+    """Input of a camera's covariance (`covariance`, `counting_views`).
+
+    Attributes
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        As from `reprojection.normal_blocks`; if the target was estimated, with the efficient scores of the
+        free camera parameters.
+    shared : (f, f) array or None
+        Covariance of A's free entries and the free distortion coefficients, normalised, if it does not follow
+        from the normal matrices.
+    n_equations : float
+        Number of equations minus the effective number of estimated unknowns of the target.
+    moves_without : callable, optional
+        (P, f) moves of the free parameters when the views of each pose are left out and the target is
+        estimated again, given the pose (V,) of each view. None if there are many poses: then the efficient
+        scores give the same.
+    poses : (V, 6, 6) array, optional
+        Covariance of the poses, if it does not follow from the normal matrices.
+    """
+
+    normal: Array
+    shared: Array | None
+    n_equations: float
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+    poses: Array | None = None
 
 
 @frozen_dataclass(eq=False)
@@ -213,6 +241,8 @@ def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
 def _basis(
     seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
 ) -> CovarianceBasis:
-    return covariance_basis(
-        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, shared
-    )
+    if seen.target is None:
+        return CovarianceBasis(normal, shared, seen.views.n_equations)
+    from neurocal_cli.target_shape.uncertainty import covariance_basis
+
+    return covariance_basis(seen.target, seen.views, state, free, seen.free_poses, seen.points, normal)

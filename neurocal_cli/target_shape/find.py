@@ -21,8 +21,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
-from neurocal_cli.target_shape.bend_size import most_probable_precision
-from neurocal_cli.target_shape.bend_validation import bends_are_valid
+from neurocal_cli.target_shape.bend_evidence import bends_are_valid, most_probable_precision
 from neurocal_cli.target_shape.information import (
     Information,
     Sight,

@@ -78,8 +78,8 @@ class Posterior:
         """(n, 3) standard deviations of the offsets, along each point's axes [world unit]."""
         if self.solved is None:
             return np.zeros_like(self.offsets)
-        solved, *rest = self.solved
-        return np.sqrt(self.variance * np.maximum(solved.offset_variance(*rest), 0.0))
+        solved, prior, gauge = self.solved
+        return np.sqrt(self.variance * np.maximum(solved.offset_variance(prior, gauge), 0.0))
 
     @property
     def poses(self) -> Array | None:

@@ -11,7 +11,7 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.target import distinct_points, is_flat, planes_of
-from neurocal_cli.target_shape.bend_size import most_probable_precision
+from neurocal_cli.target_shape.bend_evidence import most_probable_precision
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search, searched
 from neurocal_cli.target_shape.information import of_views, without_points
 from neurocal_cli.target_shape.posterior import evidence_of_given
