@@ -164,30 +164,15 @@ def posterior(
 ) -> Posterior:
     """Estimate the sizes of the parts, and the offsets.
 
-    Parameters
-    ----------
-    info : Information
-        In the whole offsets from the given target, along each point's axes.
-    prior : Prior
-    sizes : dict of float by name [world unit], optional
-        Initial sizes.
-    flat : bool
-        Whether the points stay in their plane.
-    variance : float, optional [px^2]
-        Initial noise variance. It is needed with initial sizes, because then the errors on the given target
-        are no noise.
-    with_stretch : bool
-        Whether the stretch may be switched on or off.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The points do not determine the cameras.
+    The quadratic is in the whole offsets from the given target, along each point's axes. With initial sizes
+    [world unit], an initial noise variance [px^2] is needed as well, because then the errors on the given
+    target are no noise. Flat means that the points stay in their plane, and `with_stretch` that the stretch
+    may be switched on or off. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     parts = _Parts(info, prior, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
-    start = parts.start() if sizes is None else parts.allowed(sizes)
-    now = parts.climbed(parts.at({name: size / noise for name, size in start.items()}))
+    start = sizes or {name: _START[name] * prior.size for name in (*prior.groups, *_SINGLE)}
+    now = parts.climbed(parts.at({name: size / noise for name, size in parts.allowed(start).items()}))
     if with_stretch and "stretch" in now.ratios:
         other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
         now = other if other.evidence > now.evidence else now
@@ -215,12 +200,7 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     """The posterior for known sizes and a known noise variance.
 
     For surveyed points the std keeps the given variance, because their stated sizes do not follow the
-    residuals.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Points that do not determine the cameras.
+    residuals. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     parts = _Parts(info, prior, flat=False)
     noise = np.sqrt(variance)
@@ -231,16 +211,11 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
 def minimum_of(
     info: Information, prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> tuple[Array, Array]:
-    """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Points that do not determine the cameras.
-    """
-    parts = _Parts(info, prior, flat=False)
-    noise = np.sqrt(variance)
-    return parts.minimum({name: size / noise for name, size in sizes.items()})
+    """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
+    parts, noise = _Parts(info, prior, flat=False), np.sqrt(variance)
+    ratios = {name: size / noise for name, size in sizes.items()}
+    step, smooth, single = parts.system.minimum(parts.of_smooth(ratios), parts.of_points(ratios))
+    return step, np.asarray(prior.basis @ smooth + single)
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
@@ -290,10 +265,6 @@ class _Parts:
         self.least, self.stretch = _NOTHING * prior.size, STRETCH * prior.size
         self.spare, self.log_precision = info.spare, info.log_precision
 
-    def start(self) -> dict[str, float]:
-        names = (*self.prior.groups, *_SINGLE)
-        return self.allowed({name: _START[name] * self.prior.size for name in names})
-
     def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
         """The sizes, without out-of-plane parts if the target must stay flat."""
         return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
@@ -304,11 +275,6 @@ class _Parts:
         logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
         evidence = log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
-
-    def minimum(self, ratios: dict[str, float]) -> tuple[Array, Array]:
-        """Step (f,) of the cameras and offsets (n, 3) for these sizes."""
-        step, smooth, single = self.system.minimum(self.of_smooth(ratios), self.of_points(ratios))
-        return step, np.asarray(self.prior.basis @ smooth + single)
 
     def of_smooth(self, ratios: Mapping[str, float]) -> Array:
         """(m,) precisions of the smooth coefficients, in units of the noise precision."""
@@ -329,9 +295,8 @@ class _Parts:
         solved, prior = now.solved, self.prior
         for name, places in prior.groups.items():
             w = solved.smooth[places]
-            yield (
-                name, now.ratios[name] / prior.size, len(w), float(w @ w), solved.smooth_variance(places)
-            )  # fmt: skip
+            size = now.ratios[name] / prior.size
+            yield name, size, len(w), float(w @ w), solved.smooth_variance(places)
         variance, squares = solved.single_variance(), solved.single**2
         if prior.stated is not None:
             squares, variance = squares / prior.stated**2, variance / prior.stated**2
@@ -373,9 +338,9 @@ class _Parts:
         before, reach = dict.fromkeys(now.ratios, 0.0), dict.fromkeys(now.ratios, 1.0)
         for _ in range(_PASSES):
             wanted, slope = self.renewed(now)
-            if self.change(now.ratios, wanted) < _SETTLED:
+            step = {name: math.log(wanted[name] / ratio) for name, ratio in now.ratios.items()}
+            if max(map(abs, step.values())) < _SETTLED:
                 break
-            step = {name: float(np.log(wanted[name] / ratio)) for name, ratio in now.ratios.items()}
             reach = {
                 name: min(2 * reach[name], _FARTHEST) if by * before[name] > 0 else 1.0
                 for name, by in step.items()
@@ -384,9 +349,7 @@ class _Parts:
             promised = sum(by * np.log(wanted[name] / now.ratios[name]) for name, by in slope.items())
             if 0.5 * promised < self.least_gain:
                 break
-            better = next(self.better(now, wanted), None)
-            if better is None:
-                break
+            better = self.better(now, wanted)
             gain, now, before = better.evidence - now.evidence, better, step
             if gain < self.least_gain:
                 break
@@ -394,28 +357,23 @@ class _Parts:
 
     def beyond(self, now: _Solution, step: dict[str, float], reach: dict[str, float]) -> dict[str, float]:
         """Sizes after the given multiples of steps in their logarithms; a stretch has its own limits."""
-        noise, most = np.sqrt(now.variance), self.prior.size
-        sizes = {
-            name: ratio * noise * np.exp(step[name] * (1.0 if name == "stretch" else reach[name]))
-            for name, ratio in now.ratios.items()
-        }
-        return {
-            name: size / noise if name == "stretch" else float(np.clip(size, self.least, most) / noise)
-            for name, size in sizes.items()
-        }
+        noise, beyond = math.sqrt(now.variance), {}
+        for name, ratio in now.ratios.items():
+            if name == "stretch":
+                beyond[name] = ratio * math.exp(step[name])
+                continue
+            size = ratio * noise * math.exp(step[name] * reach[name])
+            beyond[name] = min(max(size, self.least), self.prior.size) / noise
+        return beyond
 
-    def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
-        """Solutions with higher evidence on the way to the wanted sizes, by step halving."""
+    def better(self, now: _Solution, wanted: dict[str, float]) -> _Solution:
+        """A solution with higher evidence on the way to the wanted sizes, by step halving, or this one."""
         for halvings in range(_HALVINGS):
             part = 0.5**halvings
-            trial = {name: ratio * (wanted[name] / ratio) ** part for name, ratio in now.ratios.items()}
-            found = self.at(trial)
+            found = self.at({name: r * (wanted[name] / r) ** part for name, r in now.ratios.items()})
             if found.evidence > now.evidence:
-                yield found
-
-    def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
-        """Largest relative change of the sizes."""
-        return float(max(abs(np.log(new[name] / old[name])) for name in old))
+                return found
+        return now
 
     def posterior(self, now: _Solution) -> Posterior:
         prior, solved, noise = self.prior, now.solved, math.sqrt(now.variance)

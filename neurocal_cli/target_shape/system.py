@@ -145,9 +145,10 @@ class System:
             gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2) @ root.T
             poses = own + gain @ np.swapaxes(gain, 1, 2)
         x, s = half @ root, self.s
-        return self._solved(
-            x, x[s:], root, root[:, s:], np.zeros((self.n, 3, 3)), float(M[-1, -1] - half @ half),
-            logdet + self.logdet_poses, poses,
+        return Solved(
+            x[: self.f], x[self.f : s], x[s:].reshape(self.n, 3), float(M[-1, -1] - half @ half),
+            logdet + self.logdet_poses, root[:, : self.f], root[:, self.f : s], root[:, s:],
+            np.zeros((self.n, 3, 3)), poses,
         )  # fmt: skip
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
@@ -162,7 +163,7 @@ class System:
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
-        s, n, P, p = self.s, self.n, self.P, self.p
+        f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
         M, own_root, rows = self._without_points(smooth, single)
         root, logdet = _root_of_inverse(M[:-1, :-1])
         half = root @ M[:-1, -1]
@@ -172,26 +173,9 @@ class System:
         follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
         logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
         own = root[:, s:].T.reshape(P, p, len(x))[:, :6]
-        return self._solved(
-            x, e, root, root @ -follow.T, back @ own_root, float(M[-1, -1] - half @ half), logdet,
-            own @ np.swapaxes(own, 1, 2),
-        )  # fmt: skip
-
-    def _solved(
-        self,
-        x: Array,
-        single: Array,
-        root: Array,
-        single_root: Array,
-        own: Array,
-        cost: float,
-        logdet: float,
-        poses: Array | None,
-    ) -> Solved:
-        f, s = self.f, self.s
         return Solved(
-            x[:f], x[f:s], single.reshape(self.n, 3), cost, logdet,
-            root[:, :f], root[:, f:s], single_root, own, poses,
+            x[:f], x[f:s], e[..., 0], float(M[-1, -1] - half @ half), logdet,
+            root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root, own @ np.swapaxes(own, 1, 2),
         )  # fmt: skip
 
 
