@@ -66,14 +66,8 @@ class CameraSeen:
 
     Attributes
     ----------
-    views : Views
-    state : CameraState
-    normal : (V, 12 + K, 12 + K) array
-        From `reprojection.normal_blocks`.
-    free : (5 + K,) bool array
-        Of A's entries and the distortion coefficients.
-    free_poses : bool
-    repeated : RepeatedPoses
+    views, state, normal, free, free_poses, repeated
+        As for `counting_views`; the normal matrices are from `reprojection.normal_blocks`.
     points : Correspondences
         With the world coordinates of the estimated target, if any.
     target : Target, optional
@@ -109,13 +103,8 @@ class WideCovariance:
     The projection is less uncertain than the covariance of the estimated parameters alone suggests, because
     the open coefficients and the parameters correlated with them compensate.
 
-    Attributes
-    ----------
-    open : OpenCoefficients
-    normal : (V, 12 + K, 12 + K) array
-        Normal matrices of the extended camera.
-    entries : (f, f) array
-        Covariance of all free parameters, including the open ones.
+    `normal` (V, 12 + K, 12 + K) are the normal matrices of the extended camera, and `entries` (f, f) is the
+    covariance of all free parameters, including the open ones.
     """
 
     open: OpenCoefficients
@@ -150,10 +139,7 @@ class CameraCovariance:
 def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     """Covariance of a camera at its minimum.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The points do not determine a camera whose target was estimated.
+    Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
     """
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
@@ -179,28 +165,24 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from the selection of the distortion model."""
-    from neurocal_cli.bundle_adjustment.open_coefficients import corner_radius, open_coefficients, radius
+    from neurocal_cli.bundle_adjustment import open_coefficients as coefficients
 
     views, state = seen.views, seen.state
-    reach = radius(views, state)
-    corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
-    richer = open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
-    return known if richer is None else _opened(seen, known, richer, variance)
-
-
-def _opened(
-    seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients, variance: float
-) -> CameraCovariance:
-    from neurocal_cli.bundle_adjustment.open_coefficients import spread_of_open, wide_covariance
-
-    state = richer.state(seen.state)
+    reach = coefficients.radius(views, state)
+    corner = coefficients.corner_radius(
+        state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
+    )
+    richer = coefficients.open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
+    if richer is None:
+        return known
+    state = richer.state(state)
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
     left_out = richer.prior.left_out
-    spread = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    spread = coefficients.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
-    entries = wide_covariance(known.found.entries, E, follow, left_out)
+    entries = coefficients.wide_covariance(known.found.entries, E, follow, left_out)
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses

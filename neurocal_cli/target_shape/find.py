@@ -57,13 +57,8 @@ most; tests/test_simulated_targets.py (slow) checks that clean sets keep the giv
 class Found:
     """An estimated target, with the problems and their minima for it.
 
-    Attributes
-    ----------
-    target : Target
-    fits : tuple of (Problem, Adjusted)
-        The points of each problem have the target's coordinates.
-    evidence : float
-        Log evidence, comparable between distortion models.
+    The points of each problem have the target's coordinates. The log evidence is comparable between
+    distortion models.
     """
 
     target: Target
@@ -86,28 +81,17 @@ def find_target(
     known: Target | None = None,
     least_gain: float = -np.inf,
 ) -> Found | None:
-    """Estimate the true positions of a target's points.
+    """Estimate the true positions of a target's points, from cameras at their minimum.
 
-    Parameters
-    ----------
-    fits : sequence of (Problem, Adjusted)
-        Cameras that observed the target, each at its minimum. Points with equal coordinates are the same.
-    flat : bool
-        Whether the points stay in their planes.
-    known : Target, optional
-        Estimated target whose coordinates the points of the fits have already; the starting point.
-    least_gain : float
-        The search ends early if the gain in log evidence will be smaller.
-
-    Returns
-    -------
-    Found or None
-        None if the points do not determine a target, or if the result is too different from the given one.
+    Points with equal coordinates are the same. Flat means that they stay in their planes. `known` is an
+    estimated target whose coordinates the points have already; the search starts from it. It ends early if
+    the gain in log evidence will be smaller than `least_gain`. None if the points do not determine a target,
+    or if the result is too different from the given one.
     """
     some = _few_enough(fits, known)
     if some is None:
         return None
-    found = searched(Search(some, flat, known), least_gain)
+    found = Search(some, flat, known).result(least_gain)
     return found if found is None or some is fits else _of_all_views(found, fits, known)
 
 
@@ -130,28 +114,17 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
 
     It is -inf if the points do not determine the cameras.
     """
+
+    def of_camera(problem: Problem, adjusted: Adjusted) -> Information:
+        """The quadratic of one camera, with fixed target points."""
+        views, no_label = problem.views, np.zeros(0, dtype=np.intp)
+        normal = views.pixel_scale**2 * adjusted.normal
+        return of_views(sight_of(problem, adjusted, no_label), normal, np.ones(views.n_views, dtype=bool))
+
     try:
-        return evidence_of_given(*(_with_given_points(*fit) for fit in _few_enough(fits, None) or fits))
+        return evidence_of_given(*(of_camera(*fit) for fit in _few_enough(fits, None) or fits))
     except np.linalg.LinAlgError:
         return -np.inf
-
-
-def _with_given_points(problem: Problem, adjusted: Adjusted) -> Information:
-    """The quadratic of one camera at its minimum, with fixed target points."""
-    views = problem.views
-    none = np.zeros(0, dtype=np.intp)
-    sight = Sight(views, adjusted.state, problem.free_camera, problem.free_poses, none)
-    normal = views.pixel_scale**2 * adjusted.normal
-    return of_views(sight, normal, np.ones(views.n_views, dtype=bool))
-
-
-def searched(search: Search, least_gain: float) -> Found | None:
-    """Result of a search; None also if the points do not determine the target."""
-    try:
-        with np.errstate(all="ignore"):
-            return search.run(least_gain)
-    except np.linalg.LinAlgError:
-        return None
 
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
@@ -176,16 +149,10 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
 
 
 class Search:
-    """State of the search: target and fits.
+    """State of the search for a target, with arguments as for `find_target`.
 
-    Parameters
-    ----------
-    fits, flat, known
-        As for `find_target`.
-    bending : bool
-        Whether each view has a bend of its own (one camera only); always if the known target has bends.
-    still : bool
-        Whether the common points stay as given, so that only the bends are estimated.
+    If it is bending (always if the known target has bends), each view of the only camera has a bend of its
+    own. If it is still, the common points stay as given, so that only the bends are estimated.
     """
 
     def __init__(
@@ -219,7 +186,15 @@ class Search:
         self.bends = np.zeros((len(names), N_SHAPES)) if bends is None else bends.of_views(names)
         self.precision = 1.0
 
-    def run(self, least_gain: float) -> Found | None:
+    def result(self, least_gain: float) -> Found | None:
+        """As for `find_target`."""
+        try:
+            with np.errstate(all="ignore"):
+                return self._run(least_gain)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _run(self, least_gain: float) -> Found | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
         last = 0.0
@@ -355,23 +330,16 @@ class Search:
         if self.surface is not None:
             size = float(np.sqrt(found.variance / self.precision))
             bends = Bends(size, self.fits[0][0].views.names, self.bends)
+        std = np.sqrt(variance)
         return Target(
-            self.given,
-            self._common(),
-            np.sqrt(variance),
-            self.plane,
-            found.sizes,
-            self.flat,
-            gain,
-            self.ids,
-            bends=bends,
+            self.given, self._common(), std, self.plane, found.sizes, self.flat, gain, self.ids, bends=bends
         )
 
 
 def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:
     """Observations of a fit's camera; label (N,) in the order of its points."""
     views = problem.views
-    ordered = label if views.order is None else label[views.order]
+    ordered = label if views.order is None or not len(label) else label[views.order]
     return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
 
 

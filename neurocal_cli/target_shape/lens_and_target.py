@@ -63,12 +63,7 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
 def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
     """Whether more distortion coefficients and the given target fit better than the found target.
 
-    Parameters
-    ----------
-    fits : sequence of (Problem, Adjusted)
-        Each camera at its minimum for the given target.
-    found : Found
-        For the same lenses.
+    Each camera is at its minimum for the given target, and `found` has the same lenses.
     """
     estimated = [p.free[0] and a.state.model in POLYNOMIAL_MODELS for p, a in fits]
     simplest = min(
