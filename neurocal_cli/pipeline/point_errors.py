@@ -32,12 +32,9 @@ _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 class PointErrors:
     """Weighted errors of all points [px]; infinite for points behind the camera or in views left out.
 
-    Attributes
-    ----------
-    length : (N,) array
-    parts : (N, 2) array
-        Two independent errors of each point with the same standard deviation. For points measured across an
-        edge these are the errors across and along it; the latter may be far smaller, but not larger.
+    Besides its `length` (N,), each point has two `parts` (N, 2): independent errors with the same standard
+    deviation. For points measured across an edge these are the errors across and along it; the latter may be
+    far smaller, but not larger.
     """
 
     length: Array

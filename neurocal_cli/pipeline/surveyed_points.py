@@ -34,20 +34,9 @@ def with_survey(
 ) -> tuple[Solution, Rejected]:
     """Adjust camera and points together.
 
-    Parameters
-    ----------
-    problem : Problem
-        With all points, at their surveyed coordinates.
-    solution, rejected
-        Calibrated as if the survey were exact.
-    options : Options
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the camera; the message says why.
-    InputError
-        A point has two different standard deviations.
+    The problem has all points, at their surveyed coordinates; the solution and the rejected points are
+    calibrated as if the survey were exact. Raises `DegenerateGeometryError` if the points do not determine
+    the camera, and `InputError` if a point has two different standard deviations.
     """
     again, outliers = _judged(problem, solution, rejected, options, 1.0)
     factor = 1.0 if again.target is None else again.target.sizes["stated"]
