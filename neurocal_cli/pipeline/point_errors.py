@@ -105,10 +105,15 @@ def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Ar
         variance = variance_across(stated, across)[:, None]
         stated = np.where(single(across)[:, None], variance * np.array([1.0, 0.0, 1.0]), stated)
     suu, suv, svv = stated.T
-    du, dv = residuals.T
-    squared = (svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv)
     information = 0.5 * (suu + svv) / (suu * svv - suv * suv)
-    return np.sqrt(squared / information.mean())
+    return np.sqrt(squared_whitened(residuals, stated) / information.mean())
+
+
+def squared_whitened(r: Array, covariance: Array) -> Array:
+    """(N,) r^T C^-1 r of residuals (N, 2) with covariances (N, 3)."""
+    suu, suv, svv = covariance.T
+    du, dv = r.T
+    return np.asarray((svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv))
 
 
 def _parts(length: Array, residuals: Array, across: Array | None) -> Array:

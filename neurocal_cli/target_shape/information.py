@@ -130,17 +130,16 @@ class Information:
     def turned(self, axes: Array) -> Information:
         """Express each point's offset in its own axes, the columns of (n, 3, 3)."""
         transposed = np.swapaxes(axes, 1, 2)
-        alike = bool((axes == axes[:1]).all())  # with a single plane one product suffices
+        if (axes == axes[:1]).all():  # with a single plane one product suffices
+            pose_point = (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
+        else:
+            pose_point = np.einsum("pqni,nij->pqnj", self.pose_point, axes)
         return replace(
             self,
             point=transposed @ self.point @ axes,
             point_camera=transposed @ self.point_camera,
             point_right=(transposed @ self.point_right[..., None])[..., 0],
-            pose_point=(
-                (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
-                if alike
-                else np.einsum("pqni,nij->pqnj", self.pose_point, axes)
-            ),
+            pose_point=pose_point,
         )
 
     def around_given(self, offsets: Array) -> Information:
@@ -217,13 +216,8 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
 class PointTerms:
     """Sums of products with the derivatives by the target points, for one camera, normalised.
 
-    Attributes
-    ----------
-    normal : (V, 12 + K, 12 + K) array
-        As from `normal_blocks`; with bends, three columns for them before the residual.
-    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
-        Points in the world's axes and unit.
-    pose_point : (V, p, n, 3) array
+    `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
+    the residual. The rest is as in `Information`.
     """
 
     normal: Array

@@ -22,6 +22,7 @@ from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 # Nested models: each has the coefficients of the previous one and more.
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
+_PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
 
 def find_lens_and_target(
@@ -49,11 +50,7 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
     """Estimate the target with every camera's next distortion model; None at the end of the chain."""
     fits = []
     for problem, adjusted in found.fits:
-        place = (
-            POLYNOMIAL_MODELS.index(adjusted.state.model) + step
-            if adjusted.state.model in POLYNOMIAL_MODELS
-            else -1
-        )
+        place = _PLACES.get(adjusted.state.model, -2) + step
         if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
             return None
         fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
@@ -65,23 +62,16 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
 
     Each camera is at its minimum for the given target, and `found` has the same lenses.
     """
-    estimated = [p.free[0] and a.state.model in POLYNOMIAL_MODELS for p, a in fits]
-    simplest = min(
-        (
-            POLYNOMIAL_MODELS.index(a.state.model)
-            for (_, a), free in zip(fits, estimated, strict=True)
-            if free
-        ),
-        default=len(POLYNOMIAL_MODELS),
-    )
+    end = len(POLYNOMIAL_MODELS)
+    places = [_PLACES.get(a.state.model, end) if problem.free[0] else end for problem, a in fits]
     least = 0.5 * (evidence_as_given(fits) + found.evidence)
-    for model in POLYNOMIAL_MODELS[simplest + 1 :]:
-        moved = [
-            free and _is_simpler(fit[1].state.model, model) for fit, free in zip(fits, estimated, strict=True)
-        ]
+    for place in range(min(places) + 1, end):
         # A linear prediction that reaches less than half of the found target's gain settles it.
         for richer_of, wanted in ((_linearised_with, least), (_adjusted_with, found.evidence)):
-            richer = [richer_of(*fit, model) if move else fit for fit, move in zip(fits, moved, strict=True)]
+            richer = [
+                richer_of(*fit, POLYNOMIAL_MODELS[place]) if own < place else fit
+                for fit, own in zip(fits, places, strict=True)
+            ]
             if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > wanted:
                 break
         else:
@@ -96,10 +86,6 @@ def _log_prior_of_added(
         log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
         for (_, before), (problem, after) in zip(fits, richer, strict=True)
     )
-
-
-def _is_simpler(model: str, other: str) -> bool:
-    return POLYNOMIAL_MODELS.index(model) < POLYNOMIAL_MODELS.index(other)
 
 
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:

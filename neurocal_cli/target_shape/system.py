@@ -19,19 +19,17 @@ _RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefin
 
 
 class System:
-    """The quadratic with its parts; everything independent of the precisions is computed once.
+    """The quadratic in the whole offsets along each point's axes, with its parts.
 
-    Parameters
-    ----------
-    info : Information
-        In the whole offsets from the given target, along each point's axes.
-    prior : Prior
+    Everything independent of the precisions is computed once. `s` is the number of camera parameters and
+    smooth coefficients.
     """
 
     def __init__(self, info: Information, prior: Prior) -> None:
         self.info, self.prior = info, prior
         self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
+        self.s = self.f + self.m
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= self.p * self.P
         if self.points_first:
@@ -39,17 +37,12 @@ class System:
         else:
             self._eliminate_poses()
 
-    @property
-    def s(self) -> int:
-        """Number of camera parameters and smooth coefficients."""
-        return self.f + self.m
-
     def _prepare(self) -> None:
         """Compute the matrices from which the points will be eliminated."""
         info, basis = self.info, self.prior.basis
         by_basis = info.point @ basis  # (n, 3, m)
-        across = np.einsum("nif,nim->fm", info.point_camera, basis)
         flat = basis.reshape(3 * self.n, self.m)
+        across = info.point_camera.reshape(3 * self.n, self.f).T @ flat
         inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
         shared = np.block([[info.camera, across], [across.T, inner]])
         right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
