@@ -20,19 +20,10 @@ from neurocal_cli.target_shape.surveyed import find_surveyed
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
-    """Estimate the target's shape from the views of all cameras.
+    """Estimate the target's shape from the views of all cameras; None if the target stays as given.
 
-    Parameters
-    ----------
-    cameras : sequence of Calibration
-        All in the same world unit. Either none holds a target, or all hold the same one, which is then the
-        starting point.
-    choice : {"auto", "given", "flat", "free"}
-
-    Returns
-    -------
-    Target or None
-        None if the target stays as given.
+    The cameras are in the same world unit. Either none holds a target, or all hold the same one, which is
+    then the starting point. The choice is "auto", "given", "flat" or "free".
     """
     if choice != "given" and any(
         camera.target is not None and camera.target.stated is not None for camera in cameras

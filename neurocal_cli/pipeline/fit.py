@@ -41,10 +41,7 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def fit(problem: Problem, options: Options) -> Solution:
     """Fit a camera and its distortion model from random weights.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the camera; the message says why.
+    Raises `DegenerateGeometryError` if the points do not determine the camera; the message says why.
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
@@ -67,13 +64,7 @@ def fit_again(
 ) -> Solution:
     """Fit other points of the same views (or of some of them), starting from a solution.
 
-    Parameters
-    ----------
-    solution : Solution
-    points : Correspondences
-    options : Options
-    only_from_here : bool
-        Whether to try no other starts, because the solution is already near the minimum.
+    With `only_from_here`, no other starts are tried, because the solution is already near the minimum.
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
@@ -86,20 +77,19 @@ def fit_again(
 def _finished(solution: Solution, options: Options, only_from_here: bool = False) -> Solution:
     """Select the distortion model, and reweight the points as far as the residuals support that."""
     chosen = options.distortion == "auto"
-    if chosen and only_from_here:
-        from neurocal_cli.distortion.model_selection import select_model
-
-        solution = select_model(solution, preferred=options.preferred)
-    elif chosen:
-        solution = _with_selected_model(solution, options)
+    if chosen:
+        solution = _with_selected_model(solution, options, only_from_here)
     solution = reweighted(solution)
     if not chosen or solution.problem.points.covariance is not None:  # reweighting may have moved it
         solution = check_distortion(solution)
     return solution
 
 
-def _with_selected_model(solution: Solution, options: Options) -> Solution:
+def _with_selected_model(solution: Solution, options: Options, only_from_here: bool) -> Solution:
     from neurocal_cli.distortion.model_selection import select_model
+
+    if only_from_here:
+        return select_model(solution, preferred=options.preferred)
 
     def more_starts(problem: Problem) -> Iterator[CameraState]:
         return _distorted_starts(problem, options)

@@ -36,23 +36,10 @@ _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:
-    """Explain why one view contradicts the others.
+    """Explain why one view, of which these are the points, contradicts the others.
 
-    Parameters
-    ----------
-    points : Correspondences
-        The points of this view alone.
-    camera : Camera
-        The camera calibrated from the other views.
-    rmse_px : float [px]
-        Rms error of the other views.
-    otherwise : str
-        The reason to return if no hypothesis fits.
-
-    Returns
-    -------
-    str
-        "its u and v are exchanged", for example.
+    The camera is calibrated from the other views, and `rmse_px` is their rms error [px]. A reason is "its u
+    and v are exchanged", for example; it is `otherwise` if no hypothesis fits.
     """
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise

@@ -48,10 +48,8 @@ _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens can
 def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
     """Fit a camera, leaving outliers out.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the camera (the message says why), or at least half of them are outliers.
+    Raises `DegenerateGeometryError` if the points do not determine the camera (the message says why), or if
+    at least half of them are outliers.
     """
     failure: DegenerateGeometryError | None = None
     first: Solution | None = None
@@ -71,17 +69,9 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
 def judged_again(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options
 ) -> tuple[Solution, Rejected]:
-    """Judge all points again by a lens that was fitted to the points an earlier lens had kept.
+    """Judge all points of a problem again by the lens of a solution.
 
-    Parameters
-    ----------
-    problem : Problem
-        With all points.
-    solution : Solution
-        With the new lens.
-    rejected : Rejected
-        Points that the earlier lens rejected; no whole views.
-    options : Options
+    It was fitted to the points an earlier lens had kept; that lens had rejected points, but no whole views.
     """
     search = _Search(problem, options)
     search.solution = solution
@@ -262,14 +252,10 @@ class _Search:
 
     def _explain(self) -> None:
         """Diagnose each view that was left out."""
-        if not self.wrong_views:
-            return
-        camera = self.solution.camera
-        rmse = rms(self.solution)
         for name, reason in self.wrong_views.items():
             rows = self.points.view_index == self.points.view_names.index(name)
             plain = replace(self.points.select(rows), covariance=None, across=None)
-            self.wrong_views[name] = why_odd(plain, camera, rmse, reason)
+            self.wrong_views[name] = why_odd(plain, self.solution.camera, rms(self.solution), reason)
 
 
 def _suspicious(solution: Solution) -> bool:

@@ -32,12 +32,9 @@ _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 class PointErrors:
     """Weighted errors of all points [px]; infinite for points behind the camera or in views left out.
 
-    Attributes
-    ----------
-    length : (N,) array
-    parts : (N, 2) array
-        Two independent errors of each point with the same standard deviation. For points measured across an
-        edge these are the errors across and along it; the latter may be far smaller, but not larger.
+    Besides its `length` (N,), each point has two `parts` (N, 2): independent errors with the same standard
+    deviation. For points measured across an edge these are the errors across and along it; the latter may be
+    far smaller, but not larger.
     """
 
     length: Array
@@ -108,10 +105,15 @@ def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Ar
         variance = variance_across(stated, across)[:, None]
         stated = np.where(single(across)[:, None], variance * np.array([1.0, 0.0, 1.0]), stated)
     suu, suv, svv = stated.T
-    du, dv = residuals.T
-    squared = (svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv)
     information = 0.5 * (suu + svv) / (suu * svv - suv * suv)
-    return np.sqrt(squared / information.mean())
+    return np.sqrt(squared_whitened(residuals, stated) / information.mean())
+
+
+def squared_whitened(r: Array, covariance: Array) -> Array:
+    """(N,) r^T C^-1 r of residuals (N, 2) with covariances (N, 3)."""
+    suu, suv, svv = covariance.T
+    du, dv = r.T
+    return np.asarray((svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv))
 
 
 def _parts(length: Array, residuals: Array, across: Array | None) -> Array:

@@ -40,10 +40,7 @@ def calibration_of(
 ) -> Calibration:
     """Convert a solution to pixels and world units, with standard deviations and warnings.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the camera.
+    Raises `DegenerateGeometryError` if the points do not determine the camera.
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state

@@ -43,22 +43,11 @@ _ALIKE, _NOISE = 0.05, 0.15
 def with_rich_lens(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
-    """Choose a rich lens if it predicts decidedly better.
+    """Choose a rich lens if it predicts decidedly better; else solution and rejected points stay.
 
-    Parameters
-    ----------
-    problem : Problem
-        With all points, at the world coordinates of their file.
-    solution, rejected
-        The best other lens, with the target if it was estimated.
-    options : Options
-    choice : {"auto", "given", "flat", "free"}
-        How the target is estimated. Only with "auto" is it known that a bent target is not the cause.
-
-    Returns
-    -------
-    solution, rejected
-        Unchanged if the rich lens is not chosen.
+    The problem has all points, at the world coordinates of their file. The solution has the best other lens,
+    with the target if it was estimated. The choice is how; only with "auto" is it known that a bent target is
+    not the cause.
     """
     looked_for = choice == "auto" and options.distortion == "auto" and problem.points.world_std is None
     if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:

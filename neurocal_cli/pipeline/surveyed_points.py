@@ -21,6 +21,7 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.pipeline.point_errors import squared_whitened
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
@@ -34,20 +35,9 @@ def with_survey(
 ) -> tuple[Solution, Rejected]:
     """Adjust camera and points together.
 
-    Parameters
-    ----------
-    problem : Problem
-        With all points, at their surveyed coordinates.
-    solution, rejected
-        Calibrated as if the survey were exact.
-    options : Options
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The points do not determine the camera; the message says why.
-    InputError
-        A point has two different standard deviations.
+    The problem has all points, at their surveyed coordinates; the solution and the rejected points are
+    calibrated as if the survey were exact. Raises `DegenerateGeometryError` if the points do not determine
+    the camera, and `InputError` if a point has two different standard deviations.
     """
     again, outliers = _judged(problem, solution, rejected, options, 1.0)
     factor = 1.0 if again.target is None else again.target.sizes["stated"]
@@ -107,9 +97,9 @@ def _with_places(solution: Solution, points: Correspondences, factor: float) -> 
     r, place = seen[known] - points.pixels[known], place.T[known]
 
     def level(variance: float) -> float:
-        return float(median(_squared(r, variance * own[known] + place))) / _MEDIAN
+        return float(median(squared_whitened(r, variance * own[known] + place))) / _MEDIAN
 
-    high = float(median(_squared(r, own[known]))) / _MEDIAN
+    high = float(median(squared_whitened(r, own[known]))) / _MEDIAN
     low = high * _LEAST_NOISE**2
     for _ in range(_HALVINGS):
         middle = float(np.sqrt(low * high))
@@ -117,10 +107,3 @@ def _with_places(solution: Solution, points: Correspondences, factor: float) -> 
     covariance = high * own
     covariance[known] += place
     return covariance
-
-
-def _squared(r: Array, covariance: Array) -> Array:
-    """(N,) r^T C^-1 r."""
-    suu, suv, svv = covariance.T
-    du, dv = r.T
-    return np.asarray((svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv))

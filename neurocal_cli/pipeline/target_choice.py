@@ -47,19 +47,9 @@ def with_target(
 ) -> tuple[Solution, Rejected]:
     """Estimate the target's shape, and fit the camera to it.
 
-    Parameters
-    ----------
-    problem : Problem
-        With all points, at the world coordinates of their file.
-    solution, rejected
-        For the given target.
-    options : Options
-    choice : {"auto", "given", "flat", "free"}
-
-    Returns
-    -------
-    solution, rejected
-        Unchanged if the target stays as given.
+    The problem has all points, at the world coordinates of their file; the solution and the rejected points
+    are for the given target. They are returned unchanged if it stays. The choice is "auto", "given", "flat"
+    or "free".
     """
     if choice != "given" and problem.points.world_std is not None and not solution.refusal:
         return with_survey(problem, solution, rejected, options)
@@ -69,21 +59,11 @@ def with_target(
     known = _searched(problem, solution, rejected, options, choice)
     target, views = known[0].target, known[1].views
     unexplained = target is None or target.bends is not None
-    if unexplained and views and all(map(may_be_bent, views.values())):
-        return _taking_views_back(problem, solution.of_all, known, options, choice)
-    return known
-
-
-def _taking_views_back(
-    problem: Problem,
-    of_all: Solution | None,
-    known: tuple[Solution, Rejected],
-    options: Options,
-    choice: str,
-) -> tuple[Solution, Rejected]:
-    """Try again with the rejected views, which may contradict only the given target."""
+    if not (unexplained and views and all(map(may_be_bent, views.values()))):
+        return known
+    # Try again with the rejected views, which may contradict only the given target.
     try:
-        found = _searched(problem, of_all or fit(problem, options), known[1], options, choice)
+        found = _searched(problem, solution.of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
         return known
     explained = found[0].target is not None and not found[1].views
@@ -225,11 +205,11 @@ def _fitted_to(
 ) -> tuple[Solution, Rejected] | None:
     """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
     solution, rejected = before
+    points = target.seen(problem.points)
     try:
         if len(rejected) or rejected.views:
-            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
+            again, rejected = fit_robustly(problem.with_points(points), options)
         else:
-            points = target.seen(problem.points)
             again = fit_again(solution, points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None

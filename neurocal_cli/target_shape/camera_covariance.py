@@ -7,7 +7,7 @@ over views (`view_covariance`), and the model uncertainty of the selected distor
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,10 +26,38 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
 
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.open_coefficients import OpenCoefficients
+
+
+@frozen_dataclass(eq=False)
+class CovarianceBasis:
+    """Input of a camera's covariance (`covariance`, `counting_views`).
+
+    Attributes
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        As from `reprojection.normal_blocks`; if the target was estimated, with the efficient scores of the
+        free camera parameters.
+    shared : (f, f) array or None
+        Covariance of A's free entries and the free distortion coefficients, normalised, if it does not follow
+        from the normal matrices.
+    n_equations : float
+        Number of equations minus the effective number of estimated unknowns of the target.
+    moves_without : callable, optional
+        (P, f) moves of the free parameters when the views of each pose are left out and the target is
+        estimated again, given the pose (V,) of each view. None if there are many poses: then the efficient
+        scores give the same.
+    poses : (V, 6, 6) array, optional
+        Covariance of the poses, if it does not follow from the normal matrices.
+    """
+
+    normal: Array
+    shared: Array | None
+    n_equations: float
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+    poses: Array | None = None
 
 
 @frozen_dataclass(eq=False)
@@ -38,14 +66,8 @@ class CameraSeen:
 
     Attributes
     ----------
-    views : Views
-    state : CameraState
-    normal : (V, 12 + K, 12 + K) array
-        From `reprojection.normal_blocks`.
-    free : (5 + K,) bool array
-        Of A's entries and the distortion coefficients.
-    free_poses : bool
-    repeated : RepeatedPoses
+    views, state, normal, free, free_poses, repeated
+        As for `counting_views`; the normal matrices are from `reprojection.normal_blocks`.
     points : Correspondences
         With the world coordinates of the estimated target, if any.
     target : Target, optional
@@ -81,13 +103,8 @@ class WideCovariance:
     The projection is less uncertain than the covariance of the estimated parameters alone suggests, because
     the open coefficients and the parameters correlated with them compensate.
 
-    Attributes
-    ----------
-    open : OpenCoefficients
-    normal : (V, 12 + K, 12 + K) array
-        Normal matrices of the extended camera.
-    entries : (f, f) array
-        Covariance of all free parameters, including the open ones.
+    `normal` (V, 12 + K, 12 + K) are the normal matrices of the extended camera, and `entries` (f, f) is the
+    covariance of all free parameters, including the open ones.
     """
 
     open: OpenCoefficients
@@ -122,10 +139,7 @@ class CameraCovariance:
 def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     """Covariance of a camera at its minimum.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The points do not determine a camera whose target was estimated.
+    Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
     """
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
@@ -151,28 +165,24 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """Add the uncertainty from the selection of the distortion model."""
-    from neurocal_cli.bundle_adjustment.open_coefficients import corner_radius, open_coefficients, radius
+    from neurocal_cli.bundle_adjustment import open_coefficients as coefficients
 
     views, state = seen.views, seen.state
-    reach = radius(views, state)
-    corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
-    richer = open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
-    return known if richer is None else _opened(seen, known, richer, variance)
-
-
-def _opened(
-    seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients, variance: float
-) -> CameraCovariance:
-    from neurocal_cli.bundle_adjustment.open_coefficients import spread_of_open, wide_covariance
-
-    state = richer.state(seen.state)
+    reach = coefficients.radius(views, state)
+    corner = coefficients.corner_radius(
+        state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
+    )
+    richer = coefficients.open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
+    if richer is None:
+        return known
+    state = richer.state(state)
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
     left_out = richer.prior.left_out
-    spread = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    spread = coefficients.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
-    entries = wide_covariance(known.found.entries, E, follow, left_out)
+    entries = coefficients.wide_covariance(known.found.entries, E, follow, left_out)
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses
@@ -213,6 +223,8 @@ def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
 def _basis(
     seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
 ) -> CovarianceBasis:
-    return covariance_basis(
-        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, shared
-    )
+    if seen.target is None:
+        return CovarianceBasis(normal, shared, seen.views.n_equations)
+    from neurocal_cli.target_shape.uncertainty import covariance_basis
+
+    return covariance_basis(seen.target, seen.views, state, free, seen.free_poses, seen.points, normal)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bends import N_SHAPES, Bends, surface_of
-from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
@@ -21,9 +21,14 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
-from neurocal_cli.target_shape.bend_size import bends_of, most_probable_precision
-from neurocal_cli.target_shape.bend_validation import bends_are_valid
-from neurocal_cli.target_shape.information import Information, Sight, information_of, of_views
+from neurocal_cli.target_shape.bend_evidence import bends_are_valid, most_probable_precision
+from neurocal_cli.target_shape.information import (
+    Information,
+    Sight,
+    information_of,
+    of_views,
+    steps_of_poses,
+)
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
 from neurocal_cli.target_shape.target_validation import passes_cross_validation
@@ -36,6 +41,8 @@ _FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
 _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
+_ITERATIONS = 1  # of a camera on a target that will still move
+_STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
 # estimated target below the first limit may move slightly beyond it when the lens is selected again.
@@ -50,13 +57,8 @@ most; tests/test_simulated_targets.py (slow) checks that clean sets keep the giv
 class Found:
     """An estimated target, with the problems and their minima for it.
 
-    Attributes
-    ----------
-    target : Target
-    fits : tuple of (Problem, Adjusted)
-        The points of each problem have the target's coordinates.
-    evidence : float
-        Log evidence, comparable between distortion models.
+    The points of each problem have the target's coordinates. The log evidence is comparable between
+    distortion models.
     """
 
     target: Target
@@ -79,28 +81,17 @@ def find_target(
     known: Target | None = None,
     least_gain: float = -np.inf,
 ) -> Found | None:
-    """Estimate the true positions of a target's points.
+    """Estimate the true positions of a target's points, from cameras at their minimum.
 
-    Parameters
-    ----------
-    fits : sequence of (Problem, Adjusted)
-        Cameras that observed the target, each at its minimum. Points with equal coordinates are the same.
-    flat : bool
-        Whether the points stay in their planes.
-    known : Target, optional
-        Estimated target whose coordinates the points of the fits have already; the starting point.
-    least_gain : float
-        The search ends early if the gain in log evidence will be smaller.
-
-    Returns
-    -------
-    Found or None
-        None if the points do not determine a target, or if the result is too different from the given one.
+    Points with equal coordinates are the same. Flat means that they stay in their planes. `known` is an
+    estimated target whose coordinates the points have already; the search starts from it. It ends early if
+    the gain in log evidence will be smaller than `least_gain`. None if the points do not determine a target,
+    or if the result is too different from the given one.
     """
     some = _few_enough(fits, known)
     if some is None:
         return None
-    found = searched(Search(some, flat, known), least_gain)
+    found = Search(some, flat, known).result(least_gain)
     return found if found is None or some is fits else _of_all_views(found, fits, known)
 
 
@@ -123,28 +114,17 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
 
     It is -inf if the points do not determine the cameras.
     """
+
+    def of_camera(problem: Problem, adjusted: Adjusted) -> Information:
+        """The quadratic of one camera, with fixed target points."""
+        views, no_label = problem.views, np.zeros(0, dtype=np.intp)
+        normal = views.pixel_scale**2 * adjusted.normal
+        return of_views(sight_of(problem, adjusted, no_label), normal, np.ones(views.n_views, dtype=bool))
+
     try:
-        return evidence_of_given(*(_with_given_points(*fit) for fit in _few_enough(fits, None) or fits))
+        return evidence_of_given(*(of_camera(*fit) for fit in _few_enough(fits, None) or fits))
     except np.linalg.LinAlgError:
         return -np.inf
-
-
-def _with_given_points(problem: Problem, adjusted: Adjusted) -> Information:
-    """The quadratic of one camera at its minimum, with fixed target points."""
-    views = problem.views
-    none = np.zeros(0, dtype=np.intp)
-    sight = Sight(views, adjusted.state, problem.free_camera, problem.free_poses, none)
-    normal = views.pixel_scale**2 * adjusted.normal
-    return of_views(sight, normal, np.ones(views.n_views, dtype=bool))
-
-
-def searched(search: Search, least_gain: float) -> Found | None:
-    """Result of a search; None also if the points do not determine the target."""
-    try:
-        with np.errstate(all="ignore"):
-            return search.run(least_gain)
-    except np.linalg.LinAlgError:
-        return None
 
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
@@ -169,16 +149,10 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
 
 
 class Search:
-    """State of the search: target and fits.
+    """State of the search for a target, with arguments as for `find_target`.
 
-    Parameters
-    ----------
-    fits, flat, known
-        As for `find_target`.
-    bending : bool
-        Whether each view has a bend of its own (one camera only); always if the known target has bends.
-    still : bool
-        Whether the common points stay as given, so that only the bends are estimated.
+    If it is bending (always if the known target has bends), each view of the only camera has a bend of its
+    own. If it is still, the common points stay as given, so that only the bends are estimated.
     """
 
     def __init__(
@@ -212,9 +186,18 @@ class Search:
         self.bends = np.zeros((len(names), N_SHAPES)) if bends is None else bends.of_views(names)
         self.precision = 1.0
 
-    def run(self, least_gain: float) -> Found | None:
+    def result(self, least_gain: float) -> Found | None:
+        """As for `find_target`."""
+        try:
+            with np.errstate(all="ignore"):
+                return self._run(least_gain)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _run(self, least_gain: float) -> Found | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
+        last = 0.0
         for step in range(_STEPS):
             here = self.information()
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
@@ -224,14 +207,17 @@ class Search:
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                found = posterior(info, self.prior, self.sizes, self.flat, noise)
+                found = posterior(info, self.prior, self.sizes, self.flat, noise, step < _STRETCH_STEPS)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
-            settled = known and bool((np.abs(found.camera_step) < _SETTLED * std).all())
+            length = float((np.abs(found.camera_step) / std).max(initial=0.0))
+            # The next step would be shorter than this one by the same factor as this one than the last.
+            settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
+            last = length
             if not self._move(found, info):
                 return None
             if settled:
@@ -290,23 +276,40 @@ class Search:
     def _move(self, found: Posterior, info: Information) -> bool:
         if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
             return False
+        own = steps_of_poses(info, found.camera_step, found.offsets)
         if self.surface is not None:
-            self.bends = bends_of(info, found.camera_step, found.offsets)
+            self.bends = own[:, 6:]
             bent = self.surface.offsets(self._common()) @ self.bends.T
             if not np.abs(bent).max() < _LARGEST * self.prior.size:
                 return False
         self.offsets, self.sizes = found.offsets, found.sizes
+        moved = self._predicted(found.camera_step, own[:, :6])
         self.fits = [
-            at_world(*fit, in_pixels(fit[0], fit[1].state), self._world(k)) for k, fit in enumerate(self.fits)
+            at_world(*self.fits[k], state, self._world(k), _ITERATIONS) for k, state in enumerate(moved)
         ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
+    def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
+        """The state of each camera in pixels after these steps, (f,) and (P, 6), of all."""
+        states, first, view = [], 0, 0
+        for problem, adjusted in self.fits:
+            free, V = np.flatnonzero(problem.free_camera), problem.views.n_views
+            by_camera, by_pose = np.zeros((1, len(problem.free_camera))), np.zeros((V, 6))
+            by_camera[0, free] = camera_step[first : first + len(free)]
+            if problem.free_poses:
+                by_pose[:] = pose_steps[view : view + V]
+                view += V
+            first += len(free)
+            states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
+        return states
+
     def _align(self) -> None:
-        """Rotate, shift and scale the target to be nearest to the given one, which changes no pixel.
+        """Rotate, shift and scale the target to be nearest to the given one, and adjust the cameras to it.
 
         Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
+            self.fits = [(problem, problem.adjust(adjusted)) for problem, adjusted in self.fits]
             return
         world = self._common()
         s, R, t = nearest_similarity(world, self.given)
@@ -327,32 +330,29 @@ class Search:
         if self.surface is not None:
             size = float(np.sqrt(found.variance / self.precision))
             bends = Bends(size, self.fits[0][0].views.names, self.bends)
+        std = np.sqrt(variance)
         return Target(
-            self.given,
-            self._common(),
-            np.sqrt(variance),
-            self.plane,
-            found.sizes,
-            self.flat,
-            gain,
-            self.ids,
-            bends=bends,
+            self.given, self._common(), std, self.plane, found.sizes, self.flat, gain, self.ids, bends=bends
         )
 
 
 def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:
     """Observations of a fit's camera; label (N,) in the order of its points."""
     views = problem.views
-    ordered = label if views.order is None else label[views.order]
+    ordered = label if views.order is None or not len(label) else label[views.order]
     return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
 
 
 def at_world(
-    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+    problem: Problem,
+    adjusted: Adjusted,
+    state: CameraState,
+    world: Array,
+    iterations: int = OPTIONS.max_iterations,
 ) -> tuple[Problem, Adjusted]:
     """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
     if not problem.free_distortion and state.model != "none":
         # The state contains the given distortion, but `with_points` has removed it from the pixels.
         new = new.with_seen_pixels()
-    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))
+    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)), iterations)

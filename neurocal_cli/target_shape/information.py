@@ -7,8 +7,8 @@ coupled only through c and d, and different points only through c and q, so both
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,22 +24,11 @@ from neurocal_cli.geometry import Array
 
 @frozen_dataclass(eq=False)
 class Sight:
-    """Observations of the target by one camera.
+    """Observations of the target, at its current world coordinates, by one camera.
 
-    Attributes
-    ----------
-    views : Views
-        With the current world coordinates of the target.
-    state : CameraState
-        At the minimum for these.
-    free : (5 + K,) bool array
-    free_poses : bool
-    label : (N,) int array
-        Index of the target point of each row, in the order of `views`.
-    shapes : (n, 3, 3) array, optional
-        With a bend in each view: offsets of each point for unit coefficients.
-    bends : (V, 3) array, optional [world unit]
-        Current coefficients of the bend of each view.
+    `label` (N,) is the index of the target point of each row, in the order of `views`. With a bend in each
+    view, `shapes` (n, 3, 3) has the offsets of each point for unit coefficients, and `bends` (V, 3) the
+    current coefficients [world unit].
     """
 
     views: Views
@@ -141,17 +130,16 @@ class Information:
     def turned(self, axes: Array) -> Information:
         """Express each point's offset in its own axes, the columns of (n, 3, 3)."""
         transposed = np.swapaxes(axes, 1, 2)
-        alike = bool((axes == axes[:1]).all())  # with a single plane one product suffices
+        if (axes == axes[:1]).all():  # with a single plane one product suffices
+            pose_point = (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
+        else:
+            pose_point = np.einsum("pqni,nij->pqnj", self.pose_point, axes)
         return replace(
             self,
             point=transposed @ self.point @ axes,
             point_camera=transposed @ self.point_camera,
             point_right=(transposed @ self.point_right[..., None])[..., 0],
-            pose_point=(
-                (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
-                if alike
-                else np.einsum("pqni,nij->pqnj", self.pose_point, axes)
-            ),
+            pose_point=pose_point,
         )
 
     def around_given(self, offsets: Array) -> Information:
@@ -186,20 +174,19 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     return found.around_straight(np.concatenate(bends)) if bends else found
 
 
+def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
+    """(P, p) steps of the poses, and whole bends, given steps of the cameras (f,) and offsets (n, 3)."""
+    right = info.pose_right - info.pose_camera @ camera_step - info.pose_by(offsets)
+    return np.asarray(np.linalg.solve(info.pose, right[..., None])[..., 0])
+
+
 def joined(parts: Sequence[Information]) -> Information:
     """Sum over parts of the views of the same cameras."""
-
-    def summed(name: str) -> Any:
-        return sum(getattr(part, name) for part in parts)
-
-    def together(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    return Information(
-        summed("camera"), summed("camera_right"), together("pose"), together("pose_camera"),
-        together("pose_right"), summed("point"), summed("point_camera"), summed("point_right"),
-        together("pose_point"), summed("cost"), summed("equations"), summed("log_precision"),
-    )  # fmt: skip
+    blocks: dict[str, Any] = {}
+    for field in fields(Information):
+        own = [getattr(part, field.name) for part in parts]
+        blocks[field.name] = np.concatenate(own) if field.name.startswith("pose") else sum(own)
+    return Information(**blocks)
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
@@ -216,27 +203,21 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
     found.point[...] += px2 * terms.point
     found.point_camera[:, :, own] += px2 * terms.point_camera
     found.point_right[...] += px2 * terms.point_right
-    cost = float(normal[:, -1, -1].sum())
     if sight.free_poses:
         of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
         found.pose[poses] = px2 * normal[:, of_pose[:, None], of_pose]
         found.pose_camera[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
         found.pose_right[poses] = px2 * normal[:, of_pose, -1]
         found.pose_point[poses] = px2 * terms.pose_point
-    return px2 * cost
+    return px2 * float(normal[:, -1, -1].sum())
 
 
 @frozen_dataclass(eq=False)
 class PointTerms:
     """Sums of products with the derivatives by the target points, for one camera, normalised.
 
-    Attributes
-    ----------
-    normal : (V, 12 + K, 12 + K) array
-        As from `normal_blocks`; with bends, three columns for them before the residual.
-    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
-        Points in the world's axes and unit.
-    pose_point : (V, p, n, 3) array
+    `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
+    the residual. The rest is as in `Information`.
     """
 
     normal: Array
@@ -255,40 +236,20 @@ def point_terms(
     n_points: int,
     shapes: Array | None = None,
 ) -> PointTerms:
-    """Sums of one camera over its observations of the target points.
+    """Sums of one camera over its observations of `n_points` target points.
 
-    Parameters
-    ----------
-    batches : PointBatches
-    state : CameraState
-    scale : (V,) array
-        S2 of each view [world unit].
-    label : (T, n) int array
-        Index of the target point in each slot of the batches; -1: none.
-    columns : (f,) int array
-        Columns of the camera's free parameters.
-    n_points : int
-        Number of target points.
-    shapes : (n, 3, 3) array, optional
-        Offsets of the points for unit coefficients of a view's bend.
+    `scale` (V,) is S2 of each view, `label` (T, n) from `labelled`, `columns` (f,) those of the camera's free
+    parameters, and `shapes` as in `Sight`.
     """
-    width, f, V = 12 + len(state.k), len(columns), batches.n_views
-    whole = width if shapes is None else width + N_SHAPES
+    f, V, by_batch = len(columns), batches.n_views, blocks_by_batch(batches, state, shapes)
+    whole = by_batch.shape[1]
     of_pose = pose_columns(whole, shapes is not None)
-    p = len(of_pose)
-    kept = np.append(columns, whole - 1)
+    p, kept = len(of_pose), np.append(columns, whole - 1)
     once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
     alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
-    by_batch = np.empty((len(batches.view), whole, whole))
     summed, cross = np.zeros((n_points, 3, f + 4)), np.zeros((V, p, n_points, 3))
-    buffer = batches.memory(width)
-    for chunk in batches.chunks():
+    for chunk, part, by_point in linearised(batches, state, scale, label[:1] if alike else label, shapes):
         view, seen = batches.view[chunk], label[chunk]
-        part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part[:, :-1])
-        by_point = by_world(part, state, scale, view)
-        if shapes is not None:
-            part = with_bends(part, by_point, shapes[seen[:1] if alike else seen])
         products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, kept]], axis=1)
         crossed = np.swapaxes(_of_each(part[:, of_pose], by_point), 2, 3)  # (T, p, n, 3)
@@ -326,20 +287,36 @@ def _of_each(a: Array, b: Array) -> Array:
 
 def without_points(sight: Sight) -> Array:
     """(V, w, w) normal matrices of one camera's views [px], with the columns of `PointTerms.normal`."""
-    views, state, batches = sight.views, sight.state, sight.views.batches
-    width = 12 + len(state.k)
-    whole = width if sight.shapes is None else width + N_SHAPES
-    label = labelled(views, sight.label)
-    by_batch = np.empty((len(batches.view), whole, whole))
-    buffer = batches.memory(width)
+    views, state = sight.views, sight.state
+    label, by_batch = labelled(views, sight.label), blocks_by_batch(views.batches, state, sight.shapes)
+    for chunk, part, _ in linearised(views.batches, state, views.scale, label, sight.shapes):
+        products(part, by_batch[chunk])
+    return views.pixel_scale**2 * views.batches.sum_by_view(by_batch)
+
+
+def linearised(
+    batches: PointBatches, state: CameraState, scale: Array, label: NDArray[np.intp], shapes: Array | None
+) -> Iterator[tuple[slice, Array, Array]]:
+    """Chunks of batches, their rows of derivatives and residuals, and the derivatives by the points.
+
+    With bends (`shapes`), the rows have those by each view's bend. A single row of labels holds for all
+    batches. The rows are overwritten in the next chunk.
+    """
+    buffer = batches.memory(12 + len(state.k))
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part[:, :-1])
-        if sight.shapes is not None:
-            part = with_bends(part, by_world(part, state, views.scale, view), sight.shapes[label[chunk]])
-        products(part, by_batch[chunk])
-    return views.pixel_scale**2 * batches.sum_by_view(by_batch)
+        by_point = _by_world(part, state, scale, view)
+        if shapes is not None:
+            part = _with_bends(part, by_point, shapes[label if len(label) == 1 else label[chunk]])
+        yield chunk, part, by_point
+
+
+def blocks_by_batch(batches: PointBatches, state: CameraState, shapes: Array | None) -> Array:
+    """Memory for the normal matrices of all batches; with bends, with three more columns."""
+    whole = 12 + len(state.k) + (0 if shapes is None else N_SHAPES)
+    return np.empty((len(batches.view), whole, whole))
 
 
 def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
@@ -364,24 +341,17 @@ def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
     return np.concatenate([np.arange(POSE.start, POSE.stop), last])
 
 
-def with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
+def _with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
     """(T, width + 4, 2, n) derivatives with those by the view's bend before the residual.
 
-    Parameters
-    ----------
-    part : (T, width + 1, 2, n) array
-        A part of `PointBatches.memory`.
-    by_point : (T, 3, 2, n) array
-        From `by_world`.
-    shapes : (T, n, 3, 3) or (1, n, 3, 3) array
-        Offsets of the points for unit coefficients.
+    `shapes` (T, n, 3, 3) or (1, n, 3, 3) are the offsets of the points for unit coefficients.
     """
     along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
     by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
     return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
 
 
-def by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
+def _by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
     """(T, 3, 2, n) derivatives by the world's coordinates, from those of `derivatives`.
 
     d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.

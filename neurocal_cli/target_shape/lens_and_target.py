@@ -7,12 +7,14 @@ evidence enough. If none does, the next simpler one is tried as long as it hardl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.open_coefficients import log_prior, radius
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
@@ -20,6 +22,7 @@ from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 # Nested models: each has the coefficients of the previous one and more.
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
+_PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
 
 def find_lens_and_target(
@@ -47,11 +50,7 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
     """Estimate the target with every camera's next distortion model; None at the end of the chain."""
     fits = []
     for problem, adjusted in found.fits:
-        place = (
-            POLYNOMIAL_MODELS.index(adjusted.state.model) + step
-            if adjusted.state.model in POLYNOMIAL_MODELS
-            else -1
-        )
+        place = _PLACES.get(adjusted.state.model, -2) + step
         if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
             return None
         fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
@@ -61,40 +60,40 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
 def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
     """Whether more distortion coefficients and the given target fit better than the found target.
 
-    Parameters
-    ----------
-    fits : sequence of (Problem, Adjusted)
-        Each camera at its minimum for the given target.
-    found : Found
-        For the same lenses.
+    Each camera is at its minimum for the given target, and `found` has the same lenses.
     """
-    estimated = [p.free[0] and a.state.model in POLYNOMIAL_MODELS for p, a in fits]
-    simplest = min(
-        (
-            POLYNOMIAL_MODELS.index(a.state.model)
-            for (_, a), free in zip(fits, estimated, strict=True)
-            if free
-        ),
-        default=len(POLYNOMIAL_MODELS),
-    )
-    for model in POLYNOMIAL_MODELS[simplest + 1 :]:
-        richer = [
-            _adjusted_with(*fit, model) if free and _is_simpler(fit[1].state.model, model) else fit
-            for fit, free in zip(fits, estimated, strict=True)
-        ]
-        added = sum(
-            log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
-            for (_, before), (problem, after) in zip(fits, richer, strict=True)
-        )
-        if evidence_as_given(richer) + added > found.evidence:
+    end = len(POLYNOMIAL_MODELS)
+    places = [_PLACES.get(a.state.model, end) if problem.free[0] else end for problem, a in fits]
+    least = 0.5 * (evidence_as_given(fits) + found.evidence)
+    for place in range(min(places) + 1, end):
+        # A linear prediction that reaches less than half of the found target's gain settles it.
+        for richer_of, wanted in ((_linearised_with, least), (_adjusted_with, found.evidence)):
+            richer = [
+                richer_of(*fit, POLYNOMIAL_MODELS[place]) if own < place else fit
+                for fit, own in zip(fits, places, strict=True)
+            ]
+            if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > wanted:
+                break
+        else:
             return True
     return False
 
 
-def _is_simpler(model: str, other: str) -> bool:
-    return POLYNOMIAL_MODELS.index(model) < POLYNOMIAL_MODELS.index(other)
+def _log_prior_of_added(
+    fits: Sequence[tuple[Problem, Adjusted]], richer: Sequence[tuple[Problem, Adjusted]]
+) -> float:
+    return sum(
+        log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
+        for (_, before), (problem, after) in zip(fits, richer, strict=True)
+    )
 
 
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
     new = problem.with_model(model)
     return new, new.adjust(adjusted.state.with_model(model))
+
+
+def _linearised_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    state = adjusted.state.with_model(model)
+    normal, _ = normal_blocks(problem.views.batches, state)
+    return problem.with_model(model), replace(adjusted, state=state, normal=normal)

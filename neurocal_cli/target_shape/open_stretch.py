@@ -33,15 +33,9 @@ _NO_PRINT = 5.0  # standard deviations of prints and pixels together, beyond whi
 
 @frozen_dataclass(eq=False)
 class StretchedCovariance:
-    """Term that an open stretch adds to the covariance of a camera.
+    """Terms that an open stretch adds to the covariance of the free parameters (f, f) and poses (V, 6, 6).
 
-    Attributes
-    ----------
-    probability : float
-        That the print is stretched.
-    entries : (f, f) array
-        For A's free entries and the free distortion coefficients.
-    poses : (V, 6, 6) array
+    `probability` is that of a stretched print.
     """
 
     probability: float
@@ -54,14 +48,8 @@ def open_stretch(
 ) -> StretchedCovariance | None:
     """The term that the stretch of a target adds; None if it is negligible or the target is not flat.
 
-    Parameters
-    ----------
-    views, state, free
-        Of a camera at its minimum with free poses, for the given target.
-    world : (N, 3) array
-        Points of the target.
-    variance : float
-        Of the residuals, enlarged if they are correlated.
+    The camera is at its minimum with free poses, for the given target (N, 3). The variance is that of the
+    residuals, enlarged if they are correlated.
     """
     if not is_flat(world):
         return None
@@ -96,14 +84,8 @@ def stretches(world: Array) -> Array:
 def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | None:
     """Posterior of the two stretches; None if they are negligible, or larger than those of prints.
 
-    Parameters
-    ----------
-    S : (f + 2, f + 2) array
-        Normal matrix of the free parameters and the stretches, with the poses eliminated.
-    g : (f + 2,) array
-        Right side, J^T r.
-    variance : float
-        Of the residuals.
+    S (f + 2, f + 2) is the normal matrix of the free parameters and the stretches with the poses eliminated,
+    g (f + 2,) its right side J^T r, and the variance that of the residuals.
     """
     is_open = np.arange(len(g)) >= len(g) - 2
     groups = (np.array([0]), np.array([1]))
@@ -117,13 +99,5 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | Non
 
 
 def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
-    """(V, 14 + K, 14 + K) normal matrices with columns of two stretches between coefficients and residual.
-
-    Parameters
-    ----------
-    batches, state
-        As for `reprojection.normal_blocks`.
-    by : (2, 3, 3) array
-        From `stretches`.
-    """
+    """(V, 14 + K, 14 + K) normal matrices with columns of both `stretches` before that of the residual."""
     return displaced_blocks(batches, state, 2, lambda chunk: by @ batches.local[chunk][:, None])

@@ -45,29 +45,46 @@ class Posterior:
         Of the cameras' free parameters.
     camera : (f, f) array
         Covariance of these in units of the noise variance, with the offsets marginalised.
-    followed : (f, n, 3) array
-        S_cd S_dd^-1: regression of the cameras' scores on those of the offsets.
-    std : (n, 3) array [world unit]
-        Of the offsets, along each point's axes.
     sizes : dict of float by name [world unit]
     determined : float
         Effective number of the offsets' unknowns that the data determine.
     evidence : float
         Log evidence, with a flat prior on the cameras' normalised parameters.
-    poses : (P, 6, 6) array, optional
-        Covariance of each pose in units of the noise variance, if the points are surveyed.
+    solved : (Solved, Prior, (3 n, g) array), optional
+        The solution, its prior and the gauge; None if the points stay as given.
     """
 
     offsets: Array
     variance: float
     camera_step: Array
     camera: Array
-    followed: Array
-    std: Array
     sizes: dict[str, float]
     determined: float
     evidence: float
-    poses: Array | None = None
+    solved: tuple[Solved, Prior, Array] | None = None
+
+    @property
+    def followed(self) -> Array:
+        """(f, n, 3) S_cd S_dd^-1: regression of the cameras' scores on those of the offsets."""
+        whole = np.zeros((len(self.camera), *self.offsets.shape))
+        if self.solved is None or not len(whole):
+            return whole
+        solved, prior, _ = self.solved
+        along = solved.camera_root.T @ solved.offset_root(prior)
+        return np.asarray(-np.linalg.solve(self.camera, along).reshape(whole.shape))
+
+    @property
+    def std(self) -> Array:
+        """(n, 3) standard deviations of the offsets, along each point's axes [world unit]."""
+        if self.solved is None:
+            return np.zeros_like(self.offsets)
+        solved, prior, gauge = self.solved
+        return np.sqrt(self.variance * np.maximum(solved.offset_variance(prior, gauge), 0.0))
+
+    @property
+    def poses(self) -> Array | None:
+        """(P, 6, 6) covariance of each pose in units of the noise variance; see `Solved`."""
+        return None if self.solved is None else self.solved[0].poses
 
 
 _SINGLE = {"place": [0, 1], "height": [2]}  # axes of the parts of single points
@@ -84,10 +101,10 @@ _START = {
 _MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
 _NOTHING = 1e-7  # size of an absent part over the target's size
 _SETTLED = 0.03  # relative change of the sizes
-# Least predicted gain in log evidence of a step. With these, cameras differ by 0.017 standard deviations rms
-# from those with 1e-5; 24 draws of each kind by tests/support/simulated_targets.py.
-_NO_GAIN = 0.001
-_NO_GAIN_YET = 0.1  # the same from arbitrary initial sizes, around a target that will still move
+# Least predicted gain in log evidence of a step. With these, cameras differ by 0.005 standard deviations rms
+# from those with 1e-5; 90 sets of boards of all shapes by tests/support/targets.py.
+_NO_GAIN = 0.002
+_NO_GAIN_YET = 0.5  # the same from arbitrary initial sizes, around a target that will still move
 _FARTHEST = 8.0  # largest multiple of MacKay's step
 _HALVINGS = 6
 _PASSES = 40
@@ -112,9 +129,9 @@ def camera_step_of(info: Information) -> Array:
 
 
 def camera_step(S: Array, g: Array) -> Array:
-    """Steps of the cameras, given their matrix (f, f) and right sides (f,) or (f, k)."""
+    """Steps of the cameras, given their matrices (..., f, f) and right sides (f,) or (..., f, k)."""
     scaled, scale = unit_diagonal(S)
-    inverse = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale
+    inverse = np.linalg.pinv(scaled, hermitian=True) * scale[..., :, None] * scale[..., None, :]
     return np.asarray(inverse @ g)
 
 
@@ -143,32 +160,20 @@ def posterior(
     sizes: Mapping[str, float] | None = None,
     flat: bool = False,
     variance: float | None = None,
+    with_stretch: bool = True,
 ) -> Posterior:
     """Estimate the sizes of the parts, and the offsets.
 
-    Parameters
-    ----------
-    info : Information
-        In the whole offsets from the given target, along each point's axes.
-    prior : Prior
-    sizes : dict of float by name [world unit], optional
-        Initial sizes.
-    flat : bool
-        Whether the points stay in their plane.
-    variance : float, optional [px^2]
-        Initial noise variance. It is needed with initial sizes, because then the errors on the given target
-        are no noise.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The points do not determine the cameras.
+    The quadratic is in the whole offsets from the given target, along each point's axes. With initial sizes
+    [world unit], an initial noise variance [px^2] is needed as well, because then the errors on the given
+    target are no noise. Flat means that the points stay in their plane, and `with_stretch` that the stretch
+    may be switched on or off. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     parts = _Parts(info, prior, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
-    start = parts.start() if sizes is None else parts.allowed(sizes)
-    now = parts.climbed(parts.at({name: size / noise for name, size in start.items()}))
-    if "stretch" in now.ratios:
+    start = sizes or {name: _START[name] * prior.size for name in (*prior.groups, *_SINGLE)}
+    now = parts.climbed(parts.at({name: size / noise for name, size in parts.allowed(start).items()}))
+    if with_stretch and "stretch" in now.ratios:
         other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
         now = other if other.evidence > now.evidence else now
     return parts.posterior(now)
@@ -176,18 +181,15 @@ def posterior(
 
 def given_posterior(info: Information, prior: Prior) -> Posterior:
     """The posterior with zero offsets: the points stay as given."""
-    n, f = len(info.point), len(info.camera)
     S, g, cost, logdet = _poses_eliminated(info)
     inverse = np.linalg.inv(S)
     cost -= float(g @ inverse @ g)
     logdet += float(np.linalg.slogdet(S)[1]) - info.log_precision
     return Posterior(
-        offsets=np.zeros((n, 3)),
+        offsets=np.zeros((len(info.point), 3)),
         variance=cost / info.spare,
         camera_step=inverse @ g,
         camera=np.asarray(inverse, dtype=float),
-        followed=np.zeros((f, n, 3)),
-        std=np.zeros((n, 3)),
         sizes=dict.fromkeys((*prior.groups, *_SINGLE), _NOTHING * prior.size),
         determined=0.0,
         evidence=log_evidence(info.spare, cost, logdet),
@@ -198,34 +200,22 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     """The posterior for known sizes and a known noise variance.
 
     For surveyed points the std keeps the given variance, because their stated sizes do not follow the
-    residuals.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Points that do not determine the cameras.
+    residuals. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     parts = _Parts(info, prior, flat=False)
     noise = np.sqrt(variance)
     found = parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
-    if prior.stated is None:
-        return found
-    return replace(found, variance=variance, std=found.std * np.sqrt(variance / found.variance))
+    return found if prior.stated is None else replace(found, variance=variance)
 
 
 def minimum_of(
     info: Information, prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> tuple[Array, Array]:
-    """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Points that do not determine the cameras.
-    """
-    parts = _Parts(info, prior, flat=False)
-    noise = np.sqrt(variance)
-    return parts.minimum({name: size / noise for name, size in sizes.items()})
+    """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
+    parts, noise = _Parts(info, prior, flat=False), np.sqrt(variance)
+    ratios = {name: size / noise for name, size in sizes.items()}
+    step, smooth, single = parts.system.minimum(parts.of_smooth(ratios), parts.of_points(ratios))
+    return step, np.asarray(prior.basis @ smooth + single)
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
@@ -275,10 +265,6 @@ class _Parts:
         self.least, self.stretch = _NOTHING * prior.size, STRETCH * prior.size
         self.spare, self.log_precision = info.spare, info.log_precision
 
-    def start(self) -> dict[str, float]:
-        names = (*self.prior.groups, *_SINGLE)
-        return self.allowed({name: _START[name] * self.prior.size for name in names})
-
     def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
         """The sizes, without out-of-plane parts if the target must stay flat."""
         return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
@@ -289,11 +275,6 @@ class _Parts:
         logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
         evidence = log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
-
-    def minimum(self, ratios: dict[str, float]) -> tuple[Array, Array]:
-        """Step (f,) of the cameras and offsets (n, 3) for these sizes."""
-        step, smooth, single = self.system.minimum(self.of_smooth(ratios), self.of_points(ratios))
-        return step, np.asarray(self.prior.basis @ smooth + single)
 
     def of_smooth(self, ratios: Mapping[str, float]) -> Array:
         """(m,) precisions of the smooth coefficients, in units of the noise precision."""
@@ -309,32 +290,37 @@ class _Parts:
         place, height = (ratios[name] ** -2 for name in _SINGLE)
         return np.tile([place, place, height], (self.system.n, 1))
 
-    def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
-        """A part's coefficients, their variances, and the offset for a unit coefficient."""
-        if name in self.prior.groups:
-            places = self.prior.groups[name]
-            return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
-        if self.prior.stated is not None:
-            stated = self.prior.stated
-            return now.solved.single / stated, now.solved.single_variance / stated**2, 1.0
-        columns = _SINGLE[name]
-        return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
+    def _parts(self, now: _Solution) -> Iterator[tuple[str, float, int, float, float]]:
+        """Name, size, number, sum of squares and sum of variances of each part's coefficients."""
+        solved, prior = now.solved, self.prior
+        for name, places in prior.groups.items():
+            w = solved.smooth[places]
+            size = now.ratios[name] / prior.size
+            yield name, size, len(w), float(w @ w), solved.smooth_variance(places)
+        variance, squares = solved.single_variance(), solved.single**2
+        if prior.stated is not None:
+            squares, variance = squares / prior.stated**2, variance / prior.stated**2
+            yield _STATED, now.ratios[_STATED], squares.size, float(squares.sum()), float(variance.sum())
+            return
+        for name, columns in _SINGLE.items():
+            w2 = squares[:, columns]
+            yield name, now.ratios[name], w2.size, float(w2.sum()), float(variance[:, columns].sum())
 
     def renewed(self, now: _Solution) -> tuple[dict[str, float], dict[str, float]]:
         """MacKay's update of the sizes, and the slopes of the log evidence by the logarithms of the sizes.
 
         The step is lengthened for parts that the data hardly determine, where MacKay's step is too short.
         """
-        new, slope, noise = {}, {}, np.sqrt(now.variance)
-        for name, ratio in now.ratios.items():
-            w, var, unit = self._coefficients(now, name)
-            share = float(np.clip(1.0 - (unit / ratio) ** 2 * var.mean(), 1e-6, 1.0))
-            change = float((w**2).mean()) * (unit / ratio / noise) ** 2 / share
-            slope[name] = w.size * share * (change - 1.0)
+        new, slope, noise = {}, {}, math.sqrt(now.variance)
+        for name, size, number, squares, variance in self._parts(now):
+            share = min(max(1.0 - variance / (number * size**2), 1e-6), 1.0)
+            change = squares / number / (size * noise) ** 2 / share
+            slope[name] = number * share * (change - 1.0)
             least, most = self.least, self.prior.size
             if name == "stretch":
                 least, most = (self.stretch, _MOST * most) if self.is_stretched(now) else (least, least)
-            new[name] = float(np.clip(ratio * change ** (1.0 - 0.5 * share), least / noise, most / noise))
+            wanted = now.ratios[name] * change ** (1.0 - 0.5 * share)
+            new[name] = min(max(wanted, least / noise), most / noise)
         allowed = self.allowed({name: ratio * noise for name, ratio in new.items()})
         return {name: size / noise for name, size in allowed.items()}, slope
 
@@ -352,9 +338,9 @@ class _Parts:
         before, reach = dict.fromkeys(now.ratios, 0.0), dict.fromkeys(now.ratios, 1.0)
         for _ in range(_PASSES):
             wanted, slope = self.renewed(now)
-            if self.change(now.ratios, wanted) < _SETTLED:
+            step = {name: math.log(wanted[name] / ratio) for name, ratio in now.ratios.items()}
+            if max(map(abs, step.values())) < _SETTLED:
                 break
-            step = {name: float(np.log(wanted[name] / ratio)) for name, ratio in now.ratios.items()}
             reach = {
                 name: min(2 * reach[name], _FARTHEST) if by * before[name] > 0 else 1.0
                 for name, by in step.items()
@@ -363,9 +349,7 @@ class _Parts:
             promised = sum(by * np.log(wanted[name] / now.ratios[name]) for name, by in slope.items())
             if 0.5 * promised < self.least_gain:
                 break
-            better = next(self.better(now, wanted), None)
-            if better is None:
-                break
+            better = self.better(now, wanted)
             gain, now, before = better.evidence - now.evidence, better, step
             if gain < self.least_gain:
                 break
@@ -373,48 +357,34 @@ class _Parts:
 
     def beyond(self, now: _Solution, step: dict[str, float], reach: dict[str, float]) -> dict[str, float]:
         """Sizes after the given multiples of steps in their logarithms; a stretch has its own limits."""
-        noise, most = np.sqrt(now.variance), self.prior.size
-        sizes = {
-            name: ratio * noise * np.exp(step[name] * (1.0 if name == "stretch" else reach[name]))
-            for name, ratio in now.ratios.items()
-        }
-        return {
-            name: size / noise if name == "stretch" else float(np.clip(size, self.least, most) / noise)
-            for name, size in sizes.items()
-        }
+        noise, beyond = math.sqrt(now.variance), {}
+        for name, ratio in now.ratios.items():
+            if name == "stretch":
+                beyond[name] = ratio * math.exp(step[name])
+                continue
+            size = ratio * noise * math.exp(step[name] * reach[name])
+            beyond[name] = min(max(size, self.least), self.prior.size) / noise
+        return beyond
 
-    def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
-        """Solutions with higher evidence on the way to the wanted sizes, by step halving."""
+    def better(self, now: _Solution, wanted: dict[str, float]) -> _Solution:
+        """A solution with higher evidence on the way to the wanted sizes, by step halving, or this one."""
         for halvings in range(_HALVINGS):
             part = 0.5**halvings
-            trial = {name: ratio * (wanted[name] / ratio) ** part for name, ratio in now.ratios.items()}
-            found = self.at(trial)
+            found = self.at({name: r * (wanted[name] / r) ** part for name, r in now.ratios.items()})
             if found.evidence > now.evidence:
-                yield found
-
-    def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
-        """Largest relative change of the sizes."""
-        return float(max(abs(np.log(new[name] / old[name])) for name in old))
+                return found
+        return now
 
     def posterior(self, now: _Solution) -> Posterior:
-        n, f, prior, solved = self.system.n, self.system.f, self.prior, now.solved
-        determined = 0.0
-        for name, ratio in now.ratios.items():
-            w, var, unit = self._coefficients(now, name)
-            determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        rest = solved.rest()
-        along = rest.camera_offsets.reshape(f, 3 * n)
-        followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
-        noise = np.sqrt(now.variance)
+        prior, solved, noise = self.prior, now.solved, math.sqrt(now.variance)
+        determined = sum(number - variance / size**2 for _, size, number, _, variance in self._parts(now))
         return Posterior(
             offsets=(prior.basis @ solved.smooth) + solved.single,
             variance=now.variance,
             camera_step=solved.camera,
-            camera=solved.camera_covariance,
-            followed=followed.reshape(f, n, 3),
-            std=noise * np.sqrt(np.maximum(rest.offset_variance, 0.0)),
-            sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
+            camera=solved.camera_root.T @ solved.camera_root,
+            sizes={name: ratio * noise for name, ratio in now.ratios.items()},
             determined=determined,
             evidence=now.evidence,
-            poses=rest.poses,
+            solved=(solved, prior, self.system.gauge),
         )

@@ -17,6 +17,8 @@ plane, represented by its largest eigenfunctions. A solid target warps in all di
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,14 +77,13 @@ class Prior:
 
 
 def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
-    """Prior for the points of a target.
+    """Prior for the points (n, 3) of a target [world unit]; `plane` (n,) is each point's, from 0."""
+    return _prior_of(given.tobytes(), plane.tobytes())
 
-    Parameters
-    ----------
-    given : (n, 3) array [world unit]
-    plane : (n,) int array
-        Index of each point's plane, from 0.
-    """
+
+@lru_cache(maxsize=4)  # one calibration asks three times for the same target, a millisecond each
+def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
+    given, plane = np.frombuffer(given_bytes).reshape(-1, 3), np.frombuffer(plane_bytes, dtype=np.intp)
     n, planes = len(given), int(plane.max()) + 1
     size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
     axes = np.empty((n, 3, 3))
@@ -95,12 +96,8 @@ def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
             parts.append((name, _at(rows, part, n)))
         if planes > 1:
             parts.append(("fold", _at(rows, _as_a_whole(centred / size, own), n)))
-    groups: dict[str, NDArray[np.intp]] = {}
-    first = 0
-    for name, part in parts:
-        new = np.arange(first, first + part.shape[2])
-        groups[name] = np.concatenate([groups[name], new]) if name in groups else new
-        first += part.shape[2]
+    names = np.repeat([name for name, _ in parts], [part.shape[2] for _, part in parts])
+    groups = {name: np.flatnonzero(names == name) for name, _ in parts}
     basis = size * np.concatenate([part for _, part in parts], axis=2)
     return Prior(axes, basis, groups, _gauge(given, axes), size)
 

@@ -41,22 +41,10 @@ _OFF = 1.4  # least factor that matters
 
 
 def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
-    """Adjust surveyed points and cameras together.
+    """Adjust surveyed points together with cameras at their minimum for the surveyed coordinates.
 
-    Parameters
-    ----------
-    fits : sequence of (Problem, Adjusted)
-        Cameras with the points at their surveyed coordinates, each at its minimum.
-
-    Returns
-    -------
-    Found or None
-        None if there are too many points and views, or if they do not determine the unknowns.
-
-    Raises
-    ------
-    InputError
-        A point has two different standard deviations.
+    None if there are too many points and views, or if they do not determine the unknowns. Raises `InputError`
+    if a point has two different standard deviations.
     """
     all_points = [problem.points for problem, _ in fits]
     given, label, ids = distinct_points(all_points)
@@ -99,14 +87,7 @@ def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
 def noise_variance(info: Information, prior: Prior, factor: float) -> float:
     """Most likely variance of the pixels [px^2], with surveyed points.
 
-    Parameters
-    ----------
-    info : Information
-        In the whole offsets from the surveyed points.
-    prior : Prior
-        Of surveyed points.
-    factor : float
-        On the stated standard deviations.
+    The quadratic is in the whole offsets from them, and the factor is on their stated standard deviations.
     """
     return _noise(info, prior, factor)[0]
 

@@ -6,9 +6,6 @@ remaining system is dense. So the work grows linearly with the number of views o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,26 +13,23 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
-from neurocal_cli.target_shape.without_poses import WithoutPoses
 
 _SMALL = 48  # largest triangular matrix that is inverted directly; others are split in halves
 _RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefinite
 
 
 class System:
-    """The quadratic with its parts; everything independent of the precisions is computed once.
+    """The quadratic in the whole offsets along each point's axes, with its parts.
 
-    Parameters
-    ----------
-    info : Information
-        In the whole offsets from the given target, along each point's axes.
-    prior : Prior
+    Everything independent of the precisions is computed once. `s` is the number of camera parameters and
+    smooth coefficients.
     """
 
     def __init__(self, info: Information, prior: Prior) -> None:
         self.info, self.prior = info, prior
         self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
+        self.s = self.f + self.m
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= self.p * self.P
         if self.points_first:
@@ -43,17 +37,12 @@ class System:
         else:
             self._eliminate_poses()
 
-    @property
-    def s(self) -> int:
-        """Number of camera parameters and smooth coefficients."""
-        return self.f + self.m
-
     def _prepare(self) -> None:
         """Compute the matrices from which the points will be eliminated."""
         info, basis = self.info, self.prior.basis
         by_basis = info.point @ basis  # (n, 3, m)
-        across = np.einsum("nif,nim->fm", info.point_camera, basis)
         flat = basis.reshape(3 * self.n, self.m)
+        across = info.point_camera.reshape(3 * self.n, self.f).T @ flat
         inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
         shared = np.block([[info.camera, across], [across.T, inner]])
         right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
@@ -64,6 +53,7 @@ class System:
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
         by_shared = [info.point_camera, by_basis]
         self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
+        self.rows = np.empty_like(self.by_point)  # large arrays are quicker to fill again than to allocate
 
     def _with_points(self, shared: Array, right: Array, pose_shared: Array) -> Array:
         """The bordered matrix of cameras, smooth parts and poses, before points are eliminated."""
@@ -138,47 +128,27 @@ class System:
         return M
 
     def _poses_first(self, smooth: Array, single: Array) -> Solved:
-        s, f = self.s, self.f
-        dim = s + 3 * self.n
         M = self._without_poses(smooth, single)
-        root, logdet = _root_of_inverse(M[:dim, :dim])
-        half = root @ M[:dim, -1]
-        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
-        cost = float(M[-1, -1] - half @ half)
-        var_single = variance[s:].reshape(self.n, 3)
-
-        def rest() -> Rest:
-            inverse = root.T @ root
-            cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
-            along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
-            return Rest(
-                self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3)),
-                self._variance(inverse[f:s, f:s], cross, var_single, along_gauge),
-                self._poses(inverse),
-            )
-
+        root, logdet = _root_of_inverse(M[:-1, :-1])
+        half = root @ M[:-1, -1]
+        poses = None
+        if self.prior.stated is not None:
+            own = np.linalg.inv(self.info.pose)
+            by_point = self.info.pose_point.reshape(self.P, self.p, -1)
+            gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2) @ root.T
+            poses = own + gain @ np.swapaxes(gain, 1, 2)
+        x, s = half @ root, self.s
         return Solved(
-            x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
-            variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest,
+            x[: self.f], x[self.f : s], x[s:].reshape(self.n, 3), float(M[-1, -1] - half @ half),
+            logdet + self.logdet_poses, root[:, : self.f], root[:, self.f : s], root[:, s:],
+            np.zeros((self.n, 3, 3)), poses,
         )  # fmt: skip
-
-    def _poses(self, inverse: Array) -> Array | None:
-        """(P, 6, 6) covariance of the poses from that of all other unknowns; only for surveyed points.
-
-        Without a survey it would include the gauge freedom of the target.
-        """
-        if self.prior.stated is None:
-            return None
-        own = np.linalg.inv(self.info.pose)
-        by_point = self.info.pose_point.reshape(self.P, self.p, -1)
-        gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2)
-        return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
         own = self.info.point + single[:, :, None] * np.eye(3)
         root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
-        rows = root @ self.by_point
+        rows = np.matmul(root, self.by_point, out=self.rows)
         flat = rows.reshape(3 * self.n, -1)
         M = self.bordered - flat.T @ flat
         at = np.arange(self.f, self.s)
@@ -186,79 +156,73 @@ class System:
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
-        s, f, n, P, p = self.s, self.f, self.n, self.P, self.p
-        dim = s + p * P
+        f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
         M, own_root, rows = self._without_points(smooth, single)
-        root, logdet = _root_of_inverse(M[:dim, :dim])
-        half = root @ M[:dim, -1]
-        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
-        cost = float(M[-1, -1] - half @ half)
+        root, logdet = _root_of_inverse(M[:-1, :-1])
+        half = root @ M[:-1, -1]
+        x, back = half @ root, np.swapaxes(own_root, 1, 2)
         # Back-substitution of the points: their response to all other unknowns.
-        back = np.swapaxes(own_root, 1, 2)
-        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        follow = (back @ rows[:, :, :-1]).reshape(3 * n, dim)
-        by_root = follow @ root.T
-        var_single = np.diagonal(back @ own_root, axis1=1, axis2=2) + (
-            np.einsum("ij,ij->i", by_root, by_root).reshape(n, 3)
-        )
+        e = back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None]
+        follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
         logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
-
-        def rest() -> Rest:
-            inverse, spread = root.T @ root, by_root @ root
-            cross = -spread.T.reshape(dim, n, 3)
-            own = ((back @ own_root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
-            along_gauge = own + spread @ (follow.T @ self.gauge)
-            return Rest(
-                self._with_offsets(inverse[:f, f:s], cross[:f]),
-                self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1)),
-                inverse[s:, s:].reshape(P, p, P, p)[np.arange(P), :6, np.arange(P), :6],
-            )
-
+        own = root[:, s:].T.reshape(P, p, len(x))[:, :6]
         return Solved(
-            x[:f], x[f:s], e, cost, logdet, variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest
-        )
-
-    def _with_offsets(self, smooth: Array, single: Array) -> Array:
-        """(f, n, 3) covariance between the cameras and the whole offsets."""
-        return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
-
-    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
-        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
-
-        With G the orthonormal gauge directions, it is the diagonal of (I - G G^T) C (I - G G^T).
-        """
-        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
-        diagonal = (
-            ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
-        )
-        by_smooth = np.einsum("nim,nig->mg", basis, G)
-        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
-        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
-        inner = np.einsum("nig,nih->gh", G, C_G)
-        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
+            x[:f], x[f:s], e[..., 0], float(M[-1, -1] - half @ half), logdet,
+            root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root, own @ np.swapaxes(own, 1, 2),
+        )  # fmt: skip
 
 
-class Rest(NamedTuple):
-    """Blocks of the covariance that are needed only for the final sizes.
+class WithoutPoses:
+    """Information with the poses eliminated (Schur complement); results for different views can be added.
 
-    Attributes
-    ----------
-    camera_offsets : (f, n, 3) array
-        Covariance between the cameras and the whole offsets.
-    offset_variance : (n, 3) array
-        Variance of the whole offsets, without the gauge.
-    poses : (P, 6, 6) array, optional
-        Covariance of each pose.
+    `rows` (P p, f + 3 n + 1) is a factor of the correction for cameras, offsets and the right side, and
+    `logdet` the log determinant of the poses' part.
     """
 
-    camera_offsets: Array
-    offset_variance: Array
-    poses: Array | None
+    def __init__(self, info: Information) -> None:
+        self.info, (P, p), d = info, info.pose.shape[:2], info.point_right.size
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        columns = [info.pose_camera, info.pose_point.reshape(P, p, d), info.pose_right[..., None]]
+        self.rows = (root @ np.concatenate(columns, axis=2)).reshape(P * p, len(info.camera) + d + 1)
+        self.logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+
+    def matrix(self) -> Array:
+        """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
+        info, f, n = self.info, len(self.info.camera), len(self.info.point)
+        M = self.rows.T @ -self.rows
+        M[:f, :f] += info.camera
+        across = info.point_camera.reshape(3 * n, f)
+        M[f:-1, :f] += across
+        M[:f, f:-1] += across.T
+        at = f + 3 * np.arange(n)
+        for i in range(3):
+            for j in range(3):
+                M[at + i, at + j] += info.point[:, i, j]
+        right = np.concatenate([info.camera_right, info.point_right.ravel(), [info.cost]])
+        M[-1] += right
+        M[:-1, -1] += right[:-1]
+        return np.asarray(M)
+
+    def at(self, offsets: Array) -> tuple[Array, Array, Array]:
+        """The cameras' matrix (f, f), right sides (f, k) and costs (k,) for given offsets (k, n, 3)."""
+        info, f, k = self.info, len(self.info.camera), len(offsets)
+        flat = offsets.reshape(k, -1).T
+        by_camera, left = self.rows[:, :f], self.rows[:, -1:] - self.rows[:, f:-1] @ flat
+        by_point = (info.point @ offsets[..., None])[..., 0] - 2 * info.point_right
+        right = info.camera_right[:, None] - info.point_camera.reshape(len(flat), f).T @ flat
+        return (
+            info.camera - by_camera.T @ by_camera,
+            right - by_camera.T @ left,
+            info.cost + (offsets * by_point).sum(axis=(1, 2)) - (left**2).sum(axis=0),
+        )
 
 
 @frozen_dataclass(eq=False)
 class Solved:
-    """The minimum of the quadratic, and blocks of the inverse of its matrix.
+    """The minimum of the quadratic, and the inverse of its matrix: the covariance for unit noise.
+
+    The covariance of two unknowns is the product of their columns in the roots. To that of single points,
+    `own` is added.
 
     Attributes
     ----------
@@ -271,10 +235,11 @@ class Solved:
     cost : float
     logdet : float
         Log determinant of the whole matrix.
-    smooth_variance, single_variance : (m,), (n, 3) array
-    camera_covariance : (f, f) array
-    rest : callable
-        Computes further blocks.
+    camera_root, smooth_root, single_root : (d, f), (d, m), (d, 3 n) array
+    own : (n, 3, 3) array
+    poses : (P, 6, 6) array, optional
+        Covariance of each pose. Without a survey it includes the gauge freedom of the target, and is given
+        only if the points are eliminated first.
     """
 
     camera: Array
@@ -282,10 +247,37 @@ class Solved:
     single: Array
     cost: float
     logdet: float
-    smooth_variance: Array
-    single_variance: Array
-    camera_covariance: Array
-    rest: Callable[[], Rest]
+    camera_root: Array
+    smooth_root: Array
+    single_root: Array
+    own: Array
+    poses: Array | None
+
+    def smooth_variance(self, places: NDArray[np.intp]) -> float:
+        """Sum of the variances of some coefficients."""
+        return float(np.square(self.smooth_root[:, places]).sum())
+
+    def single_variance(self) -> Array:
+        """(n, 3) variances of the single points' parts."""
+        by_root = np.einsum("ij,ij->j", self.single_root, self.single_root).reshape(-1, 3)
+        return by_root + np.diagonal(self.own, axis1=1, axis2=2)
+
+    def offset_root(self, prior: Prior) -> Array:
+        """(d, 3 n) root of the whole offsets."""
+        return self.single_root + self.smooth_root @ prior.basis.reshape(self.single.size, -1).T
+
+    def offset_variance(self, prior: Prior, gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
+
+        With G the orthonormal gauge directions (3 n, 7), it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        root = self.offset_root(prior)
+        root = root - (root @ gauge) @ gauge.T
+        G = gauge.reshape(*self.single.shape, -1)
+        own = self.own @ G
+        inner = np.einsum("nig,nih->gh", G, own)
+        by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
+        return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.information import Information, Sight, information_of
-from neurocal_cli.target_shape.leave_out import without_each
-from neurocal_cli.target_shape.posterior import camera_step, minimum_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
+from neurocal_cli.target_shape.posterior import camera_step, minimum_of, prior_covariance
 from neurocal_cli.target_shape.prior import Prior
-from neurocal_cli.target_shape.without_poses import WithoutPoses
+from neurocal_cli.target_shape.system import WithoutPoses
 
 _FEWEST = 4  # fewest views, so that the others determine a camera
 _FOLDS = 5
@@ -37,18 +36,9 @@ def passes_cross_validation(
 ) -> bool:
     """Whether offsets estimated from the other views fit the held-out ones; True if that cannot be tested.
 
-    Parameters
-    ----------
-    sights : sequence of Sight
-        At the minimum for the estimated target.
-    prior : Prior
-    offsets : (n, 3) array
-        Along each point's axes.
-    sizes : dict of float by name [world unit]
-    variance : float [px^2]
-        Of the noise.
-    precision : float
-        Prior precision of the bends of single views, if any, in units of the noise precision.
+    The sights are at the minimum for the estimated target with these offsets (n, 3), along each point's axes,
+    and `variance` [px^2] is that of the noise. `precision` is that of the prior of the bends of single views,
+    if any, in units of the noise precision.
     """
     n_views = max(sight.views.n_views for sight in sights)
     if sum(sight.views.n_views for sight in sights) < _FEWEST:
@@ -74,26 +64,50 @@ def passes_cross_validation(
     except np.linalg.LinAlgError:
         return True
     tried = np.stack([np.zeros_like(offsets), *estimated])
+    # Costs minimised over cameras and poses: without offsets, and with those from all but each fold.
     if by_parts:
-        terms = [WithoutPoses(part).at(tried) for part in parts]
-
-    def costs(which: NDArray[np.intp]) -> Array:
-        """Costs minimised over cameras and poses: without offsets, and with those from all but each fold."""
-        if not by_parts:
-            return _least(WithoutPoses(information(which)).at(tried))
-        some = [terms[fold] for fold in which]
-        return _least((sum(S for S, *_ in some), sum(g for _, g, _ in some), sum(c for *_, c in some)))
-
-    whole = costs(folds)
-    alone, together = 0.0, -n_folds * whole[0]
-    for fold in range(n_folds):
-        out, rest = costs(folds[folds == fold]), costs(folds[folds != fold])
-        alone += out[1 + fold] - out[0]
-        together += whole[1 + fold] - rest[1 + fold] + rest[0]
+        terms = [
+            np.stack(term) for term in zip(*(WithoutPoses(part).at(tried) for part in parts), strict=True)
+        ]
+        sums = [term.sum(axis=0) for term in terms]
+        whole = _least(*sums)
+        out = _least(*terms)
+        rest = _least(*(total - term for total, term in zip(sums, terms, strict=True)))
+    else:
+        whole = _least(*WithoutPoses(information(folds)).at(tried))
+        out = np.stack([_least(*WithoutPoses(part).at(tried)) for part in parts])
+        rest = np.stack([_least(*WithoutPoses(other).at(tried)) for other in others])
+    own = out[folds, 1 + folds], rest[folds, 1 + folds]
+    alone = (own[0] - out[:, 0]).sum()
+    together = (whole[1:] - own[1] + rest[:, 0]).sum() - n_folds * whole[0]
     return bool(alone < 0 or together < 0)
 
 
-def _least(terms: tuple[Array, Array, Array]) -> Array:
-    """Costs (k,) minimised over the cameras."""
-    S, g, cost = terms
-    return np.asarray(cost - (g * camera_step(S, g)).sum(axis=0))
+def _least(S: Array, g: Array, cost: Array) -> Array:
+    """Costs (..., k) minimised over the cameras."""
+    return np.asarray(cost - (g * camera_step(S, g)).sum(axis=-2))
+
+
+def without_each(
+    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
+) -> list[tuple[Array, Array]]:
+    """Step (f,) of the cameras and offsets (n, 3) from all parts but one, for each part left out.
+
+    The parts are of different views of the same cameras, in the whole offsets along each point's axes, and
+    `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
+    determine the cameras.
+    """
+    if 3 * len(prior.axes) > sum(part.pose_right.size for part in parts):
+        others = (joined([part for part in parts if part is not out]) for out in parts)
+        return [minimum_of(some, prior, sizes, variance) for some in others]
+    matrices = [WithoutPoses(part).matrix() for part in parts]
+    f = len(parts[0].camera)
+    precision = np.zeros_like(matrices[0][:-1, :-1])
+    precision[f:, f:] = variance * np.linalg.inv(prior_covariance(prior, sizes))
+    whole = sum(matrices)
+    estimated = []
+    for out in matrices:
+        M = whole - out
+        x = np.asarray(np.linalg.solve(M[:-1, :-1] + precision, M[:-1, -1]))
+        estimated.append((x[:f], x[f:].reshape(-1, 3)))
+    return estimated

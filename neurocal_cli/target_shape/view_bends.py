@@ -11,8 +11,8 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.target import distinct_points, is_flat, planes_of
-from neurocal_cli.target_shape.bend_size import most_probable_precision
-from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search, searched
+from neurocal_cli.target_shape.bend_evidence import most_probable_precision
+from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search
 from neurocal_cli.target_shape.information import of_views, without_points
 from neurocal_cli.target_shape.posterior import evidence_of_given
 
@@ -21,19 +21,10 @@ _EARLY = 0.5  # share of the required gain that the first step must predict
 
 
 def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:
-    """Estimate the bend of the board in each view.
+    """Estimate the bend of the board in each view, for a camera at its minimum for the given board.
 
-    Parameters
-    ----------
-    fit : (Problem, Adjusted)
-        A camera at its minimum for the given board.
-    common : Found, optional
-        The estimated common shape of the board, if there is one.
-
-    Returns
-    -------
-    Found or None
-        The board with its bends; `common` if the evidence for bends is not clear.
+    `common` is the estimated common shape of the board, if there is one. It is returned if the evidence for
+    bends is not clear.
     """
     if not _may_bend(fit[0]):
         return common
@@ -44,11 +35,11 @@ def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | N
         return common
     if bent < rigid + _EARLY * LEAST_GAIN:
         return common
-    only = searched(Search([fit], False, None, bending=True, still=True), LEAST_GAIN)
+    only = Search([fit], False, None, bending=True, still=True).result(LEAST_GAIN)
     start = only if common is None else common
     if start is None:
         return None
-    both = searched(Search(start.fits, False, start.target, bending=True), LEAST_GAIN)
+    both = Search(start.fits, False, start.target, bending=True).result(LEAST_GAIN)
     best = max(filter(None, (only, both)), key=lambda found: found.evidence, default=None)
     least = LEAST_GAIN + (rigid if common is None else common.evidence)
     return common if best is None or best.evidence < least else best
