@@ -98,6 +98,13 @@ def test_a_board_of_another_size_is_named(cols: int, rows: int, words: str) -> N
         identify(Board.single(cols, rows, 25), seen_grids(scene, seen), seen.image)
 
 
+def test_a_pattern_full_of_gaps_is_not_called_a_board_of_its_size() -> None:
+    blinds = flat_grid(15, 13)
+    blinds.pixels[1:12, 1:14][np.add.outer(np.arange(11), np.arange(13)) % 3 > 0] = np.nan
+    with pytest.raises(NoBoardError, match="no board of 7 x 4 inner vertices, only parts of a pattern"):
+        identify(Board.single(7, 4, 25), [blinds], EMPTY)
+
+
 def test_a_piece_of_a_bigger_board_is_refused_though_it_has_the_size() -> None:
     seen = picture("base", 0)
     whole = seen_grid(seen.truth.planes[0], True)

@@ -103,6 +103,24 @@ def test_hidden_edges_are_left_out(seed: int) -> None:
     assert found_errors.hidden_kept <= 3  # the occluder only just touches the strip around them
 
 
+@pytest.mark.parametrize("light", [0.7, 0.5])
+def test_a_board_half_in_a_shadow_is_measured_on_both_sides(light: float) -> None:
+    _, seen = take("base", 1)
+    (plane,) = seen.truth.planes
+    border = np.median(plane.vertices[..., 0])
+    across = np.tanh((np.arange(seen.image.shape[1]) - border) / 2)
+    dimmed = seen.image * (0.5 * (1 + light) + 0.5 * (1 - light) * across)
+    grid, mirrored = found(plane, 1)
+    measured = measure(dimmed.round().astype(np.uint8), grid)
+    row = places(measured, plane, mirrored)
+    error = ((measured.pixels - plane.midpoints[row]) * plane.normals[row]).sum(axis=1)
+    away = np.abs(plane.midpoints[row, 0] - border) > 20
+    for side in (-1, 1):
+        there = side * (plane.midpoints[:, 0] - border) > 20
+        assert there[row].sum() > 0.95 * there.sum()
+    assert np.abs(error[away]).max() < 0.1
+
+
 def test_result_is_complete_and_repeatable() -> None:
     _, picture = take("base", 0)
     plane = picture.truth.planes[0]

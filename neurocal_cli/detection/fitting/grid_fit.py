@@ -35,7 +35,14 @@ from neurocal_cli.detection.fitting.edge_profile import half_widths
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
-from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.shading import (
+    Levels,
+    LocalShading,
+    Shading,
+    fit_shading,
+    has_shadow,
+    square_levels,
+)
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, vertex_lines, vertex_model, vertex_pixels
@@ -405,4 +412,5 @@ def _shading(first: GridFit) -> Shading:
 
 def _shading_of(at: SmoothMap, dark: Levels, light: Levels) -> Shading:
     smooth = fit_shading(at.frame, dark, light)
-    return LocalShading.of(smooth, dark, light) if isinstance(at, WideMap) else smooth
+    uneven = isinstance(at, WideMap) or has_shadow(smooth, dark, light)
+    return LocalShading.of(smooth, dark, light) if uneven else smooth

@@ -9,6 +9,10 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 
+# Least share of a grid's vertices that are found if it is a whole board. On photographs it is 0.89 and more
+# for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.
+_WHOLE = 0.8
+
 SYMMETRIC_BOARD = (
     "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
     "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
@@ -44,6 +48,12 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
             return NoBoardError(
                 f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
             )
+    if grid.seen.mean() < _WHOLE:
+        return NoBoardError(
+            f"detected no board of {wanted} inner vertices, only parts of a pattern of {_size(shape)}; "
+            "show the whole board, sharp and evenly lit",
+            shape,
+        )
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
     return NoBoardError(
         f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
