@@ -68,6 +68,7 @@ def adjust(
     free_pose: bool = True,
     max_iterations: int = OPTIONS.max_iterations,
     penalty: Penalty | None = None,
+    damping: float = OPTIONS.damping,
 ) -> Adjusted:
     """Minimise the reprojection error (3) from a start near the minimum.
 
@@ -85,9 +86,11 @@ def adjust(
     penalty : callable, optional
         Extra residuals on the shared camera, whose squares are added to those of the pixels. The result's
         `normal` and `cost` contain the pixels alone.
+    damping : float
+        At the start; less of it saves steps from a start close to the minimum.
     """
     problem = _Reprojection(batches, start, free, free_pose, penalty)
-    options = replace(OPTIONS, max_iterations=max_iterations)
+    options = replace(OPTIONS, max_iterations=max_iterations, damping=damping)
     outcome = minimise(problem, options, problem.by_group(2.0 * FLOOR**2 * batches.counts.astype(float)))
     state, normal = replace(problem.state, R=orthonormalised(problem.state.R)), problem.normal
     if penalty is not None:
