@@ -173,7 +173,7 @@ def _conic(p: Array) -> tuple[Array, Array]:
     return half[:, 5].reshape(-1, 9), by_p.reshape(-1, 5, 9)
 
 
-_Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives
+_Trial = tuple[Array, Array, Array, Array]  # parameters, their residuals, derivatives and losses
 
 
 class _Starts:
@@ -193,24 +193,27 @@ class _Starts:
         """Steps of limited length, damped by the mean of the diagonal, and their predicted gains."""
         J, f = self.J[active], len(self.conditions.free)
         H = J @ np.swapaxes(J, 1, 2)
-        g = -(J @ self.r[active][..., None])[..., 0]
-        ridge = damping * (np.trace(H, axis1=1, axis2=2) / f + 1e-12)
-        step = np.linalg.solve(H + ridge[:, None, None] * np.eye(f), g[..., None])[..., 0]
+        g = -(J @ self.r[active][..., None])
+        diagonal = H.reshape(len(H), -1)[:, :: f + 1]  # a view
+        ridge = damping * (diagonal.sum(axis=1) / f + 1e-12)
+        diagonal += ridge[:, None]
+        step = np.linalg.solve(H, g)
         step = np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
-        return step, (step * (g - 0.5 * (H @ step[..., None])[..., 0])).sum(axis=1)
+        gain = step * (g - 0.5 * (H @ step - ridge[:, None, None] * step))
+        return step[..., 0], gain[..., 0].sum(axis=1)
 
     def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
         """The parameters after a step; all of them are valid."""
         trial = self.p[active]
         trial[:, self.conditions.free] += step
         r, J = self.conditions(trial)
-        return (trial, r, J), 0.5 * (r * r).sum(axis=1), np.ones(len(trial), dtype=bool)
+        loss = 0.5 * (r * r).sum(axis=1)
+        return (trial, r, J, loss), loss, np.ones(len(trial), dtype=bool)
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
         """Accept the trial for the starts that improved."""
         kept = active[better]
-        self.p[kept], self.r[kept], self.J[kept] = (values[better] for values in trial)
-        self.loss[kept] = 0.5 * (self.r[kept] * self.r[kept]).sum(axis=1)
+        self.p[kept], self.r[kept], self.J[kept], self.loss[kept] = (values[better] for values in trial)
 
 
 def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:

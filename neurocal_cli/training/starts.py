@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.network import Patterns, output, random_weights
+from neurocal_cli.network import Patterns, random_weights
 from neurocal_cli.training import Task, Trained, Trainer
 
 
@@ -140,7 +140,7 @@ class _BestStarts:
         trained = self.trainer(Task(patterns, W, V, free_W, free_V))
         self.iterations += int(trained.iterations.sum())
         self.starts[views] += count
-        depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
+        depth = (patterns.inputs @ (trained.W[:, 2:] @ trained.V).swapaxes(1, 2))[..., 0]
         real = patterns.weights > 0
         rms = patterns.rms(trained.loss)
         # A loss that overflowed to nan must not be chosen.
