@@ -17,7 +17,6 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -47,13 +46,13 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    errors = point_residuals(views, state)  # (N, 2), by view
+    errors = solution.residuals
     repeated = repeated_poses(views, state, errors)
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
             problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
-            solution.by_prior, solution.target_kept,
+            solution.by_prior, solution.target_kept, solution.covariance if solution.target is None else None,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
