@@ -79,8 +79,8 @@ def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
     np.multiply(from_middle, -share, out=J[:, -3])
     np.multiply(J[:, -3], share, out=J[:, -2])
     np.subtract(pixels, predicted, out=J[:, -1])
-    J = (J * np.sqrt(patterns.weights)[:, None, None]).reshape(K, len(own) + 3, -1)
-    strength, by_product, _ = schur_step(J @ np.swapaxes(J, 1, 2), len(own) + np.arange(2), own, _RIDGE)
+    rows = (J * np.sqrt(patterns.weights)[:, None, None]).reshape(K, len(own) + 3, -1)
+    strength, by_product, _ = schur_step(rows @ np.swapaxes(rows, 1, 2), len(own) + np.arange(2), own, _RIDGE)
     if not np.isfinite(by_product).all() or not np.abs(strength).sum() < _STRONGEST:
         return None
     if 1 + strength @ [3.0, 5.0] <= 0:  # the undistorted radius decreases before the farthest point
