@@ -23,7 +23,6 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.options import MOST_POINTS
 from neurocal_cli.initialisation.view_networks import Group
 from neurocal_cli.least_squares.schur_complement import schur_step
 
@@ -58,10 +57,10 @@ class RadialStep:
 
 def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
     """The step; None if no distortion is estimated, or if the step is not determined or too long."""
-    if not problem.free_distortion or len(groups) > 1:  # boards and solid targets: products of two sizes
+    group, views, patterns = groups[0], problem.views, groups[0].patterns
+    # Boards and solid targets together have products of two sizes.
+    if not problem.free_distortion or len(groups) > 1 or patterns is None:
         return None
-    group, views = groups[0], problem.views
-    patterns = views.patterns(group.views, group.flat, MOST_POINTS)
     Z, pixels = np.swapaxes(patterns.inputs, 1, 2), np.swapaxes(patterns.targets[..., :2], 1, 2)
     K, inputs, n = Z.shape
     own = np.arange(3 * inputs)

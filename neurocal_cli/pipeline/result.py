@@ -58,9 +58,10 @@ def calibration_of(
     refuse_undetermined(problem, state, known.plain)
     cov = known.found
     A = problem.matrix(state.entries[0])
-    intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+    else:
+        intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     entries = _entries(problem, known, solution.ambiguity)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
@@ -88,7 +89,7 @@ def calibration_of(
         rmse_px=rmse,
         max_px=float(np.sqrt(squared.max())),
         covariance=block[np.ix_(free, free)],
-        covariance_names=tuple(np.array(list(std))[free].tolist()),
+        covariance_names=tuple(parameter for parameter in std if parameter not in fixed),
         distortion_model=problem.distortion.model,
         distortion=state.k,
         network=_network_record(solution, rmse),
