@@ -93,8 +93,11 @@ class _Search:
     def _begin(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
         """First bundle adjustment; the error of its start is recorded."""
         self.options.progress("refining", 0.0)
-        before = float((point_residuals(self.views, state) ** 2).sum())
-        return self.problem.adjust(state, damping=damping), replace(record, before=before)
+        adjusted = self.problem.adjust(state, damping=damping)
+        before = adjusted.before
+        if self.views.whitening is not None:
+            before = float((point_residuals(self.views, state) ** 2).sum())
+        return adjusted, replace(record, before=before)
 
     def _constrained(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
         state, iterations = train_constrained(self.problem, self.options, state)

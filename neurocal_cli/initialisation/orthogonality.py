@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
 # Bundle adjustment refines the result, so gains below 1e-4 of the loss are not worth a step. Starts are
@@ -24,6 +24,7 @@ _OPTIONS = DescentOptions(
     tolerance=1e-4, by_promise=False, needless=1e-4, flat=0.0, max_iterations=50,
 )  # fmt: skip
 _FLOOR = 1e-28  # loss that rounding alone can cause
+_APART = 1e-2  # largest difference of any entry from which on two minima are different
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
 _STARTS = 8  # random starts, trained side by side
 _ENOUGH = 3  # starts at the same, lowest loss with which training ends
@@ -78,10 +79,10 @@ def shared_intrinsics(
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
     agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
+    apart = np.abs(p[:, None] - p).max(axis=2) > _APART
     distinct = [0]
-    for n in range(1, _STARTS):
-        gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
-        if np.isfinite(loss[n]) and gap > 1e-2:
+    for n in np.flatnonzero(apart[0] & np.isfinite(loss)).tolist():
+        if apart[n, distinct].all():
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
 
@@ -264,6 +265,6 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
     M = D[:, :, :-1]
     scale: Array = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
     if M.shape[2] == 2:
-        third = np.cross(M[:, :, 0], M[:, :, 1]) / scale[:, None]
-        M = np.asarray(np.concatenate([M, third[:, :, None]], axis=2), dtype=float)
+        third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
+        M = np.concatenate([M, third], axis=2)
     return nearest_rotation(M), D[:, :, -1] / scale[:, None]
