@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
@@ -23,6 +24,7 @@ _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
     tolerance=1e-4, by_promise=False, needless=1e-4, flat=0.0, max_iterations=50,
 )  # fmt: skip
+_ROWS, _COLUMNS = ENTRIES
 _FLOOR = 1e-28  # loss that rounding alone can cause
 _APART = 1e-2  # largest difference of any entry from which on two minima are different
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
@@ -157,21 +159,18 @@ def _conic(p: Array) -> tuple[Array, Array]:
     conic : (B, 9) array
     by_p : (B, 5, 9) array
     """
-    _, s, _, u, v = p.T
-    a, b = np.exp(-p[:, 0]), np.exp(-p[:, 2])
-    ab = a * b
-    skew = s * ab
-    # The derivatives of W^-1 with the sign reversed (mended at the end), followed by W^-1 itself.
-    by = np.zeros((6, 3, 3, len(p)))
-    inverse = by[5]
-    inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, -skew, skew * v - u * a
-    inverse[1, 1], inverse[1, 2], inverse[2, 2] = b, -v * b, 1.0
-    by[0, 0], by[1, 0, 1], by[1, 0, 2] = inverse[0], ab, -v * ab
-    by[2, 0, 1], by[2, 0, 2], by[2, 1] = -skew, v * skew, inverse[1]
-    by[3, 0, 2], by[4, 0, 2], by[4, 1, 2] = a, -skew, b
-    half = by.transpose(3, 0, 2, 1) @ inverse.transpose(2, 0, 1)[:, None]
-    by_p = -(half[:, :5] + np.swapaxes(half[:, :5], 2, 3))
-    return half[:, 5].reshape(-1, 9), by_p.reshape(-1, 5, 9)
+    log_a, s, log_b, u, v = p.T
+    a, b = np.exp(log_a), np.exp(log_b)
+    inverse = np.zeros((len(p), 3, 3))
+    inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 0, 2] = 1 / a, -s / (a * b), (s * v / b - u) / a
+    inverse[:, 1, 1], inverse[:, 1, 2], inverse[:, 2, 2] = 1 / b, -v / b, 1.0
+    conic = np.swapaxes(inverse, 1, 2) @ inverse
+    # Row i, column j of W changes the conic by -(h + h^T), h = (column i of the conic) (row j of W^-1).
+    half = conic[:, _ROWS, :, None] * inverse[:, _COLUMNS, None]
+    half[:, 0] *= a[:, None, None]
+    half[:, 2] *= b[:, None, None]
+    by_p = -(half + np.swapaxes(half, 2, 3))
+    return conic.reshape(-1, 9), by_p.reshape(-1, 5, 9)
 
 
 _Trial = tuple[Array, Array, Array, Array]  # parameters, their residuals, derivatives and losses

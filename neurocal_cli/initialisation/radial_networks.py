@@ -29,7 +29,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.local_minima import try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options, options_for
-from neurocal_cli.initialisation.radial_step import middle_of_image, radial_coefficients
+from neurocal_cli.initialisation.radial_step import radial_coefficients
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
@@ -81,6 +81,16 @@ def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
         entries[3:], free[[1, 3, 4]] = middle, False
         yield replace(problem, entries=entries, free=free, fixed=problem.fixed | {"theta", "u0", "v0"})
     yield problem
+
+
+def middle_of_image(problem: Problem) -> Array:
+    """(2,) assumed centre of the radial distortion [px]."""
+    points = problem.points
+    if problem.given_centre is not None:
+        return problem.given_centre
+    if points.image_size is not None:
+        return (np.array(points.image_size) - 1) / 2
+    return np.asarray(0.5 * (points.pixels.min(axis=0) + points.pixels.max(axis=0)))
 
 
 def _best_strength(radial: _Radial, seed: int) -> Array:

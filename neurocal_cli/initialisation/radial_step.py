@@ -5,10 +5,10 @@ tell its distortion before there is a camera. Undistortion by
 
     m_u = c + (m - c) (1 + kappa_1 s + kappa_2 s^2),  s = |m - c|^2 / r^2,
 
-where c is the middle of the image and r the distance of the farthest point, is linear in the two numbers. One
-Gauss-Newton step from the trained products W V, in the numbers and all products at once, finds most lenses
-well enough: bundle adjustment starts near its minimum instead of at a pinhole. `radial_networks` searches for
-stronger distortions.
+where c is the given image centre or the mean of all pixels, and r the distance of the farthest, is linear in
+the two numbers. One Gauss-Newton step from the trained products W V, in the numbers and all products at once,
+finds most lenses well enough: bundle adjustment starts near its minimum instead of at a pinhole.
+`radial_networks` searches for stronger distortions.
 """
 
 from __future__ import annotations
@@ -58,14 +58,18 @@ class RadialStep:
 def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
     """The step; None if no distortion is estimated, or if the step is not determined or too long."""
     group, views, patterns = groups[0], problem.views, groups[0].patterns
-    # Boards and solid targets together have products of two sizes.
-    if not problem.free_distortion or len(groups) > 1 or patterns is None:
+    if not problem.free_distortion or patterns is None or views.rays is not None:
+        return None
+    if len(groups) > 1:  # boards and solid targets together have products of two sizes
         return None
     Z, pixels = np.swapaxes(patterns.inputs, 1, 2), np.swapaxes(patterns.targets[..., :2], 1, 2)
     K, inputs, n = Z.shape
     own = np.arange(3 * inputs)
-    from_middle = pixels - ((middle_of_image(problem) - views.pixel_centre) / views.pixel_scale)[:, None]
-    square = (from_middle * from_middle).sum(axis=1)
+    centre = np.zeros(2)
+    if problem.given_centre is not None:
+        centre = (problem.given_centre - views.pixel_centre) / views.pixel_scale
+    from_centre = pixels - centre[:, None]
+    square = (from_centre * from_centre).sum(axis=1)
     reach = float(np.sqrt(square.max()))
     share = (square / reach**2)[:, None]
     o = group.product @ Z
@@ -75,7 +79,7 @@ def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
     J = np.zeros((K, len(own) + 3, 2, n))
     J[:, :inputs, 0] = J[:, inputs : 2 * inputs, 1] = by_o
     J[:, 2 * inputs : -3] = -by_o[:, :, None] * predicted[:, None]
-    np.multiply(from_middle, -share, out=J[:, -3])
+    np.multiply(from_centre, -share, out=J[:, -3])
     np.multiply(J[:, -3], share, out=J[:, -2])
     np.subtract(pixels, predicted, out=J[:, -1])
     rows = (J * np.sqrt(patterns.weights)[:, None, None]).reshape(K, len(own) + 3, -1)
@@ -86,16 +90,6 @@ def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
         return None
     moved = replace(group, product=group.product + by_product.reshape(K, 3, inputs))
     return RadialStep((moved,), strength, reach)
-
-
-def middle_of_image(problem: Problem) -> Array:
-    """(2,) assumed centre of the radial distortion [px]."""
-    points = problem.points
-    if problem.given_centre is not None:
-        return problem.given_centre
-    if points.image_size is not None:
-        return (np.array(points.image_size) - 1) / 2
-    return np.asarray(0.5 * (points.pixels.min(axis=0) + points.pixels.max(axis=0)))
 
 
 def radial_coefficients(model: str, straight: Array, distorted: Array) -> tuple[Array, float]:

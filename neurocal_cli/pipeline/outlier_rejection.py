@@ -28,7 +28,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import Consensus, find_consensus, find_consensus_through_wide_lens
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.initialisation.radial_step import middle_of_image
+from neurocal_cli.initialisation.radial_networks import middle_of_image
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
