@@ -22,7 +22,7 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, Leven
 # random, so the actual gain counts; test_orthogonality.py checks the share of starts that converge.
 _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
-    tolerance=1e-4, by_promise=False, needless=1e-4, flat=0.0, max_iterations=50,
+    tolerance=1e-4, by_promise=False, flat=0.0, max_iterations=50,
 )  # fmt: skip
 _ROWS, _COLUMNS = ENTRIES
 _FLOOR = 1e-28  # loss that rounding alone can cause

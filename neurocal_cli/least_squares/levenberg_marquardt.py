@@ -94,7 +94,8 @@ class DescentOptions:
         small actual gain may be accidental, and a small predicted gain a saddle point.
     needless : float
         A group also ends, without the step, where the predicted gain is less than this share of the cost: for
-        callers that need the last digits of neither state nor cost. Its steps must be an array (A, ...).
+        callers that need the last digits of neither state nor cost, and whose damping is small, because it
+        lowers the predicted gain. The steps must be an array (A, ...).
     flat : float
         The minimum is reached when a rejected step had predicted a gain of less than this share of the cost:
         it failed by rounding only.
