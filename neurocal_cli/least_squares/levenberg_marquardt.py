@@ -92,10 +92,6 @@ class DescentOptions:
     by_promise : bool
         Whether this gain is the predicted or the actual one. Near the minimum both are equal. Far from it, a
         small actual gain may be accidental, and a small predicted gain a saddle point.
-    needless : float
-        A group also ends, without the step, where the predicted gain is less than this share of the cost: for
-        callers that need the last digits of neither state nor cost, and whose damping is small, because it
-        lowers the predicted gain. The steps must be an array (A, ...).
     flat : float
         The minimum is reached when a rejected step had predicted a gain of less than this share of the cost:
         it failed by rounding only.
@@ -110,7 +106,6 @@ class DescentOptions:
     tolerance: float = 1e-9
     negligible: float = 0.0
     by_promise: bool = True
-    needless: float = 0.0
     flat: float = 1e-6
     max_iterations: int = 200
 
@@ -215,11 +210,6 @@ class LevenbergMarquardt:
         """Try one step in each active group, and accept it where it lowers the cost."""
         problem, options, active, before = self.problem, self.options, self.active, self.cost
         step, promised = problem.solve(self.damping, active)
-        if options.needless and (done := promised < options.needless * before).any():
-            self._retire(done, np.full(len(done), Stop.CONVERGED, dtype=np.int8))
-            if done.all():
-                return
-            step, promised, active, before = step[~done], promised[~done], self.active, self.cost
         trial, after, sensible = problem.move(step, active)
         better = sensible & (after < before)
         problem.accept(trial, better, active)

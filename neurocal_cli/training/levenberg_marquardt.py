@@ -185,8 +185,7 @@ class _Networks:
         for stage, mu in enumerate(options.stiffness):
             last = stage == len(options.stiffness) - 1
             tolerance = options.tolerance if last else max(_RELEASED, options.tolerance)
-            needless = tolerance if last else 0.0
-            settings = replace(_FAR, damping=damping, tolerance=tolerance, needless=needless)
+            settings = replace(_FAR, damping=damping, tolerance=tolerance)
             ended = self._descend(_Stiffened(self, mu, networks), settings, options.max_iterations)
             networks, damping = networks[ended], _SOFTENED * options.damping
         self.settled[networks] = True
