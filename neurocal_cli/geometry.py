@@ -59,19 +59,18 @@ def euler_jacobian(R: Array) -> Array:
     Columns of the inverse are the instantaneous axes of R_x, R_y, R_z in the camera frame. At gimbal lock the
     pseudo-inverse is returned: only the defined combination moves.
     """
+    R = np.asarray(R, dtype=float)
+    cy, sy = np.hypot(R[..., 0, 0], R[..., 1, 0]), -R[..., 2, 0]
+    if (cy > _SINGULAR).all():
+        cz, sz = R[..., 0, 0] / cy, R[..., 1, 0] / cy
+        J = np.zeros_like(R)
+        J[..., 0, 0], J[..., 0, 1] = cz / cy, sz / cy
+        J[..., 1, 0], J[..., 1, 1] = -sz, cz
+        J[..., 2, 0], J[..., 2, 1], J[..., 2, 2] = cz * sy / cy, sz * sy / cy, 1.0
+        return J
     _, R_y, R_z = np.moveaxis(rotation_to_euler(R), -1, 0)
     cy, sy, cz, sz = np.cos(R_y), np.sin(R_y), np.cos(R_z), np.sin(R_z)
     zero, one = np.zeros_like(cy), np.ones_like(cy)
-    if (cy > _SINGULAR).all():
-        secant, tangent = 1 / cy, sy / cy
-        J = np.array(
-            [
-                [cz * secant, sz * secant, zero],
-                [-sz, cz, zero],
-                [cz * tangent, sz * tangent, one],
-            ]
-        )
-        return np.moveaxis(J, (0, 1), (-2, -1))
     axes = np.stack(
         [
             np.stack([cz * cy, -sz, zero], -1),

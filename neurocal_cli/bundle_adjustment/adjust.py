@@ -47,6 +47,8 @@ class Adjusted:
     iterations : int
     each_settled : bool array
         Whether each independent problem converged; a single value if all views are one problem.
+    before : float
+        Sum of squared (whitened) residuals of all views at the start, with the penalty's.
     """
 
     state: CameraState
@@ -54,6 +56,7 @@ class Adjusted:
     cost: Array
     iterations: int
     each_settled: NDArray[np.bool_]
+    before: float = np.nan
 
     @property
     def converged(self) -> bool:
@@ -68,6 +71,7 @@ def adjust(
     free_pose: bool = True,
     max_iterations: int = OPTIONS.max_iterations,
     penalty: Penalty | None = None,
+    damping: float = OPTIONS.damping,
 ) -> Adjusted:
     """Minimise the reprojection error (3) from a start near the minimum.
 
@@ -85,15 +89,18 @@ def adjust(
     penalty : callable, optional
         Extra residuals on the shared camera, whose squares are added to those of the pixels. The result's
         `normal` and `cost` contain the pixels alone.
+    damping : float
+        At the start; less of it saves steps from a start close to the minimum.
     """
     problem = _Reprojection(batches, start, free, free_pose, penalty)
-    options = replace(OPTIONS, max_iterations=max_iterations)
+    options = replace(OPTIONS, max_iterations=max_iterations, damping=damping)
+    before = float(problem.normal[:, -1, -1].sum())
     outcome = minimise(problem, options, problem.by_group(2.0 * FLOOR**2 * batches.counts.astype(float)))
     state, normal = replace(problem.state, R=orthonormalised(problem.state.R)), problem.normal
     if penalty is not None:
         normal, _ = normal_blocks(batches, problem.state)
     iterations = int(outcome.iterations.max())
-    return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, outcome.settled)
+    return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, outcome.settled, before)
 
 
 _Step = tuple[Array, Array]  # of the cameras (1 or V, 5 + K) and of the poses (V, 6)

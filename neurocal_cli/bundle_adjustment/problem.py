@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted, Penalty, adjust
+from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted, Penalty, adjust
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
@@ -29,7 +29,6 @@ _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's m
 _LARGEST = 1e9  # px; no image is larger
 # Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
 _RIM, _HALVINGS = 0.02, 30
-_MAX_ITERATIONS = 200
 
 
 @frozen_dataclass(eq=False)
@@ -163,7 +162,12 @@ class Problem:
             state = replace(state, R=back @ state.R, t=(back @ state.t[..., None])[..., 0])
         return self.with_seen_pixels(), state
 
-    def adjust(self, start: CameraState | Adjusted, max_iterations: int = _MAX_ITERATIONS) -> Adjusted:
+    def adjust(
+        self,
+        start: CameraState | Adjusted,
+        max_iterations: int = OPTIONS.max_iterations,
+        damping: float = OPTIONS.damping,
+    ) -> Adjusted:
         """Minimise the reprojection error (3) from a state; see `adjust`.
 
         If the distortion is estimated and the start is a pinhole, its coefficients start at those of a
@@ -175,7 +179,9 @@ class Problem:
             model = self.distortion.model
             state = replace(state, model=model, k=pinhole_coefficients(model))
         free = self.free if state.model == "none" else self.free_camera
-        adjusted = adjust(self.views.batches, state, free, self.free_poses, max_iterations, self.penalty)
+        adjusted = adjust(
+            self.views.batches, state, free, self.free_poses, max_iterations, self.penalty, damping
+        )
         return replace(adjusted, iterations=done + adjusted.iterations)
 
 

@@ -97,7 +97,7 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
 
 def _seen(views: Views, state: CameraState) -> Array:
     """Normalised pixels of five target points in each view; (V, 10). Only wide lenses are distorted."""
-    centre = np.average(views.centre, axis=0, weights=views.counts)
+    centre = views.counts @ views.centre / views.counts.sum()
     reach = views.scale[0] * views.extent[0, :2] * views.basis[0][:, :2]  # columns
     places = centre + np.concatenate([np.zeros((1, 3)), reach.T, -reach.T])
     local = (places - views.centre[:, None]) / views.scale[:, None, None]
@@ -128,6 +128,8 @@ def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
             if leader[first + k] == first + k:
                 mine = close[k] & (leader == np.arange(V)) & (np.arange(V) > first + k)
                 leader[mine] = first + k
+    if (leader == np.arange(V)).all():
+        return leader
     _, group = np.unique(leader, return_inverse=True)
     return group.reshape(-1)
 

@@ -82,12 +82,12 @@ class CameraState:
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
         if self.model in WITH_XI:
             by_entries = by_entries + self._along_valley(by_entries, by_k)
-        return replace(
-            self,
-            entries=self.entries + by_entries,
-            R=rotation_step(by_pose[:, :3]) @ self.R,
-            t=self.t + by_pose[:, 3:],
-            k=self.k + (by_k[0] if self.k.ndim == 1 else by_k),
+        return CameraState(
+            self.entries + by_entries,
+            rotation_step(by_pose[:, :3]) @ self.R,
+            self.t + by_pose[:, 3:],
+            self.model,
+            self.k + (by_k[0] if self.k.ndim == 1 else by_k),
         )
 
     def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
@@ -171,6 +171,15 @@ def residuals(batches: PointBatches, state: CameraState) -> Array:
         out[chunk, 0] = batches.pixels[chunk, 0] - u
         out[chunk, 1] = batches.pixels[chunk, 1] - v
     return out
+
+
+def squared_errors(batches: PointBatches, state: CameraState) -> Array:
+    """(V,) sum of squared (whitened) residuals of each view, without their derivatives."""
+    du, dv = residuals(batches, state).swapaxes(0, 1)
+    if batches.whitening is not None:
+        root = batches.whitening.swapaxes(0, 1)
+        du, dv = root[0] * du + root[1] * dv, root[2] * dv
+    return batches.sum_by_view((du * du + dv * dv).sum(axis=1))
 
 
 def predicted_pixels(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.units import in_pixels
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.camera.camera import Camera
@@ -123,6 +126,17 @@ class Solution:
     def state(self) -> CameraState:
         """Camera and poses, normalised."""
         return self.adjusted.state
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(N, 2) normalised residuals of the points, in the order of the problem's views."""
+        return point_residuals(self.problem.views, self.state)
+
+    @cached_property
+    def covariance(self) -> Covariance:
+        """Covariances from the normal matrices alone, for a target that is as given."""
+        problem, n = self.problem, self.problem.views.n_equations + self.by_prior
+        return covariance(self.adjusted.normal, problem.free_camera, problem.free_poses, n, self.shared)
 
     @property
     def camera(self) -> Camera:

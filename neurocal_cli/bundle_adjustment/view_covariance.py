@@ -87,7 +87,7 @@ def counting_views(
     if not repeated.none:
         entries = _of_copies(q, repeated.variance, variance)
     enough = len(q.cost) >= _FEWEST
-    contradict = enough and _contradict(q, repeated.variance, variance)
+    contradict = enough and _contradict(q if repeated.none else _weighed(q, repeated.variance), variance)
     if contradict or (bends and enough):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
@@ -148,8 +148,7 @@ def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
     """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
     if not repeated.none:
         q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
-    step = q.steps(np.ones((1, len(q.cost))))[0]
-    return Quadratics(q.S, q.g - q.S @ step, q.cost)
+    return Quadratics(q.S, q.g - q.S @ solve_or_nan(q.S.sum(axis=0), q.g.sum(axis=0)), q.cost)
 
 
 def _of_copies(q: Quadratics, times: Array, variance: float) -> Array:
@@ -158,28 +157,26 @@ def _of_copies(q: Quadratics, times: Array, variance: float) -> Array:
     return np.asarray(variance * S_inverse @ np.tensordot(times, q.S, 1) @ S_inverse)
 
 
-def _contradict(q: Quadratics, times: Array, variance: float) -> bool:
-    """Whether the scores g of the poses are larger than noise explains, where cov(g) = times variance S.
+def _contradict(q: Quadratics, variance: float) -> bool:
+    """Whether the scores g of the poses are larger than noise explains, where cov(g) = variance S.
 
     The statistic is sum g^T S^-1 g. For noise it is a sum of squares with the covariance W_v - W_v W_w
     between views v and w, where W_v = S^-1/2 S_v S^-1/2. Its mean and variance follow, and it is compared
     with a chi-squared distribution of the same mean and variance (Satterthwaite 1946).
     """
-    weighed = _weighed(q, times)
-    S, g = weighed.S, weighed.g
-    scaled, scale = unit_diagonal(S.sum(axis=0))
+    scaled, scale = unit_diagonal(q.S.sum(axis=0))
     try:
         root = np.linalg.inv(np.linalg.cholesky(scaled)) * scale
     except np.linalg.LinAlgError:
         return False
-    W = root @ S @ root.T
+    W = root @ q.S @ root.T
     W2 = W @ W
     Q = W2.sum(axis=0)
     mean = len(Q) - float(np.trace(Q))
-    spread = float(np.trace(W2, axis1=1, axis2=2).sum() - 2 * (W * W2).sum() + (Q * Q).sum())
+    spread = float(np.trace(Q) - 2 * (W * W2).sum() + (Q * Q).sum())
     if not (mean > 0 and spread > 0 and variance > 0):
         return False
-    statistic = float(((g @ root.T) ** 2).sum()) / variance / mean
+    statistic = float(((q.g @ root.T) ** 2).sum()) / variance / mean
     return bool(statistic > exceeded_by_chance(mean**2 / spread, _CHANCE))
 
 

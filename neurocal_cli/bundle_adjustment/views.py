@@ -239,8 +239,9 @@ def _principal_axes(local: Array, counts: NDArray[np.intp], first: NDArray[np.in
     """Principal axes (V, 3, 3) and rms extents (V, 3) of each view's centred points."""
     scatter = np.empty((len(counts), 3, 3))
     columns = np.ascontiguousarray(local.T)
-    for a, b in zip(*np.triu_indices(3), strict=True):
-        scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
+    for a in range(3):
+        for b in range(a, 3):
+            scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
     values, basis = np.linalg.eigh(scatter / counts[:, None, None])
     basis = basis[:, :, ::-1] * np.where(np.linalg.det(basis[:, :, ::-1]) < 0, -1.0, 1.0)[:, None, None]
     # Rounding leaves 1e-16 in a zero eigenvalue, so 1e-8 in the extent, below `_EXACTLY_FLAT`.

@@ -66,7 +66,8 @@ def image_points_with_jacobian(
         by_point = a * xx, a * xy, b * yx, b * yy
     else:
         by_point = a * xx + s * yx, a * xy + s * yy, b * yx, b * yy
-    return ImagePoints(a * x + s * y + u0, b * y + v0, x, y, by_point, by_k)
+    u = a * x + u0 if _is_zero(s) else a * x + s * y + u0
+    return ImagePoints(u, b * y + v0, x, y, by_point, by_k)
 
 
 def project_points(

@@ -24,7 +24,6 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
-from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.observability import is_weak
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
@@ -66,12 +65,9 @@ def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterab
 
 
 def _may_be_local(solution: Solution) -> bool:
-    problem, found, views = solution.problem, solution.adjusted, solution.problem.views
-    if not found.converged:
+    if not solution.adjusted.converged or is_weak(solution.problem, solution.state, solution.covariance):
         return True
-    cov = covariance(found.normal, problem.free_camera, problem.free_poses, views.n_equations)
-    alike = correlation(views, point_residuals(views, found.state))
-    return is_weak(problem, found.state, cov) or not alike < _CORRELATED
+    return not correlation(solution.problem.views, solution.residuals) < _CORRELATED
 
 
 def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Adjusted:

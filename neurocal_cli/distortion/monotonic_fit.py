@@ -113,8 +113,8 @@ def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
     tangential = "p1" in coefficient_names(distortion.model)
     along = np.linspace(0, 1, _BORDER if tangential else 2)
     ends = np.zeros_like(along)
-    sides = ((along, ends), (along, ends + 1), (ends, along), (ends + 1, along))
-    return np.concatenate([np.column_stack(side) for side in sides]) * (np.array(image_size) - 1)
+    across = np.concatenate([along, along, ends, ends + 1]), np.concatenate([ends, ends + 1, along, along])
+    return np.column_stack(across) * (np.array(image_size) - 1)
 
 
 def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:

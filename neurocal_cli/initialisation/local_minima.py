@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, squared_errors
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.view_networks import Group
@@ -144,8 +144,9 @@ def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, 
         return None
     R, t = state.R.copy(), state.t.copy()
     R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
-    normal, in_front = normal_blocks(views.batches, replace(state, R=R, t=t))
-    near = in_front & (normal[:, -1, -1] < _FLIP_RANGE**2 * adjusted.cost + 1e-20)
+    # Points behind the camera's plane lie far from their pixels, or are nan.
+    cost = squared_errors(views.batches, replace(state, R=R, t=t))
+    near = cost < _FLIP_RANGE**2 * adjusted.cost + 1e-20
     candidates = np.flatnonzero(near & views.nearly_flat)
     for steps in (_FLIP_STEPS, 200):
         if not candidates.size:

@@ -19,12 +19,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
 from neurocal_cli.initialisation.constrained_training import train_constrained
 from neurocal_cli.initialisation.local_minima import (
@@ -36,6 +37,7 @@ from neurocal_cli.initialisation.local_minima import (
     try_start,
 )
 from neurocal_cli.initialisation.options import Options
+from neurocal_cli.initialisation.radial_step import radial_step
 from neurocal_cli.initialisation.view_networks import (
     Group,
     begin_flat,
@@ -46,6 +48,8 @@ from neurocal_cli.initialisation.view_networks import (
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
 _FEW_POINT_STARTS = 100
+# Initial damping of the first bundle adjustment from a pinhole, and from a camera near the minimum.
+_FAR, _NEAR = OPTIONS.damping, 1e-7
 _MANY_EQUATIONS = 12  # with so many more equations than unknowns there is only one good minimum
 
 _Found = tuple[Adjusted, TrainingRecord]
@@ -86,15 +90,18 @@ class _Search:
         self.problem, self.options, self.rng = problem, options, rng
         self.views = problem.views
 
-    def _begin(self, state: CameraState, record: TrainingRecord) -> _Found:
+    def _begin(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
         """First bundle adjustment; the error of its start is recorded."""
         self.options.progress("refining", 0.0)
-        before = float((point_residuals(self.views, state) ** 2).sum())
-        return self.problem.adjust(state), replace(record, before=before)
+        adjusted = self.problem.adjust(state, damping=damping)
+        before = adjusted.before
+        if self.views.whitening is not None:
+            before = float((point_residuals(self.views, state) ** 2).sum())
+        return adjusted, replace(record, before=before)
 
-    def _constrained(self, state: CameraState, record: TrainingRecord) -> _Found:
+    def _constrained(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
         state, iterations = train_constrained(self.problem, self.options, state)
-        return self._begin(state, replace(record, iterations=record.iterations + iterations))
+        return self._begin(state, replace(record, iterations=record.iterations + iterations), damping)
 
     def camera_and_poses(self) -> _Found:
         """Types 1 and 2."""
@@ -102,12 +109,20 @@ class _Search:
         every = np.ones(self.views.n_views, dtype=bool)
         groups, record = train_networks(problem, self.options, self.rng, every)
         refuse_few_conditions(problem, groups)
-        first, *others = candidate_intrinsics(problem, groups, self.rng)
-        best, record = self._constrained(cameras_from_products(problem, groups, first), record)
+        # The paper's constrained training needs the networks as they are.
+        bend = radial_step(problem, groups) if self.options.constrained is None else None
+        products = groups if bend is None else bend.groups
+
+        def camera(entries: Array) -> CameraState:
+            pinhole = cameras_from_products(problem, products, entries)
+            return pinhole if bend is None else bend.bent(pinhole, problem.distortion.model)
+
+        first, *others = candidate_intrinsics(problem, products, self.rng)
+        best, record = self._constrained(camera(first), record, _FAR if bend is None else _NEAR)
         for entries in others:
             if reaches_bound(problem, best, groups):
                 break
-            best = try_start(problem, best, cameras_from_products(problem, groups, entries))
+            best = try_start(problem, best, camera(entries))
         best = try_mirrored(problem, best)
         if self.views.n_views == 1:
             best, record = self._against_random_cameras(best, record, groups)

@@ -13,8 +13,9 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
 # Bundle adjustment refines the result, so gains below 1e-4 of the loss are not worth a step. Starts are
@@ -23,7 +24,9 @@ _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
     tolerance=1e-4, by_promise=False, flat=0.0, max_iterations=50,
 )  # fmt: skip
+_ROWS, _COLUMNS = ENTRIES
 _FLOOR = 1e-28  # loss that rounding alone can cause
+_APART = 1e-2  # largest difference of any entry from which on two minima are different
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
 _STARTS = 8  # random starts, trained side by side
 _ENOUGH = 3  # starts at the same, lowest loss with which training ends
@@ -78,10 +81,10 @@ def shared_intrinsics(
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
     agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
+    apart = np.abs(p[:, None] - p).max(axis=2) > _APART
     distinct = [0]
-    for n in range(1, _STARTS):
-        gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
-        if np.isfinite(loss[n]) and gap > 1e-2:
+    for n in np.flatnonzero(apart[0] & np.isfinite(loss)).tolist():
+        if apart[n, distinct].all():
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
 
@@ -156,24 +159,21 @@ def _conic(p: Array) -> tuple[Array, Array]:
     conic : (B, 9) array
     by_p : (B, 5, 9) array
     """
-    _, s, _, u, v = p.T
-    a, b = np.exp(-p[:, 0]), np.exp(-p[:, 2])
-    ab = a * b
-    skew = s * ab
-    # The derivatives of W^-1 with the sign reversed (mended at the end), followed by W^-1 itself.
-    by = np.zeros((6, 3, 3, len(p)))
-    inverse = by[5]
-    inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, -skew, skew * v - u * a
-    inverse[1, 1], inverse[1, 2], inverse[2, 2] = b, -v * b, 1.0
-    by[0, 0], by[1, 0, 1], by[1, 0, 2] = inverse[0], ab, -v * ab
-    by[2, 0, 1], by[2, 0, 2], by[2, 1] = -skew, v * skew, inverse[1]
-    by[3, 0, 2], by[4, 0, 2], by[4, 1, 2] = a, -skew, b
-    half = by.transpose(3, 0, 2, 1) @ inverse.transpose(2, 0, 1)[:, None]
-    by_p = -(half[:, :5] + np.swapaxes(half[:, :5], 2, 3))
-    return half[:, 5].reshape(-1, 9), by_p.reshape(-1, 5, 9)
+    log_a, s, log_b, u, v = p.T
+    a, b = np.exp(log_a), np.exp(log_b)
+    inverse = np.zeros((len(p), 3, 3))
+    inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 0, 2] = 1 / a, -s / (a * b), (s * v / b - u) / a
+    inverse[:, 1, 1], inverse[:, 1, 2], inverse[:, 2, 2] = 1 / b, -v / b, 1.0
+    conic = np.swapaxes(inverse, 1, 2) @ inverse
+    # Row i, column j of W changes the conic by -(h + h^T), h = (column i of the conic) (row j of W^-1).
+    half = conic[:, _ROWS, :, None] * inverse[:, _COLUMNS, None]
+    half[:, 0] *= a[:, None, None]
+    half[:, 2] *= b[:, None, None]
+    by_p = -(half + np.swapaxes(half, 2, 3))
+    return conic.reshape(-1, 9), by_p.reshape(-1, 5, 9)
 
 
-_Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives
+_Trial = tuple[Array, Array, Array, Array]  # parameters, their residuals, derivatives and losses
 
 
 class _Starts:
@@ -193,24 +193,27 @@ class _Starts:
         """Steps of limited length, damped by the mean of the diagonal, and their predicted gains."""
         J, f = self.J[active], len(self.conditions.free)
         H = J @ np.swapaxes(J, 1, 2)
-        g = -(J @ self.r[active][..., None])[..., 0]
-        ridge = damping * (np.trace(H, axis1=1, axis2=2) / f + 1e-12)
-        step = np.linalg.solve(H + ridge[:, None, None] * np.eye(f), g[..., None])[..., 0]
+        g = -(J @ self.r[active][..., None])
+        diagonal = H.reshape(len(H), -1)[:, :: f + 1]  # a view
+        ridge = damping * (diagonal.sum(axis=1) / f + 1e-12)
+        diagonal += ridge[:, None]
+        step = np.linalg.solve(H, g)
         step = np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
-        return step, (step * (g - 0.5 * (H @ step[..., None])[..., 0])).sum(axis=1)
+        gain = step * (g - 0.5 * (H @ step - ridge[:, None, None] * step))
+        return step[..., 0], gain[..., 0].sum(axis=1)
 
     def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
         """The parameters after a step; all of them are valid."""
         trial = self.p[active]
         trial[:, self.conditions.free] += step
         r, J = self.conditions(trial)
-        return (trial, r, J), 0.5 * (r * r).sum(axis=1), np.ones(len(trial), dtype=bool)
+        loss = 0.5 * (r * r).sum(axis=1)
+        return (trial, r, J, loss), loss, np.ones(len(trial), dtype=bool)
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
         """Accept the trial for the starts that improved."""
         kept = active[better]
-        self.p[kept], self.r[kept], self.J[kept] = (values[better] for values in trial)
-        self.loss[kept] = 0.5 * (self.r[kept] * self.r[kept]).sum(axis=1)
+        self.p[kept], self.r[kept], self.J[kept], self.loss[kept] = (values[better] for values in trial)
 
 
 def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
@@ -261,6 +264,6 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
     M = D[:, :, :-1]
     scale: Array = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
     if M.shape[2] == 2:
-        third = np.cross(M[:, :, 0], M[:, :, 1]) / scale[:, None]
-        M = np.asarray(np.concatenate([M, third[:, :, None]], axis=2), dtype=float)
+        third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
+        M = np.concatenate([M, third], axis=2)
     return nearest_rotation(M), D[:, :, -1] / scale[:, None]

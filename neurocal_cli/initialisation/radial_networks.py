@@ -23,13 +23,13 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.local_minima import try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options, options_for
+from neurocal_cli.initialisation.radial_step import radial_coefficients
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
@@ -181,13 +181,8 @@ def _distorted(state: CameraState, strength: Array, reach: float) -> CameraState
     distorted = np.linspace(0.02, 1, 60) * reach / float(np.sqrt(state.entries[0, 0] * state.entries[0, 2]))
     straight = distorted / _divisor(strength, (distorted / distorted[-1]) ** 2)
     best = (np.inf, state)
-    for model, argument in (("plumb_bob", straight), ("fisheye", np.arctan(straight))):
-        names = coefficient_names(model)
-        radial = [name for name in names if not name.startswith("p")]
-        powers = argument[:, None] ** np.arange(3, 2 * len(radial) + 3, 2)
-        k = np.linalg.lstsq(powers, distorted - argument, rcond=1e-6)[0]
-        error = float(np.abs(powers @ k - (distorted - argument)).max())
-        found = dict(zip(radial, k.tolist(), strict=True))
+    for model in ("plumb_bob", "fisheye"):
+        k, error = radial_coefficients(model, straight, distorted)
         if error < best[0]:
-            best = error, replace(state, model=model, k=np.array([found.get(name, 0.0) for name in names]))
+            best = error, replace(state, model=model, k=k)
     return best[1]

@@ -35,12 +35,15 @@ class Group:
         W V; for flat views in the coordinates of the view's own plane.
     bound : (K,) array
         Squared pixel error of the free networks, a lower bound for that of any camera.
+    patterns : Patterns, optional
+        On which they were trained, at most `MOST_POINTS` of each view.
     """
 
     views: NDArray[np.intp]
     flat: bool
     product: Array
     bound: Array
+    patterns: Patterns | None = None
 
 
 def begin_flat(problem: Problem) -> NDArray[np.bool_]:
@@ -97,7 +100,7 @@ def _train_group(
         curve=learnt.curve if members[0] == 0 else record.curve,
     )
     bound = _pixel_error(problem, members, flat, learnt.product, every)
-    return Group(members, flat, learnt.product, bound), record
+    return Group(members, flat, learnt.product, bound, every), record
 
 
 def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:

@@ -216,19 +216,22 @@ class LevenbergMarquardt:
         del trial, step  # frees large arrays before the next ones are allocated
         self.iteration += 1
         gained = before - after
-        shrink: float | Array = options.shrink
+        factor: float | Array = options.shrink
         if options.by_ratio:
             excess = np.minimum(2 * (gained / promised) - 1, 2.0)
-            shrink = np.maximum(shrink, 1 - excess * excess * excess)
-        self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
+            factor = np.maximum(factor, 1 - excess * excess * excess)
+        failed = not better.all()
+        if failed:
+            factor = np.where(better, factor, self.growth)
+            after = np.where(better, after, before)
+        self.damping = np.maximum(self.damping * factor, options.least_damping)
         self.growth = np.where(better, 2.0, 2 * self.growth)
-        self.cost = np.where(better, after, before)
+        self.cost = after
         exact = self.cost <= self.floor
         converged = better & ((promised if options.by_promise else gained) < self._last_gain(before))
         done = exact | converged
         if self.iteration >= self.soonest:
             done |= self.limit <= self.iteration
-        failed = not better.all()
         if failed:
             flat = ~better & sensible & (np.abs(promised) < options.flat * before)
             stuck = ~better & (self.damping > options.largest_damping)

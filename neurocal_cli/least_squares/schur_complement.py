@@ -66,17 +66,18 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
     columns = np.concatenate([own, shared, [N.shape[-1] - 1]])
     M = N[:, columns[:, None], columns]
     B, C = M[:, :p, :p], M[:, :p, p:]  # C (V, p, f + 1), with the right side
-    ridge_own = damping * (np.diagonal(B, axis1=1, axis2=2) + NOTHING)
-    places = np.arange(p)
-    B[:, places, places] += ridge_own
+    diagonal = np.einsum("vii->vi", B)  # a view
+    ridge_own = damping * (diagonal + NOTHING)
+    diagonal += ridge_own
     solved = solve_scaled(B, C)
     # (f, V p) times (V p, f + 1): one product sums over blocks and own unknowns.
     flat = C.reshape(-1, f + 1)
     S = M[:, p:-1, p:].sum(axis=0)
     g = S[:, -1].copy()
-    ridge = damping * (np.diagonal(S) + NOTHING)
+    diagonal = np.einsum("ii->i", S[:, :-1])
+    ridge = damping * (diagonal + NOTHING)
     S -= flat[:, :-1].T @ solved.reshape(-1, f + 1)
-    S[np.arange(f), np.arange(f)] += ridge
+    diagonal += ridge
     step = solve_scaled(S[:, :-1], S[:, -1:])[:, 0]
     by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
     gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)

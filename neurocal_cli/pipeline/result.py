@@ -17,7 +17,6 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -44,21 +43,22 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    errors = point_residuals(views, state)  # (N, 2), by view
+    errors = solution.residuals
     repeated = repeated_poses(views, state, errors)
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
             problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
-            solution.by_prior, solution.target_kept,
+            solution.by_prior, solution.target_kept, solution.covariance if solution.target is None else None,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
     cov = known.found
     A = problem.matrix(state.entries[0])
-    intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+    else:
+        intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     entries = _entries(problem, known, solution.ambiguity)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
@@ -86,7 +86,7 @@ def calibration_of(
         rmse_px=rmse,
         max_px=float(np.sqrt(squared.max())),
         covariance=block[np.ix_(free, free)],
-        covariance_names=tuple(np.array(list(std))[free].tolist()),
+        covariance_names=tuple(parameter for parameter in std if parameter not in fixed),
         distortion_model=problem.distortion.model,
         distortion=state.k,
         network=_network_record(solution, rmse),

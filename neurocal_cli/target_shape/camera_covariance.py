@@ -80,6 +80,8 @@ class CameraSeen:
         Effective number of coefficients that a prior determines instead of the points.
     target_kept : bool
         Whether the given target was kept although it could have been estimated.
+    plain : Covariance, optional
+        From the normal matrices alone, if it is known already and the target is as given.
     """
 
     views: Views
@@ -94,6 +96,7 @@ class CameraSeen:
     shared: Array | None = None
     by_prior: float = 0.0
     target_kept: bool = False
+    plain: Covariance | None = None
 
 
 @frozen_dataclass(eq=False)
@@ -143,7 +146,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     """
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
-    plain = covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
+    plain = seen.plain or covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
     if basis.poses is not None:
         plain = replace(plain, poses=basis.poses)
     if seen.shared is not None:

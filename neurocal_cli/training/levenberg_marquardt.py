@@ -27,7 +27,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
-from neurocal_cli.network import Patterns, optimal_gamma
+from neurocal_cli.network import Patterns
 from neurocal_cli.training import Task, Trained
 
 
@@ -72,9 +72,9 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
         W, V = _split(task.W, product)
     else:
         W, V = product, task.V
-    gamma = optimal_gamma(patterns.inputs @ np.swapaxes(product, -1, -2), patterns.targets)
     iterations, settled = networks.iterations, networks.settled
-    return Trained(W, V, gamma, networks.loss, iterations, settled, networks.curve(options.max_iterations))
+    curve = networks.curve(options.max_iterations)
+    return Trained(W, V, networks.normal.gamma(product), networks.loss, iterations, settled, curve)
 
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:
@@ -101,7 +101,7 @@ class _Normal:
         # Patterns are the last axis, along which NumPy is fastest.
         self.Zt = np.ascontiguousarray(np.swapaxes(Z, -1, -2))
         self.dt = np.ascontiguousarray(np.swapaxes(d, -1, -2))
-        a, b = np.triu_indices(self.n_inputs)
+        a, b = np.array([(a, b) for a in range(self.n_inputs) for b in range(a, self.n_inputs)]).T
         self.ZZ = Z[..., a] * Z[..., b]
         # Where entry (k, a), (l, b) of the matrix is found among 6 output pairs x input pairs.
         inputs = np.zeros((self.n_inputs, self.n_inputs), dtype=np.intp)
@@ -110,6 +110,11 @@ class _Normal:
         self.free = np.flatnonzero(free)
         row, column = np.divmod(self.free, self.n_inputs)
         self.place = outputs[row[:, None], row] * len(a) + inputs[column[:, None], column]
+
+    def gamma(self, product: Array) -> Array:
+        """Optimal factors of all networks (K, N)."""
+        o = product @ self.Zt
+        return np.asarray((o * self.dt).sum(axis=1) / (o * o).sum(axis=1))
 
     def __call__(self, product: Array, mu: float, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
@@ -201,7 +206,7 @@ class _Stiffened:
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
         """Damped step and the predicted gain."""
         H, g = self.matrix[active], self.gradient[active]  # copies
-        diagonal = np.einsum("kii->ki", H)
+        diagonal = H.reshape(len(H), -1)[:, :: H.shape[1] + 1]  # a view
         # The ridge is proportional to the mean of the diagonal. Where the scale is free, it alone keeps the
         # matrix regular, so it has a least value.
         ridge = (damping + 1e-14) * diagonal.mean(axis=1) + 1e-300

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.network import Patterns, output, random_weights
+from neurocal_cli.network import Patterns, random_weights
 from neurocal_cli.training import Task, Trained, Trainer
 
 
@@ -105,7 +105,7 @@ def _best_of(
     A start with all points on one side of the camera is better than one without.
     """
     count = len(trained.W) // len(views)
-    depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
+    depth = (patterns.inputs @ (trained.W[:, 2:] @ trained.V).swapaxes(1, 2))[..., 0]
     real = patterns.weights > 0
     all_rms = patterns.rms(trained.loss)
     # A loss that overflowed to nan must not be chosen.
