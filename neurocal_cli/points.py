@@ -208,6 +208,7 @@ class Correspondences:
         )
 
     def _check_covariance(self, covariance: Array) -> None:
+        self._check_length("covariance", covariance)
         suu, suv, svv = covariance.T
         with np.errstate(over="ignore", invalid="ignore"):
             good = (suu > 0) & (svv > 0) & (suu * svv > suv * suv) & (suu * svv < np.inf)
@@ -226,10 +227,13 @@ class Correspondences:
         problem = "the direction nu,nv in which the point was measured must be two finite numbers"
         self._set_rows("across", across, good, problem)
 
-    def _set_rows(self, name: str, values: Array, good: NDArray[np.bool_], problem: str) -> None:
-        """Set values of all points, unless all are zero."""
+    def _check_length(self, name: str, values: Array) -> None:
         if len(values) != len(self.world):
             raise InputError(f"{self.source}: {name} needs one row for each of the {len(self.world)} points")
+
+    def _set_rows(self, name: str, values: Array, good: NDArray[np.bool_], problem: str) -> None:
+        """Set values of all points, unless all are zero."""
+        self._check_length(name, values)
         self._refuse_row(good, problem)
         self._set(**{name: _frozen(values) if values.any() else None})
 

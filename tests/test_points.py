@@ -83,6 +83,7 @@ def test_lists_are_taken_and_arrays_are_copied_and_read_only() -> None:
         ({"image_center": (10**400, 1.0)}, "real numbers"),
         ({"image_center": (np.nan, 1.0)}, "finite"),
         ({"covariance": np.ones((N, 2))}, r"shape \(N, 3\)"),
+        ({"covariance": np.tile([1.0, 0.0, 1.0], (N - 1, 1))}, "covariance needs one row for each"),
         ({"covariance": np.tile([1.0, 1.0, 1.0], (N, 1))}, "row 1: .* positive definite"),
         (
             {"covariance": with_value(np.tile([1.0, 0.0, 1.0], (N, 1)), 2.0)},

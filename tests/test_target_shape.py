@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.slow_cases import slow_but
-from support.targets import SHAPES, board, offsets, photographed
+from support.targets import SHAPES, board, offsets, photographed, placed_translations
 
 from neurocal_cli import Camera, Intrinsics, calibrate
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
@@ -359,9 +359,24 @@ def test_a_given_camera_with_distortion_finds_the_target_as_well() -> None:
     assert shape_error(found, truth.found) < 0.05  # mm; the board is bent by 0.5 mm
     of_views = [
         (view.pose.t - t) / [view.std[name] for name in ("t_x", "t_y", "t_z")]
-        for view, t in zip(found.views.values(), truth.t, strict=True)
+        for view, t in zip(found.views.values(), placed_translations(truth), strict=True)
     ]
     assert np.sqrt(np.square(of_views).mean()) < 2.0
+
+
+@pytest.mark.parametrize("shape", ["parabola", "both"])
+def test_the_std_of_poses_are_those_of_a_target_held_in_its_place(shape: str) -> None:
+    # From 32 views of 63 points on, the poses are eliminated before the points.
+    std, errors = [], []
+    for n_views in (31, 32):
+        points, truth = photographed(shape, 1, n_views, 0.2)
+        views = calibrate(points, distortion="k1k2", target="free").views.values()
+        for view, t in zip(views, placed_translations(truth), strict=True):
+            std.append([view.std[name] for name in ("t_x", "t_y", "t_z")])
+            errors.append((view.pose.t - t) / std[-1])
+    before, after = np.mean(std[:31], axis=0), np.mean(std[31:], axis=0)
+    np.testing.assert_allclose(after, before, rtol=0.15)
+    assert 0.4 < np.sqrt(np.square(errors).mean()) < 1.6
 
 
 def test_given_poses_find_the_target_as_well() -> None:

@@ -83,8 +83,11 @@ class Posterior:
 
     @property
     def poses(self) -> Array | None:
-        """(P, 6, 6) covariance of each pose in units of the noise variance; see `Solved`."""
-        return None if self.solved is None else self.solved[0].poses
+        """(P, 6, 6) covariance of each pose in units of the noise variance, with the target's gauge held."""
+        if self.solved is None:
+            return None
+        solved, prior, gauge = self.solved
+        return solved.poses(prior, gauge)
 
 
 _SINGLE = {"place": [0, 1], "height": [2]}  # axes of the parts of single points

@@ -6,6 +6,8 @@ remaining system is dense. So the work grows linearly with the number of views o
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,18 +133,21 @@ class System:
         M = self._without_poses(smooth, single)
         root, logdet = _root_of_inverse(M[:-1, :-1])
         half = root @ M[:-1, -1]
-        poses = None
-        if self.prior.stated is not None:
-            own = np.linalg.inv(self.info.pose)
-            by_point = self.info.pose_point.reshape(self.P, self.p, -1)
-            gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2) @ root.T
-            poses = own + gain @ np.swapaxes(gain, 1, 2)
         x, s = half @ root, self.s
         return Solved(
             x[: self.f], x[self.f : s], x[s:].reshape(self.n, 3), float(M[-1, -1] - half @ half),
             logdet + self.logdet_poses, root[:, : self.f], root[:, self.f : s], root[:, s:],
-            np.zeros((self.n, 3, 3)), poses,
+            np.zeros((self.n, 3, 3)), lambda: self._followed_poses(root),
         )  # fmt: skip
+
+    def _followed_poses(self, root: Array) -> tuple[Array, Array]:
+        """Poses eliminated first: covariances (P, 6, 6) for known other unknowns, and roots (P, d, 6)."""
+        info = self.info
+        by_point = info.pose_point.reshape(self.P, self.p, 3 * self.n)
+        by_smooth = by_point @ self.prior.basis.reshape(3 * self.n, self.m)
+        own = np.linalg.inv(info.pose)
+        gain = own[:, :6] @ np.concatenate([info.pose_camera, by_smooth, by_point], axis=2)
+        return np.asarray(own[:, :6, :6]), -root @ np.swapaxes(gain, 1, 2)
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
@@ -165,10 +170,11 @@ class System:
         e = back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None]
         follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
         logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
-        own = root[:, s:].T.reshape(P, p, len(x))[:, :6]
+        poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].swapaxes(0, 1)
         return Solved(
             x[:f], x[f:s], e[..., 0], float(M[-1, -1] - half @ half), logdet,
-            root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root, own @ np.swapaxes(own, 1, 2),
+            root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root,
+            lambda: (np.zeros((P, 6, 6)), poses),
         )  # fmt: skip
 
 
@@ -237,9 +243,8 @@ class Solved:
         Log determinant of the whole matrix.
     camera_root, smooth_root, single_root : (d, f), (d, m), (d, 3 n) array
     own : (n, 3, 3) array
-    poses : (P, 6, 6) array, optional
-        Covariance of each pose. Without a survey it includes the gauge freedom of the target, and is given
-        only if the points are eliminated first.
+    pose_parts : callable
+        Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, d, 6) of the rest.
     """
 
     camera: Array
@@ -251,7 +256,7 @@ class Solved:
     smooth_root: Array
     single_root: Array
     own: Array
-    poses: Array | None
+    pose_parts: Callable[[], tuple[Array, Array]]
 
     def smooth_variance(self, places: NDArray[np.intp]) -> float:
         """Sum of the variances of some coefficients."""
@@ -278,6 +283,18 @@ class Solved:
         inner = np.einsum("nig,nih->gh", G, own)
         by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
         return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
+
+    def poses(self, prior: Prior, gauge: Array) -> Array:
+        """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
+        own, root = self.pose_parts()
+        covariance = own + np.swapaxes(root, 1, 2) @ root
+        if not gauge.size:
+            return np.asarray(covariance)
+        by_gauge = self.offset_root(prior) @ gauge
+        G = gauge.reshape(*self.single.shape, -1)
+        of_gauge = by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G)
+        across = np.swapaxes(root, 1, 2) @ by_gauge
+        return np.asarray(covariance - across @ np.linalg.solve(of_gauge, np.swapaxes(across, 1, 2)))
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:

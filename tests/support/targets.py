@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.camera.distortion import distort
-from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.geometry import Array, nearest_similarity, rotation_step
 from neurocal_cli.points import Correspondences
 
 SHAPES = ("flat", "parabola", "twist", "waves", "stretch", "in_plane", "out_of_plane", "both", "flexing")
@@ -104,6 +104,12 @@ def photographed(
 
     points, *poses = views_of(K, lens, model, bent, n_views, sigma, rng)
     return points, Truth(K, lens, given, given + d, model, *poses)
+
+
+def placed_translations(truth: Truth) -> Array:
+    """(V, 3) translations of the true target, moved and scaled to where it was given, as results are."""
+    scale, turn, shift = nearest_similarity(truth.found, truth.given)
+    return np.asarray(scale * truth.t - truth.R @ turn.T @ shift)
 
 
 def views_of(
