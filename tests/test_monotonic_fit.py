@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,12 @@ from support.distorted import SIGMA, bent_set, new_views, through
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
-from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
 from neurocal_cli.camera.monotonic import radial_slope
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.distortion import given_model
 from neurocal_cli.distortion.monotonic_fit import MonotonicFit, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.stereo.fit_rig import fit_rig
@@ -139,3 +141,14 @@ def test_a_rig_keeps_a_camera_that_it_would_fold() -> None:
     assert np.array_equal(rig.left.distortion, cameras[0].distortion)
     assert any("the distortion model of the left camera is not monotonic" in text for text in rig.warnings)
     assert rig.baseline == pytest.approx(60.0, abs=4 * rig.std["baseline"])
+
+
+def test_a_wide_lens_without_a_polynomial_is_not_fitted_with_the_slopes_of_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points = read_points(Path(__file__).parents[1] / "sample_data" / "fisheye.csv")
+
+    found = calibrate(points, distortion="omnidir", skew=False, target="given")
+    monkeypatch.setattr(given_model, "folds_back", lambda problem, state: "image")
+    again = calibrate(points, distortion="omnidir", skew=False, target="given")
+    np.testing.assert_array_equal(again.distortion, found.distortion)

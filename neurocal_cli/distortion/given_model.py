@@ -140,7 +140,9 @@ def check_distortion(solution: Solution) -> Solution:
     if where is None:
         return solution
     if where == "image" and solution.shared is None:
-        found = fit_monotonic(problem, solution.adjusted)
+        # The slopes are those of polynomials; other wide models end with their image circle.
+        polynomial = not distortion.wide or distortion.model == "fisheye"
+        found = fit_monotonic(problem, solution.adjusted) if polynomial else None
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
         if distortion.wide:  # its image circle may end within the image
