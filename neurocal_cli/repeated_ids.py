@@ -1,4 +1,4 @@
-"""Ids of points that occur twice in a view."""
+"""Ids of points that occur twice in a view, or stand for different places in the world."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z, as a share of the target's size
 
 
 def first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] | None:
@@ -28,6 +32,24 @@ def first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] 
         if earlier != row:
             return row, earlier
     return None
+
+
+def first_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the first row whose id had other X, Y, Z before, and the first row of that id; None if none has.
+
+    Parameters
+    ----------
+    world : (N, 3) array
+    ids : (N,) labels
+    """
+    hashes = _hashes(np.zeros(len(ids), dtype=np.int64), ids.astype(str, copy=False))
+    _, first, point = np.unique(hashes, return_index=True, return_inverse=True)
+    earlier = first[point.reshape(-1)]
+    moved = np.abs(world - world[earlier]).max(axis=1) > _SAME_PLACE * np.ptp(world, axis=0).max()
+    if not moved.any():
+        return None
+    row = int(np.argmax(moved))
+    return row, int(earlier[row])
 
 
 def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:

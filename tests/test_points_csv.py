@@ -124,6 +124,23 @@ def test_comments_that_are_nearly_metadata_are_noted(comment, noted, read):
     assert noted in "".join(notes)
 
 
+def test_an_id_at_two_places_is_noted_with_both_lines(read):
+    notes = []
+    points = read(f"{CONTRACT}left03,h:0:0,13,0,0,300,110\n", notes=notes)
+    assert len(points) == 4
+    assert len(notes) == 1
+    assert "a.csv:8: the point 'h:0:0' is at (13, 0, 0), but at (12.5, 0, 0) in" in notes[0]
+    assert "a.csv:5; if all views show one target" in notes[0]
+
+
+@pytest.mark.parametrize("text", [CONTRACT, CONTRACT.replace("left02,h:0:0,12.5,", "left02,h:0:0,12.50001,")])
+def test_an_id_at_one_place_is_not_noted(read, text):
+    """Up to the rounding of other programs."""
+    notes = []
+    read(text, notes=notes)
+    assert notes == []
+
+
 def test_five_columns_without_a_header_are_x_y_z_u_v(read):
     assert read("1 2 3 4 5\n6 7 8 9 10").pixels.tolist() == [[4, 5], [9, 10]]
 
