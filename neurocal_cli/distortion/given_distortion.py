@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back
+from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.errors import DegenerateGeometryError
 
 
@@ -43,7 +44,8 @@ def check_distortion(solution: Solution) -> Solution:
             return replace(solution, problem=found[0], adjusted=found[1])
         if distortion.wide:  # its image circle may end within the image
             return solution
-    raise DegenerateGeometryError(
+    folded = (
         f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "
         f"the {where}; choose another --distortion, or give points nearer to the image's corners"
     )
+    raise DegenerateGeometryError(undetermined_coefficients(problem, solution.adjusted) or folded)
