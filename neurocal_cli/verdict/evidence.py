@@ -6,7 +6,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
-from neurocal_cli.verdict.given_parameters import Reestimated
+from neurocal_cli.verdict.given_parameters import Doubt, Reestimated
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
@@ -43,6 +43,8 @@ class Evidence:
         Views that are copies of others; views that show the target mirrored.
     reestimated : tuple of Reestimated
         Given parameters, estimated from the points.
+    doubt : Doubt or None
+        Another camera that explains the points better than a given one, with other poses.
     noise : tuple of Finding
         Residuals that do not look like measurement noise, or contradict the stated noise.
     groups : ViewGroups or None
@@ -69,6 +71,7 @@ class Evidence:
     repeated: tuple[str, ...]
     mirrored: tuple[str, ...]
     reestimated: tuple[Reestimated, ...]
+    doubt: Doubt | None
     noise: tuple[Finding, ...]
     groups: ViewGroups | None
     poses: int
