@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 def given_points(names: str | Sequence[str]) -> Correspondences:
     """Read points, and report rows of their files that were left out."""
-    from neurocal_cli.io.points_csv import read_points
+    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
 
     notes: list[str] = []
     points = read_points(names, notes=notes)
+    notes += ids_at_two_places(points)
     note(notes)
     return points
 

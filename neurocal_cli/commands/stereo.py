@@ -117,7 +117,7 @@ def stereo(
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
     check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    from neurocal_cli.io.points_csv import read_points
+    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
@@ -125,7 +125,9 @@ def stereo(
     prepared = []
     for name, side in zip((left, right), sides, strict=True):
         notes: list[str] = []
-        prepared.append(side.prepare(read_points(name, notes=notes)))
+        points = read_points(name, notes=notes)
+        notes += ids_at_two_places(points)
+        prepared.append(side.prepare(points))
         note(notes)
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:

@@ -13,7 +13,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE
 from neurocal_cli.io.table import Table
 from neurocal_cli.points import Correspondences
-from neurocal_cli.repeated_ids import first_moved
 
 SETTINGS = ("zoom", "focus")
 
@@ -40,7 +39,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
     owners = _owners(tables, views) if several and views else None
     points = _points(tables, notes)
-    found = Correspondences(
+    return Correspondences(
         _joined([table.stack(PLACE) for table in tables]),
         _joined([table.stack(PIXEL) for table in tables]),
         view=None if views is None else _joined(views),
@@ -55,21 +54,6 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         source=tables[0].source,
         lines=_joined([table.lines for table in tables]),
         sources=owners,
-    )
-    if found.n_views > 1:
-        _note_moved(found, notes)
-    return found
-
-
-def _note_moved(points: Correspondences, notes: list[str]) -> None:
-    """Note an id that stands for different places, which is right for several targets only."""
-    moved = None if points.point is None else first_moved(points.world, np.asarray(points.point))
-    if moved is None or points.point is None:
-        return
-    places = [f"({', '.join(f'{x:g}' for x in points.world[row])})" for row in moved]
-    notes.append(
-        f"{points.place(moved[0])}: the point {str(points.point[moved[0]])[:60]!r} is at {places[0]}, but at "
-        f"{places[1]} in {points.place(moved[1])}; if all views show one target, correct X,Y,Z"
     )
 
 
