@@ -192,6 +192,16 @@ def test_given_poses_are_not_turned(seed: int) -> None:
     assert found.rmse_px == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
+def test_given_poses_that_are_off_are_not_excused_by_a_board_that_bends() -> None:
+    """2 mm of 500 along the axis: the estimated target and the focal length absorb most of it."""
+    points, truth = photographed("flat", 5, 8, 0.0)
+    places = truth.t + np.array([0.0, 0.0, 2.0])
+    poses = {name: Pose(R, t) for name, R, t in zip(points.view_names, truth.R, places, strict=True)}
+    verdict = calibrate(points, type=4, extrinsics=poses).verdict
+    assert verdict is not None
+    assert verdict.word != "good"
+
+
 def test_noise_may_put_a_pixel_outside_what_a_given_lens_sees() -> None:
     """The image of such a lens ends where its angle is largest; what it saw there is farther out by noise."""
     lens = Camera(

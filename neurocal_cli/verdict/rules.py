@@ -109,7 +109,9 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
-    flexes = calibration.target is not None and _by_flexing(e, image_diagonal(calibration.points))
+    # Given poses that are wrong leave such errors as well, so they are not excused.
+    estimated = calibration.target is not None and calibration.type != 4
+    flexes = estimated and _by_flexing(e, image_diagonal(calibration.points))
     if e.rmse_px > 1e-4 * spread and not flexes:
         yield (
             _CONTRADICTION.grade(e.contradiction),
