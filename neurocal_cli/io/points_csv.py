@@ -66,7 +66,7 @@ def read_points(
 
 
 def ids_at_two_places(points: Correspondences) -> list[str]:
-    """A note on an id with different X,Y,Z in two views, right for several targets only; [] if there is none."""
+    """A note on an id with different X,Y,Z in two views, which is right for several targets only."""
     moved = None if points.point is None else first_moved(points.world, np.asarray(points.point))
     if moved is None or points.point is None:
         return []
