@@ -17,6 +17,7 @@ from neurocal_cli.given_values import checked_size, real_array
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
+_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z, as a share of the target's size
 
 
 @frozen_dataclass(eq=False)
@@ -289,6 +290,18 @@ def _first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int]
         if earlier != row:
             return row, earlier
     return None
+
+
+def first_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the first row whose id had another place before, and the first row of that id, if there is one."""
+    hashes = _hashes(np.zeros(len(ids), dtype=np.int64), ids.astype(str, copy=False))
+    _, first, point = np.unique(hashes, return_index=True, return_inverse=True)
+    earlier = first[point.reshape(-1)]
+    moved = np.abs(world - world[earlier]).max(axis=1) > _SAME_PLACE * np.ptp(world, axis=0).max()
+    if not moved.any():
+        return None
+    row = int(np.argmax(moved))
+    return row, int(earlier[row])
 
 
 def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:

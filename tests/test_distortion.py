@@ -1,5 +1,6 @@
 """Distortion estimated with everything else, or given."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -220,3 +221,20 @@ def test_reported_std_is_true_with_a_lens(trials: int) -> None:
     ratio = np.sqrt(np.mean(np.square(errors), axis=0) / np.mean(np.square(stds), axis=0))
     # The relative standard error of an rms over n trials is 1 / sqrt(2 n); three and a half of them.
     assert np.abs(ratio - 1).max() < 3.5 / np.sqrt(2 * trials)
+
+
+@pytest.mark.parametrize("model", ["rational", "eucm"])
+def test_a_named_model_with_coefficients_that_no_point_determines_is_said_to_have_them(model: str) -> None:
+    """On a camera without distortion rational folds the image back, and alpha of eucm is 0."""
+    rng = np.random.default_rng(4)
+    scene = random_flat_set(rng, 10, False, cols=9, rows=7, f=1100, width=1280)
+    points = scene.points(0.1, rng)
+    said = "the points do not determine the coefficients of the distortion model .* as a camera without"
+    if model == "rational":
+        with pytest.raises(DegenerateGeometryError, match=said):
+            calibrate(points, distortion=model)
+        return
+    found = calibrate(points, distortion=model)
+    assert any(re.match(said, text) for text in found.warnings)
+    assert found.verdict is not None
+    assert "increase --starts" not in found.verdict.advice

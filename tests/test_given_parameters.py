@@ -84,6 +84,31 @@ def test_a_bent_board_does_not_make_a_true_centre_wrong(seeds: int) -> None:
         assert not any("is given, but" in reason for reason in found.verdict.reasons)
 
 
+@pytest.mark.parametrize(
+    ("shape", "seed", "n_views", "amount", "off"),
+    slow_but(
+        [("both", 102, 6, 0.15, 15.0)],
+        [("both", 102, 6, 0.15, 15.0), ("in_plane", 103, 9, 0.3, 15.0), ("out_of_plane", 103, 6, 0.3, 25.0)],
+    ),
+)
+def test_a_wrong_centre_and_a_board_off_its_file_are_told_together(
+    shape: str, seed: int, n_views: int, amount: float, off: float
+) -> None:
+    """Neither another centre nor another board alone explains these points."""
+    lens, model = ((-0.2, 0.08), "k1k2") if seed == 102 else ((), "none")
+    points, truth = photographed(shape, seed, n_views, amount, k=lens, model=model)
+    centre = truth.K[:2, 2]
+    turn = np.random.default_rng(seed).uniform(0, 2 * np.pi)
+    wrong = centre + off * np.array([np.cos(turn), np.sin(turn)])
+    found = calibrate(points, type=2, image_center=(float(wrong[0]), float(wrong[1])))
+    assert found.verdict is not None
+    assert found.verdict.word != "good"
+    (given,) = [reason for reason in found.verdict.reasons if "is given, but the points give" in reason]
+    told = {a.name: a.found for a in gather_evidence(found).reestimated}
+    assert np.abs([told["u0"] - centre[0], told["v0"] - centre[1]]).max() < 3.0
+    assert "v0" in given
+
+
 def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
     points = flat()
     assert points.image_size is not None
@@ -98,6 +123,51 @@ def test_one_flat_view_does_not_tell_what_it_would_ask_for() -> None:
     points = flat().select(np.arange(3 * 93, 4 * 93))
     found = calibrate(points, type=2, skew=False, image_center=(318.0, 243.0))
     assert gather_evidence(found).reestimated == ()
+
+
+def test_a_camera_that_is_given_without_its_distortion_is_named() -> None:
+    points, truth = photographed("flat", 1, 6, 0.0)
+    verdict = calibrate(points, type=3, intrinsics=truth.K).verdict
+    assert verdict is not None
+    assert verdict.word == "poor"
+    assert "the camera is given without distortion, but k1k2 estimated" in verdict.reasons[0]
+
+
+def test_a_given_distortion_that_is_off_is_named_instead_of_a_bent_board() -> None:
+    """k1 is off by a twentieth, which moves the corners by 2 px."""
+    points, truth = photographed("flat", 1, 12, 0.0)
+    camera = Camera(Intrinsics.from_matrix(truth.K), Distortion("k1k2", [truth.k[0] * 0.95, truth.k[1]]))
+    found = calibrate(points, type=3, intrinsics=camera)
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word != "good"
+    assert "the given distortion does not fit these points" in found.verdict.reasons[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.04])
+def test_one_flat_view_contradicts_a_wrong_focal_length(share: float) -> None:
+    """It determines two parameters beside its pose, not which two."""
+    points = flat()
+    one = points.select(points.view_index == 3)
+    f = 600.0 * (1 + share)
+    verdict = calibrate(one, type=3, intrinsics=Intrinsics(f, f, 318.0, 243.0, np.pi / 2)).verdict
+    assert verdict is not None
+    assert (verdict.word == "good") == (share == 0.0)
+    if share:
+        assert "the given camera does not fit these points" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0018])
+def test_a_small_error_of_a_given_centre_counts_as_it_moves_the_poses(share: float) -> None:
+    """Less than 0.2 % of alpha, which alone is not large, but many standard deviations of the poses."""
+    points, truth = photographed("flat", 3, 15, 0.0)
+    camera = Intrinsics.from_matrix(truth.K + share * truth.K[0, 0] * np.outer([1, 0, 0], [0, 0, 1]))
+    lens = Distortion("k1k2", truth.k)
+    verdict = calibrate(points, type=3, intrinsics=Camera(camera, lens)).verdict
+    assert verdict is not None
+    assert (verdict.word == "good") == (share == 0.0)
+    if share:
+        assert "standard deviations from the reported ones" in verdict.reasons[0]
 
 
 @pytest.mark.parametrize("seed", [0, 5])
@@ -120,6 +190,16 @@ def test_given_poses_are_not_turned(seed: int) -> None:
     in_camera = np.einsum("nij,nj->ni", R[points.view_index], points.world) + t[points.view_index]
     errors = points.pixels - found.camera.project(in_camera)[0]
     assert found.rmse_px == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def test_given_poses_that_are_off_are_not_excused_by_a_board_that_bends() -> None:
+    """2 mm of 500 along the axis: the estimated target and the focal length absorb most of it."""
+    points, truth = photographed("flat", 5, 8, 0.0)
+    places = truth.t + np.array([0.0, 0.0, 2.0])
+    poses = {name: Pose(R, t) for name, R, t in zip(points.view_names, truth.R, places, strict=True)}
+    verdict = calibrate(points, type=4, extrinsics=poses).verdict
+    assert verdict is not None
+    assert verdict.word != "good"
 
 
 def test_noise_may_put_a_pixel_outside_what_a_given_lens_sees() -> None:

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from neurocal_cli.errors import InputError, NeurocalError
-from neurocal_cli.io.points_csv import POINTS, format_points, read_points, write_points
+from neurocal_cli.io.points_csv import (
+    POINTS,
+    format_points,
+    ids_at_two_places,
+    read_points,
+    write_points,
+)
 from neurocal_cli.io.table import parse_table, read_in_bulk, read_line_by_line
 from neurocal_cli.io.table_header import find_layout
 from neurocal_cli.points import Correspondences
@@ -122,6 +128,19 @@ def test_comments_that_are_nearly_metadata_are_noted(comment, noted, read):
     assert (points.unit, points.image_size, points.image_center) == ("mm", None, None)
     assert len(notes) == bool(noted)
     assert noted in "".join(notes)
+
+
+def test_an_id_at_two_places_is_noted_with_both_lines(read):
+    points = read(f"{CONTRACT}left03,h:0:0,13,0,0,300,110\n")
+    (note,) = ids_at_two_places(points)
+    assert "a.csv:8: the point 'h:0:0' is at (13, 0, 0), but at (12.5, 0, 0) in" in note
+    assert "a.csv:5; if all views show one target" in note
+
+
+@pytest.mark.parametrize("text", [CONTRACT, CONTRACT.replace("left02,h:0:0,12.5,", "left02,h:0:0,12.50001,")])
+def test_an_id_at_one_place_is_not_noted(read, text):
+    """Up to the rounding of other programs."""
+    assert ids_at_two_places(read(text)) == []
 
 
 def test_five_columns_without_a_header_are_x_y_z_u_v(read):

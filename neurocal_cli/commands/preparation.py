@@ -70,11 +70,11 @@ def compute_in_one_thread() -> None:
 
 def given_points(names: str | Sequence[str]) -> Correspondences:
     """Read points, and report rows of their files that were left out."""
-    from neurocal_cli.io.points_csv import read_points
+    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
 
     notes: list[str] = []
     points = read_points(names, notes=notes)
-    note(*notes)
+    note(*notes, *ids_at_two_places(points))
     return points
 
 

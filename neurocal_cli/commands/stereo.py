@@ -113,7 +113,7 @@ def stereo(
         raise UsageError("-o and --ros name the same file twice; give three different files")
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    from neurocal_cli.io.points_csv import read_points
+    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
@@ -121,8 +121,9 @@ def stereo(
     prepared = []
     for name, side in zip((left, right), sides, strict=True):
         notes: list[str] = []
-        prepared.append(side.prepare(read_points(name, notes=notes)))
-        note(*notes)
+        points = read_points(name, notes=notes)
+        note(*notes, *ids_at_two_places(points))
+        prepared.append(side.prepare(points))
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)

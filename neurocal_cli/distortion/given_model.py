@@ -34,6 +34,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back
+from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.errors import DegenerateGeometryError
 
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
@@ -147,7 +148,8 @@ def check_distortion(solution: Solution) -> Solution:
             return replace(solution, problem=found[0], adjusted=found[1])
         if distortion.wide:  # its image circle may end within the image
             return solution
-    raise DegenerateGeometryError(
+    folded = (
         f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "
         f"the {where}; choose another --distortion, or give points nearer to the image's corners"
     )
+    raise DegenerateGeometryError(undetermined_coefficients(problem, solution.adjusted) or folded)

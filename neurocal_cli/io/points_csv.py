@@ -18,7 +18,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.table import Table, read_table
 from neurocal_cli.io.table_header import Schema, quoted_field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.points import Correspondences
+from neurocal_cli.points import Correspondences, first_moved
 
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
@@ -65,6 +65,18 @@ def read_points(
         raise InputError("there are no files of points; give at least one")
     tables = [read_table(path, POINTS) for path in several]
     return correspondences(tables, notes if notes is not None else [])
+
+
+def ids_at_two_places(points: Correspondences) -> list[str]:
+    """A note on an id with different X,Y,Z in two views, which is right for several targets only."""
+    moved = None if points.point is None else first_moved(points.world, np.asarray(points.point))
+    if moved is None or points.point is None:
+        return []
+    places = [f"({', '.join(f'{x:g}' for x in points.world[row])})" for row in moved]
+    return [
+        f"{points.place(moved[0])}: the point {str(points.point[moved[0]])[:60]!r} is at {places[0]}, but at "
+        f"{places[1]} in {points.place(moved[1])}; if all views show one target, correct X,Y,Z"
+    ]
 
 
 def write_points(points: Correspondences, path: str | Path) -> None:

@@ -17,7 +17,12 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.target_shape.find import Found, evidence_as_given
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
-from neurocal_cli.verdict.given_parameters import AS_WELL, reestimate_centre, reestimate_given
+from neurocal_cli.verdict.given_parameters import (
+    AS_WELL,
+    other_distortion_explains,
+    reestimate_centre,
+    reestimate_given,
+)
 from neurocal_cli.verdict.noise import stated_noise
 from neurocal_cli.verdict.view_change import view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
@@ -58,7 +63,7 @@ def _given_is_wrong(solution: Solution, found: Found) -> bool:
     ):
         if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
             return True
-    return False
+    return free_poses and other_distortion_explains(views, solution.state, given, AS_WELL * variance)
 
 
 def _are_two_cameras(solution: Solution, found: Found) -> bool:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
@@ -21,6 +22,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
@@ -101,6 +103,7 @@ def calibration_of(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
             *_xi_warning(solution.ambiguity, problem.distortion.model),
             *_corner_warning(problem),
+            *(() if chosen else _undetermined_warning(problem, adjusted)),
             *(() if normalised(problem.points) else _repeated_warning(repeated)),
             *filter(None, [scale_of(problem.points).contradiction]),
             *_mirrored_warning(seen_from_behind(views, state)),
@@ -190,6 +193,18 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
         "two directions to one pixel) in the image's corners, where there are no points; the best monotonic "
         "fit is used, which is a guess in the corners; add views that show the board there",
     )
+
+
+def _undetermined_warning(problem: Problem, adjusted: Adjusted) -> tuple[str, ...]:
+    """Warn of a named model with coefficients that the points do not determine.
+
+    Those of eucm do not show it by their standard deviations: without distortion its alpha is 0, and beta has
+    no effect.
+    """
+    model = problem.distortion.model
+    if not problem.free_distortion or model == "rich" or (adjusted.converged and model != "eucm"):
+        return ()
+    return tuple(filter(None, [undetermined_coefficients(problem, adjusted)]))
 
 
 def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:

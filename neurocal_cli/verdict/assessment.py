@@ -45,7 +45,14 @@ from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
-from neurocal_cli.verdict.given_parameters import Reestimated, reestimate_centre, reestimate_given
+from neurocal_cli.verdict.given_parameters import (
+    Doubt,
+    Reestimated,
+    doubt_about_given,
+    reestimate_centre,
+    reestimate_centre_and_target,
+    reestimate_given,
+)
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.verdict.odd_points import repeated_views
@@ -156,6 +163,7 @@ class _AtMinimum:
         self.variance = self.cost / self.spare
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
         self.covariance, self.wide = known.found.entries, known.wide
+        self.pose_covariance = known.found.poses
 
     def _arranged(self, points: Correspondences) -> Views:
         """The points, at these or other world coordinates, with the weights that the residuals bear out."""
@@ -188,6 +196,7 @@ class _AtMinimum:
             board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
+            doubt=self._doubt(),
             noise=(
                 *stated,
                 *stated_survey(self.calibration.target),
@@ -198,21 +207,31 @@ class _AtMinimum:
         )
 
     def _reestimated(self) -> tuple[Reestimated, ...]:
-        """Given parameters as the points have them; of two estimates of a centre, the farther one."""
-        given = self.calibration.fixed
+        """Given parameters as the points have them; of several estimates of a centre, the farthest one."""
+        given, rich = self.calibration.fixed, self.state.model == "rich"
         found = reestimate_given(self.views, self.state, given, self.free_poses)
         target, p = self.calibration.target, {"p1", "p2"} - given
-        if target is None and p.isdisjoint(coefficient_names(self.state.model)):
+        if target is None and not rich and p.isdisjoint(coefficient_names(self.state.model)):
             return found
-        views = self.views if target is None else self._arranged(target.as_given(self.points))
-        simpler = reestimate_centre(
-            views, normalised(self.given, views), given, self.free_poses, self.variance
-        )
-        farther = {a.name: a for a in simpler}
-        for a in found:
-            if a.name not in farther or abs(a.found - a.given) > abs(farther[a.name].found - a.given):
-                farther[a.name] = a
-        return tuple(farther.values())
+        points = self.points if target is None else target.as_given(self.points)
+        views = self.views if target is None else self._arranged(points)
+        simpler: tuple[Reestimated, ...] = ()
+        if not rich:
+            state = normalised(self.given, views)
+            simpler = reestimate_centre(views, state, given, self.free_poses, self.variance)
+        if self.calibration.type == 2 and not self._is_exact():
+            simpler += reestimate_centre_and_target(points, views, self.given, given, self.variance)
+        farthest: dict[str, Reestimated] = {}
+        for a in (*simpler, *found):
+            if a.name not in farthest or abs(a.found - a.given) > abs(farthest[a.name].found - a.given):
+                farthest[a.name] = a
+        return tuple(farthest.values())
+
+    def _doubt(self) -> Doubt | None:
+        if not self.free_poses or self._is_exact() or self.state.model == "rich":
+            return None
+        std = np.sqrt(np.maximum(np.diagonal(self.pose_covariance, axis1=1, axis2=2), 0.0))
+        return doubt_about_given(self.views, self.state, self.calibration.fixed, self.normal, std)
 
     def _residuals(self) -> Array:
         """(N, 2) predicted minus observed [px], in the order of the points."""

@@ -6,7 +6,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
-from neurocal_cli.verdict.given_parameters import Reestimated
+from neurocal_cli.verdict.given_parameters import Doubt, Reestimated
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
@@ -22,9 +22,7 @@ class Evidence:
     # Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
     # networks are no freer than the camera.
     precision_px: float
-    contradiction: (
-        float  # rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone
-    )
+    contradiction: float  # rms error, corrected likewise, over `precision_px`; 1 for noise alone
     # Chi-squared per parameter of the difference between two halves of the data; 1 if the reported standard
     # deviations hold.
     disagreement: float
@@ -37,6 +35,7 @@ class Evidence:
     repeated: tuple[str, ...]  # views that are copies of others
     mirrored: tuple[str, ...]  # views that show the target mirrored
     reestimated: tuple[Reestimated, ...]  # given parameters, estimated from the points
+    doubt: Doubt | None  # another camera that explains the points better than a given one, with other poses
     noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
     poses: int  # number of different poses among the views (`repeated_poses`)
     groups: ViewGroups | None  # two cameras among the views, or a changing focal length

@@ -4,25 +4,39 @@ The poses absorb a wrong focal length or centre, so the error hardly grows: a bo
 moved away. Therefore the given parameters are estimated from the points and compared. Tangential distortion
 and the shape of the target can absorb the rest of a wrong centre. So a given centre is also compared with
 that of a simpler camera, without tangential distortion and with the target as given, if it explains the
-points as well.
+points as well. If neither does, the target is estimated again with a free centre, and the evidence compared.
+
+Small errors of given parameters matter to poses that are known better than that. `doubt_about_given` compares
+the poses with those of a camera with other parameters, or with another distortion.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.residual_correlation import (
+    correlation,
+    effective_number,
+    point_residuals,
+)
+from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array, rotation_vector
+from neurocal_cli.points import Correspondences
 
 _NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 _PLACES = (0, 2, 3, 4)  # indices among A's entries
+_ENTRIES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # in the order of A's entries
 _THETA = 1  # a given theta stays fixed
 _STEPS = 20
 _TANGENTIAL = ("p1", "p2")
@@ -30,6 +44,10 @@ _TANGENTIAL = ("p1", "p2")
 # tests/test_given_parameters.py.
 AS_WELL = 1.05
 _WELL_POSED = 1e-7  # smallest eigenvalue of a normal matrix of unit diagonal
+TOLD_APART = 5.0  # standard deviations; 100 cameras with correctly given parameters stay below
+_DECISIVE = TOLD_APART**2 / 2  # the same as a gain in log evidence
+_ROUNDING = 1e-12
+_DISPLACED = "k1k2"  # the model of a lens that is given without one, and instead of a rich lens
 
 
 @frozen_dataclass
@@ -46,6 +64,29 @@ class Reestimated:
     given: float
     found: float
     std: float
+
+
+@frozen_dataclass
+class Doubt:
+    """Another camera that explains the points decidedly better than the given one.
+
+    Attributes
+    ----------
+    what : {"focal length or centre", "distortion"}
+        In what it differs.
+    model : str
+        Its distortion model.
+    explained : float
+        Share of the squared error that it explains.
+    poses : float
+        Rms change of the poses in their standard deviations; of the six parameters of a pose the one that
+        changes most.
+    """
+
+    what: str
+    model: str
+    explained: float
+    poses: float
 
 
 def reestimate_given(
@@ -129,3 +170,171 @@ def reestimate_centre(
     free_k = np.array([name not in given for name in names], dtype=bool) & ~tangential
     simpler = replace(state, k=np.where(tangential, 0.0, state.k))
     return reestimate_given(views, simpler, given, free_poses, free_k, AS_WELL * variance)
+
+
+def reestimate_centre_and_target(
+    points: Correspondences,
+    views: Views,
+    state: CameraState,
+    given: frozenset[str],
+    variance: float,
+) -> tuple[Reestimated, ...]:
+    """Estimate a given centre together with the target, if that is decidedly more probable.
+
+    A bent target and a wrong centre may explain the points only together.
+
+    Parameters
+    ----------
+    points : Correspondences
+        With the target as given.
+    views : Views
+        The same, weighted as in the calibration.
+    state : CameraState
+        In pixels and world units.
+    given : frozenset of str
+        Of type 2.
+    variance : float
+        Of the residuals of the calibration, normalised.
+
+    Returns
+    -------
+    tuple of Reestimated
+        The std is the distance in which the evidence falls as that of a normal distribution. Empty if the
+        given centre is as probable, or if the points do not determine the target.
+    """
+    from neurocal_cli.target_shape.find import evidence_as_given, find_target
+
+    rich = state.model == "rich"
+    if rich:
+        state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+    before = state.entries[0, 3:]
+    centre = float(before[0]), float(before[1])
+
+    def fitted(free_centre: bool) -> tuple[Problem, Adjusted]:
+        problem = problem_for(
+            points,
+            1 if free_centre else 2,
+            image_center=None if free_centre else centre,
+            skew="theta" not in given,
+            distortion=Distortion(state.model),
+        )
+        problem = replace(problem, views=views)
+        return problem, problem.adjust(normalised(state, views))
+
+    fit = fitted(free_centre=False)
+    kept, found = find_target([fit]), find_target([fitted(free_centre=True)])
+    if found is None:
+        return ()
+    gain = found.evidence - (evidence_as_given([fit]) if kept is None else kept.evidence)
+    problem, adjusted = found.fits[0]
+    spare = max(views.n_equations - problem.n_parameters, 1)
+    as_well = float(adjusted.cost.sum()) <= AS_WELL * variance * spare
+    if not gain > _DECISIVE or (rich and not as_well):
+        return ()
+    after = problem.matrix(adjusted.state.entries[0])[:2, 2]
+    std = float(np.linalg.norm(after - before) / np.sqrt(2 * gain))
+    return tuple(
+        Reestimated(name, float(old), float(new), std)
+        for name, old, new in zip(("u0", "v0"), before, after, strict=True)
+    )
+
+
+def other_distortion_explains(
+    views: Views, state: CameraState, given: frozenset[str], variance: float
+) -> bool:
+    """Whether the points are explained by another distortion than a given one; arguments as above.
+
+    Parameters
+    ----------
+    variance : float
+        Largest variance of the residuals, normalised, with which the points count as explained.
+    """
+    if "alpha_u" not in given:
+        return False
+    if state.model == "none":
+        state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+    free = np.arange(5 + len(state.k)) >= 5
+    adjusted = adjust(views.batches, state, free, True, _STEPS)
+    spare = views.n_equations - int(free.sum()) - 6 * views.n_views
+    return float(adjusted.cost.sum()) < variance * spare
+
+
+def told_apart(reestimated: tuple[Reestimated, ...], std: Mapping[str, float]) -> list[Reestimated]:
+    """Those that the points tell apart from what is given with these standard deviations."""
+    return [a for a in reestimated if abs(a.found - a.given) > TOLD_APART * np.hypot(a.std, std[a.name])]
+
+
+def doubt_about_given(
+    views: Views, state: CameraState, given: frozenset[str], normal: Array, std_of_poses: Array
+) -> Doubt | None:
+    """The camera that explains the points best if other parameters are allowed; None if the given one does.
+
+    The likelihood must tell them apart by more than five standard deviations, and the poses must differ by
+    more than five of those that are reported.
+
+    Parameters
+    ----------
+    views : Views
+    state : CameraState
+        In normalised units, at its minimum.
+    given : frozenset of str
+    normal : array
+        Normal matrices of the views at the state.
+    std_of_poses : (V, 6) array
+        Reported standard deviations of omega and tau, normalised.
+    """
+    before = float(normal[:, -1, -1].sum())
+    if given.isdisjoint(_NAMES) or not before > 0:
+        return None
+    best, most = None, 0.0
+    for what, start, some in _alternatives(state, given):
+        for added in some:
+            free = _estimated(start, given) | added
+            adjusted = adjust(views.batches, start, free, True, _STEPS)
+            if covariance(adjusted.normal, free, True, views.n_equations).smallest > _WELL_POSED:
+                break
+        else:
+            continue
+        left = float(adjusted.cost.sum()) / before
+        alike = correlation(views, point_residuals(views, adjusted.state))
+        n = effective_number(views.n_equations, alike)
+        gain = -0.5 * n * np.log(max(left, _ROUNDING)) - (added.sum() - 1)
+        moved = _change_of_poses(state, adjusted.state, std_of_poses)
+        if gain > max(most, _DECISIVE) and moved > TOLD_APART:
+            best, most = Doubt(what, start.model, 1.0 - left, moved), gain
+    return best
+
+
+def _alternatives(
+    state: CameraState, given: frozenset[str]
+) -> Iterator[tuple[str, CameraState, list[NDArray[np.bool_]]]]:
+    """In what a camera may differ from the given one: its name, where to start, and what is then free.
+
+    One view of a flat target may not determine the focal length and the centre together.
+    """
+    none = np.zeros(5 + len(state.k), dtype=bool)
+    asked, in_part = none.copy(), none.copy()
+    asked[:5] = [name in given and name != "theta" for name in _ENTRIES]
+    in_part[[0, 2]] = asked[0]
+    yield "focal length or centre", state, [asked, in_part]
+    if asked[0]:
+        if state.model == "none":
+            state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+        yield "distortion", state, [np.concatenate([none[:5], np.ones(len(state.k), dtype=bool)])]
+
+
+def _estimated(state: CameraState, given: frozenset[str]) -> NDArray[np.bool_]:
+    """(5 + K,) which entries and coefficients the calibration estimated."""
+    names = (*_ENTRIES, *coefficient_names(state.model))
+    return np.array([name not in given for name in names], dtype=bool)
+
+
+def _change_of_poses(before: CameraState, after: CameraState, std: Array) -> float:
+    """Rms change over the views in standard deviations, of the parameter that changes most."""
+    change = np.concatenate(
+        [rotation_vector(after.R @ np.swapaxes(before.R, 1, 2)), after.t - before.t], axis=1
+    )
+    known = (std > 0).all(axis=1)
+    if not known.any():
+        return 0.0
+    return float(np.sqrt(((change[known] / std[known]) ** 2).mean(axis=0)).max())

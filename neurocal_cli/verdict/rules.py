@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.calibration import Calibration, StopReason, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.target import Target, is_flat
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
-from neurocal_cli.verdict.given_parameters import Reestimated
+from neurocal_cli.verdict.given_parameters import Doubt, Reestimated, told_apart
 from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
@@ -38,7 +38,6 @@ _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _GIVEN = Limit(0.002, 0.05)  # difference over alpha
-_TOLD_APART = 5.0  # standard deviations; 100 cameras with correctly given parameters stay below
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
 _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
@@ -47,6 +46,8 @@ _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
+_FAR_BETTER = 0.5  # share of the error that remains with another camera than the given one
+_SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
@@ -76,14 +77,18 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     if _oblong(calibration):  # a target stretched in one direction makes views differ as well
         evidence = replace(evidence, groups=None)
     if not calibration.converged:
-        yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
+        named = not calibration.lens_choice and calibration.distortion_model != "none"
+        slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
+        more = "choose a simpler --distortion, or auto" if slow else "increase --starts"
+        yield 2, f"training did not converge: {calibration.stop_reason}", more
+    # A given camera that is wrong explains the errors, so it is reported before them.
+    yield from _given(calibration, evidence)
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # A common error explains the others, so it is reported first even if it hardly biases the camera.
     wide, estimated = calibration.camera.distortion.wide, calibration.target is not None
     for grade, reason, advice in common_errors(evidence, calibration.unit, wide, estimated):
         yield max(grade, int(bool(errors))), reason, advice
     yield from errors
-    yield from given_parameters(evidence.reestimated, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
@@ -97,7 +102,9 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
-    flexes = calibration.target is not None and _by_flexing(e, image_diagonal(calibration.points))
+    # Given poses that are wrong leave such errors as well, so they are not excused.
+    estimated = calibration.target is not None and calibration.type != 4
+    flexes = estimated and _by_flexing(e, image_diagonal(calibration.points))
     if e.rmse_px > 1e-4 * spread and not flexes:
         yield (
             _CONTRADICTION.grade(e.contradiction),
@@ -141,16 +148,35 @@ def given_parameters(
     reestimated: tuple[Reestimated, ...], given: Intrinsics, std: Mapping[str, float]
 ) -> Iterator[Finding]:
     """Finding about given parameters, with these standard deviations, that the points contradict."""
-    told = [a for a in reestimated if abs(a.found - a.given) > _TOLD_APART * np.hypot(a.std, std[a.name])]
-    if not told:
+    told = told_apart(reestimated, std)
+    if told:
+        off = max(abs(a.found - a.given) for a in told) / given.alpha_u
+        texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
+        yield _GIVEN.grade(off), ", ".join(texts), _SAME
+
+
+def _given(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    """Findings about given parameters: those that the points contradict, and those that harm the poses."""
+    found = list(given_parameters(e.reestimated, calibration.intrinsics, calibration.std))
+    doubt, grade = e.doubt, max((grade for grade, *_ in found), default=0)
+    if doubt is None or (grade and doubt.what != "distortion"):
+        yield from found
         return
-    off = max(abs(a.found - a.given) for a in told) / given.alpha_u
-    texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
-    yield (
-        _GIVEN.grade(off),
-        ", ".join(texts),
-        "check that what is given is of the same camera at the same zoom, focus and image size",
-    )
+    left = np.sqrt(1.0 - doubt.explained)
+    poses = f"the poses are then {doubt.poses:.2g} standard deviations from the reported ones"
+    if found and doubt.what != "distortion":
+        reason = f"{found[0][1]}; {poses}"
+    else:
+        reason = f"{_other_camera(calibration, doubt)} lowers the error by {100 * (1 - left):.2g} %; {poses}"
+    yield max(grade, 1 + int(left < _FAR_BETTER)), reason, _SAME
+
+
+def _other_camera(calibration: Calibration, doubt: Doubt) -> str:
+    if doubt.what != "distortion":
+        return f"the given camera does not fit these points: another {doubt.what}"
+    if calibration.distortion_model == "none":
+        return f"the camera is given without distortion, but {doubt.model} estimated from these points"
+    return "the given distortion does not fit these points: one estimated from them"
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
