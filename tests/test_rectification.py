@@ -9,12 +9,13 @@ import pytest
 from support.rigs import random_rig, sides
 
 from neurocal_cli import Pose, Rig
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.rig_yaml import format_ros_pair
 from neurocal_cli.io.yaml_tree import parse_yaml
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.rectification import rectify
+from neurocal_cli.stereo.rectified_pair import rectified_pair
 
 POSES = {
     "side by side": Pose.from_euler(0.02, 0.05, -0.01, np.array([-80.0, 3.0, 5.0])),
@@ -110,3 +111,19 @@ def test_ros_files_are_in_metres(rig: Rig) -> None:
     points = replace(rig.left.points, unit="squares")
     with pytest.raises(InputError, match="'squares'; use one of m, dm, cm, mm"):
         format_ros_pair(replace(rig, left=replace(rig.left, points=points)))
+
+
+@pytest.mark.parametrize(("alpha", "least"), [(0.0, 0), (0.5, 1), (1.0, 4)])
+def test_rigs_whose_axes_differ_too_much_are_refused_by_that_cause(alpha: float, least: int) -> None:
+    refused = 0
+    for seed in range(4):
+        wide = calibrate_stereo(*sides(random_rig(np.random.default_rng(seed), "wide", 4), 0.1), skew=False)
+        assert rectified_pair(wide).cameras[0].A[0, 0] > 0
+        found = rectify(wide, alpha)
+        assert found is not None
+        if found.P1[0, 0] > 0:
+            continue
+        refused += 1
+        with pytest.raises(DegenerateGeometryError, match="optical axes of the cameras differ so much"):
+            rectified_pair(wide, alpha)
+    assert refused >= least

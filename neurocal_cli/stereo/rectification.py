@@ -35,7 +35,8 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
     """Rectify a rig; None where the image sizes are unknown or differ.
 
     The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
-    pixels of the original images, and values in between interpolate. With None nothing is scaled.
+    pixels of the original images, and values in between interpolate. With None nothing is scaled. The
+    focal length is negative, as OpenCV's, where the optical axes differ so much that no scale does this.
     """
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")

@@ -12,7 +12,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.undistortion import map_points, shown
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -53,6 +53,11 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
         raise InputError(
             "both cameras must have images of one known size to be rectified; put image_width and "
             "image_height into the rig's file"
+        )
+    if not matrices.P1[0, 0] > 0:
+        raise DegenerateGeometryError(
+            f"the optical axes of the cameras differ so much that rectified images cannot be scaled by alpha "
+            f"{alpha:g}; leave alpha out"
         )
     originals = rig.left.camera, rig.right.camera
     cameras = [
