@@ -24,14 +24,9 @@ _STEPS = 60
 
 
 def undetermined_coefficients(problem: Problem, adjusted: Adjusted) -> str:
-    """Say that the points do not determine the coefficients of the model; empty if they may.
+    """Say that the points do not determine the coefficients of the named model; empty if they may.
 
-    Parameters
-    ----------
-    problem : Problem
-        With the named model, whose coefficients are estimated.
-    adjusted : Adjusted
-        The best fit.
+    `adjusted` is the best fit of `problem`, which estimates these coefficients.
     """
     simpler = _that_suffices(problem, adjusted)
     if not simpler:

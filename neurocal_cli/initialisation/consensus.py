@@ -51,32 +51,19 @@ _TIGHTER = 0.5
 
 @frozen_dataclass(eq=False)
 class Consensus:
-    """Points that agree with the robust network of their view, in the order of the views.
+    """Points that agree with the robust network of their view, in the order of the views."""
 
-    Attributes
-    ----------
-    kept : (N,) bool array
-        Points near their view's network; all points of views that have too few for a search.
-    hopeless : (V,) bool array
-        Views whose points do not agree on any network.
-    looseness : float
-        Scatter of the points around their network, as a share of the view's size; the median of the views.
-    """
-
+    # (N,) points near their view's network; all points of views that have too few for a search.
     kept: NDArray[np.bool_]
-    hopeless: NDArray[np.bool_]
+    hopeless: NDArray[np.bool_]  # (V,) views whose points do not agree on any network
+    # Scatter of the points around their network, as a share of the view's size; the median of the views.
     looseness: float
 
 
 def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
     """Find the points of each view that agree with one network.
 
-    Parameters
-    ----------
-    views : Views
-    flat : (V,) bool array
-        Which views' networks take their target as a plane.
-    rng : numpy.random.Generator
+    `flat` (V,) says which views' networks take their target as a plane.
     """
     kept = np.ones(len(views.index), dtype=bool)
     hopeless = np.zeros(views.n_views, dtype=bool)
@@ -107,16 +94,9 @@ def find_consensus_through_wide_lens(
     """The same through a wide lens, which displaces points by more than outliers do.
 
     The networks learn rays instead of pixels, through equidistant lenses of several focal lengths; the lens
-    with the smallest scatter is used.
-
-    Parameters
-    ----------
-    pinhole : Consensus
-        The consensus without a lens: returned unless a lens reduces the scatter decidedly.
-    views, flat, rng
-        As for `find_consensus`.
-    middle : (2,) array
-        Assumed position of the optical axis, in normalised pixels.
+    with the smallest scatter is used. `pinhole` is the consensus without a lens, and is returned unless a
+    lens reduces the scatter decidedly. `middle` (2,) is the assumed position of the optical axis, in
+    normalised pixels.
     """
     away = views.pixels - middle
     radius = np.hypot(*away.T)

@@ -20,11 +20,8 @@ from neurocal_cli.training import Task
 def train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:
     """Train one view's network on E_tot from a camera; a flat board's V cannot be constrained.
 
-    Returns
-    -------
-    state : CameraState
-        Unchanged if the trainer does not support it or the result is no valid camera.
-    iterations : int
+    Returns the state and the number of iterations. The state is unchanged if the trainer does not support
+    this, or if the result is no valid camera.
     """
     views = problem.views
     if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:

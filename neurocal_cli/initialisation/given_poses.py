@@ -25,10 +25,8 @@ _LEAST_DEPTH, _FEWEST = 0.5, 12
 def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generator) -> Solution:
     """Train the five weights of W, then minimise the reprojection error.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        A given pose puts points behind the camera, or the pixels fit only a mirrored camera.
+    Raises DegenerateGeometryError if a given pose puts points behind the camera, or if the pixels fit only a
+    mirrored camera.
     """
     views = problem.views
     R, t = _normalised_poses(problem)

@@ -73,10 +73,7 @@ def _explained(cost: Array, bound: Array | float, conditions: int, spare: Array 
 def refuse_mirrored(problem: Problem, adjusted: Adjusted, groups: Sequence[Group]) -> None:
     """Refuse points in space that a free network fits well only as a mirrored camera.
 
-    Raises
-    ------
-    OnlyMirroredError
-        Causes are a left-handed X,Y,Z, two swapped columns, or v pointing upwards.
+    Raises OnlyMirroredError. Causes are a left-handed X,Y,Z, two swapped columns, or v pointing upwards.
     """
     for group in groups:
         if group.flat:

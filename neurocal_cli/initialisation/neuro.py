@@ -58,10 +58,7 @@ _Found = tuple[Adjusted, TrainingRecord]
 def solve(problem: Problem, options: Options) -> Solution:
     """Estimate a camera and its poses from random weights.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The views do not determine the unknowns.
+    Raises DegenerateGeometryError if the views do not determine the unknowns.
     """
     rng = np.random.default_rng(options.seed)
     if problem.type == 4:

@@ -24,41 +24,22 @@ Progress = Callable[[str, float], None]
 
 @frozen_dataclass
 class Options:
-    """How networks are trained, and how the distortion is found.
+    """How networks are trained, and how the distortion is found."""
 
-    Attributes
-    ----------
-    trainer : Trainer
-        Trains random starts to their minimum.
-    agreement : Agreement
-        Tolerance within which two starts have the same result.
-    start_points : (int, int)
-        Points of each view on which the starts are trained, for flat and for solid targets.
-    finish : Trainer or None
-        Trains the best start on `MOST_POINTS` points; None if the starts used them already.
-    starts : int
-        Most random starts for each network.
-    constrained : callable or None
-        Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None if
-        bundle adjustment alone imposes the constraints.
-    distortion : str
-        "auto": select the model; "plumb-line": estimate it from straight lines first; else the problem's.
-    preferred : str
-        With "auto", the model to select unless another predicts decidedly better.
-    seed : int
-        Of the random weights.
-    progress : callable
-    """
-
-    trainer: Trainer
-    agreement: Agreement
+    trainer: Trainer  # trains random starts to their minimum
+    agreement: Agreement  # tolerance within which two starts have the same result
+    # Points of each view on which the starts are trained, for flat and for solid targets.
     start_points: tuple[int, int]
+    # Trains the best start on `MOST_POINTS` points; None if the starts used them already.
     finish: Trainer | None
-    starts: int
+    starts: int  # most random starts for each network
+    # Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None if bundle
+    # adjustment alone imposes the constraints.
     constrained: Callable[[Task, float], Trained] | None = None
+    # "auto": select the model; "plumb-line": estimate it from straight lines first; else the problem's.
     distortion: str = ""
-    preferred: str = ""
-    seed: int = 0
+    preferred: str = ""  # with "auto", the model to select unless another predicts decidedly better
+    seed: int = 0  # of the random weights
     progress: Progress = lambda stage, share: None
 
 

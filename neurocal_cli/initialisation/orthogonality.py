@@ -34,21 +34,11 @@ _ENOUGH = 3  # starts at the same, lowest loss with which training ends
 
 @frozen_dataclass(eq=False)
 class SharedIntrinsics:
-    """Candidates for W's entries, best first.
+    """Candidates for W's entries, best first."""
 
-    Attributes
-    ----------
-    entries : (C, 5) array
-        W11, W12, W22, W13, W23 of each distinct minimum.
-    loss : (C,) array
-        Half the sum of squared conditions.
-    agreed : int
-        Number of random starts that ended at the best minimum.
-    """
-
-    entries: Array
-    loss: Array
-    agreed: int
+    entries: Array  # (C, 5) W11, W12, W22, W13, W23 of each distinct minimum
+    loss: Array  # (C,) half the sum of squared conditions
+    agreed: int  # number of random starts that ended at the best minimum
 
 
 def shared_intrinsics(
@@ -60,17 +50,9 @@ def shared_intrinsics(
 ) -> SharedIntrinsics:
     """Estimate W from the products of all views.
 
-    Parameters
-    ----------
-    solid : (K, 3, 3) array
-        First three columns of the products of solid targets.
-    flat : (L, 3, 2) array
-        First two columns of the products of flat boards.
-    given : (5,) array
-        Values of the entries that are not free.
-    free : (5,) bool array
-        Of W11, W12, W22, W13, W23. W11 and W22 stay positive.
-    rng : numpy.random.Generator
+    `solid` (K, 3, 3) are the first three columns of the products of solid targets, and `flat` (L, 3, 2) the
+    first two of flat boards. `free` (5,) says which of W11, W12, W22, W13, W23 are estimated; the others have
+    the values of `given` (5,). W11 and W22 stay positive.
     """
     conditions = _Conditions(solid, flat, free)
     p = np.where(free, rng.uniform(-1, 1, (_STARTS, 5)), _to_log(given))
@@ -130,15 +112,7 @@ class _Conditions:
 def _columns(group: Array, pairs: tuple[tuple[int, int], ...]) -> Array:
     """Outer products of the columns, which the conic turns into scalar products: squares, then the pairs.
 
-    Parameters
-    ----------
-    group : (K, 3, c) array
-        Products W V of K views.
-    pairs : pairs of columns
-
-    Returns
-    -------
-    (q, 9, K) array
+    `group` (K, 3, c) are products W V of K views, and the result is (q, 9, K).
     """
     unit = group / np.linalg.norm(group, axis=(1, 2))[:, None, None]
     one, two = np.array([*((n, n) for n in range(group.shape[2])), *pairs]).T
@@ -149,15 +123,8 @@ def _columns(group: Array, pairs: tuple[tuple[int, int], ...]) -> Array:
 def _conic(p: Array) -> tuple[Array, Array]:
     """The image of the absolute conic, W^-T W^-1, gives the scalar products of columns W^-1 h.
 
-    Parameters
-    ----------
-    p : (B, 5) array
-        log W11, W12, log W22, W13, W23.
-
-    Returns
-    -------
-    conic : (B, 9) array
-    by_p : (B, 5, 9) array
+    `p` (B, 5) is log W11, W12, log W22, W13, W23. Returns the conic (B, 9) and its derivatives by p
+    (B, 5, 9).
     """
     log_a, s, log_b, u, v = p.T
     a, b = np.exp(log_a), np.exp(log_b)
@@ -244,20 +211,11 @@ def _tie(loss: float) -> float:
 
 
 def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
-    """Poses whose D = [R | t] is nearest to W^-1 times the products.
+    """Poses R (K, 3, 3), t (K, 3) whose D = [R | t] is nearest to W^-1 times the products (K, 3, I).
 
-    Parameters
-    ----------
-    W : (3, 3) array
-    product : (K, 3, I) array
-        Of solid targets (I = 4) or flat boards (I = 3; the third column of R is not observed and
-        is r1 x r2), up to scale and sign.
-
-    Returns
-    -------
-    R : (K, 3, 3) array
-    t : (K, 3) array
-        With t_z > 0, because the normalised origin is the points' centroid, which lies in front.
+    The products are those of solid targets (I = 4) or flat boards (I = 3; the third column of R is not
+    observed and is r1 x r2), up to scale and sign. t_z is positive, because the normalised origin is the
+    points' centroid, which lies in front.
     """
     D = cast("Array", np.linalg.solve(W, product))
     D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]

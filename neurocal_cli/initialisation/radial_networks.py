@@ -44,19 +44,10 @@ _SEARCH_VIEWS = 10  # most views in the search; all views train the final networ
 
 
 def radial_start(problem: Problem, options: Options) -> Solution | None:
-    """A camera with distortion, from networks trained on undistorted pixels.
+    """A camera with distortion for an unknown camera, from networks trained on undistorted pixels.
 
-    Parameters
-    ----------
-    problem : Problem
-        With an unknown camera.
-    options : Options
-
-    Returns
-    -------
-    Solution or None
-        A minimum of the reprojection error, with the distortion model nearest to the division model; None if
-        no camera was found.
+    The result is a minimum of the reprojection error, with the distortion model nearest to the division
+    model; None if no camera was found.
     """
     middle = middle_of_image(problem)
     reach = float(np.hypot(*(problem.points.pixels - middle).T).max())
@@ -123,19 +114,11 @@ def _error(radial: _Radial, strength: Array, seed: int) -> float:
 
 @frozen_dataclass(eq=False)
 class _Radial:
-    """A problem whose pixels were distorted by the division model.
-
-    Attributes
-    ----------
-    problem : Problem
-    middle : (2,) array [px]
-    reach : float [px]
-        Distance at which the model's terms are lambda_1 and lambda_2.
-    """
+    """A problem whose pixels were distorted by the division model."""
 
     problem: Problem
-    middle: Array
-    reach: float
+    middle: Array  # (2,) of the image [px]
+    reach: float  # distance at which the model's terms are lambda_1 and lambda_2 [px]
 
     def corrected(self, strength: Array) -> Problem:
         """The problem of a pinhole camera, with the pixels undistorted."""

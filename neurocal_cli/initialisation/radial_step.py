@@ -33,20 +33,11 @@ _RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients 
 
 @frozen_dataclass(eq=False)
 class RadialStep:
-    """Networks after the step, and the distortion.
-
-    Attributes
-    ----------
-    groups : tuple of Group
-    strength : (2,) array
-        kappa_1 and kappa_2.
-    reach : float
-        r in normalised pixels.
-    """
+    """Networks after the step, and the distortion."""
 
     groups: tuple[Group, ...]
-    strength: Array
-    reach: float
+    strength: Array  # (2,) kappa_1 and kappa_2
+    reach: float  # r in normalised pixels
 
     def bent(self, state: CameraState, model: str) -> CameraState:
         """The pinhole camera of these networks with the distortion as coefficients of a model."""

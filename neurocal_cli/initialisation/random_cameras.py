@@ -30,17 +30,10 @@ _BATCH = 48
 
 @frozen_dataclass(eq=False)
 class Found:
-    """Best random starts.
-
-    Attributes
-    ----------
-    state : CameraState
-    agreed : (K,) int array
-    starts, iterations : int
-    """
+    """Best random starts of K views."""
 
     state: CameraState
-    agreed: NDArray[np.int64]
+    agreed: NDArray[np.int64]  # (K,) number of starts with the lowest cost
     starts: int
     iterations: int
 
@@ -48,17 +41,9 @@ class Found:
 def find_poses(
     views: Views, which: NDArray[np.intp], entries: Array, rng: np.random.Generator, starts: int
 ) -> Found:
-    """Poses of some views for known intrinsics, all starts of all views side by side.
+    """Poses of the views `which` (K,) for known intrinsics, all starts of all views side by side.
 
-    Parameters
-    ----------
-    views : Views
-    which : (K,) int array
-    entries : (1, 5) array
-        Normalised A11, A12, A22, A13, A23.
-    rng : numpy.random.Generator
-    starts : int
-        For each view.
+    `entries` (1, 5) are the normalised A11, A12, A22, A13, A23, and `starts` is the number for each view.
     """
     patterns = views.patterns(which, flat=False, most=_MOST_POINTS, rng=rng)
     many = patterns.take(np.repeat(np.arange(len(which)), starts))
@@ -77,23 +62,10 @@ def find_poses(
 def find_camera(
     views: Views, given: Array, free: NDArray[np.bool_], rng: np.random.Generator, starts: int
 ) -> Found | None:
-    """Intrinsics and pose of a single view, by batches of starts until two agree.
+    """Intrinsics and pose of a single view, by batches of starts until two agree; None if none converged.
 
-    Parameters
-    ----------
-    views : Views
-        Of one view.
-    given : (5,) array
-        Normalised entries that are not free.
-    free : (5,) bool array
-    rng : numpy.random.Generator
-    starts : int
-        A new batch is started only after fewer starts than this.
-
-    Returns
-    -------
-    Found or None
-        None if no start converged.
+    `given` (5,) are the normalised entries where `free` (5,) is False. A new batch is started only after
+    fewer than `starts` starts.
     """
     patterns = views.patterns(np.array([0]), flat=False, most=_MOST_POINTS, rng=rng)
     best, cost, agreed, iterations, used = None, np.inf, 0, 0, 0

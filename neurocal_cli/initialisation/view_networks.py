@@ -25,25 +25,13 @@ _SMALL = 1500  # number of patterns below which subsampling saves no time (tests
 
 @frozen_dataclass(eq=False)
 class Group:
-    """Views of one kind, flat or solid, with their trained networks.
+    """Views of one kind, flat or solid, with their trained networks."""
 
-    Attributes
-    ----------
-    views : (K,) int array
-    flat : bool
-    product : (K, 3, I) array
-        W V; for flat views in the coordinates of the view's own plane.
-    bound : (K,) array
-        Squared pixel error of the free networks, a lower bound for that of any camera.
-    patterns : Patterns, optional
-        On which they were trained, at most `MOST_POINTS` of each view.
-    """
-
-    views: NDArray[np.intp]
+    views: NDArray[np.intp]  # (K,) indices
     flat: bool
-    product: Array
-    bound: Array
-    patterns: Patterns | None = None
+    product: Array  # (K, 3, I) W V; for flat views in the coordinates of the view's own plane
+    bound: Array  # (K,) squared pixel error of the free networks, a lower bound for that of any camera
+    patterns: Patterns | None = None  # on which they were trained, at most `MOST_POINTS` of each view
 
 
 def begin_flat(problem: Problem) -> NDArray[np.bool_]:
@@ -104,14 +92,10 @@ def _train_group(
 
 
 def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
-    """Refuse a single view whose points lie nearly all in one plane.
+    """Refuse a single view whose points lie nearly all in one plane: raise DegenerateGeometryError.
 
     Any number of points of a plane gives 8 conditions on the product W V, and each point off the plane 2
     more, up to 11. With no more conditions than unknowns, other cameras fit equally well.
-
-    Raises
-    ------
-    DegenerateGeometryError
     """
     if problem.views.n_views > 1 or groups[0].flat:
         return

@@ -25,18 +25,11 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @frozen_dataclass(eq=False)
 class Quadratics:
-    """Squared errors of G groups as quadratic functions of the f unknowns that they share.
+    """Squared errors of G groups as quadratic functions of the f unknowns that they share."""
 
-    Attributes
-    ----------
-    S : (G, f, f) array
-    g : (G, f) array
-    cost : (G,) array
-    """
-
-    S: Array
-    g: Array
-    cost: Array
+    S: Array  # (G, f, f)
+    g: Array  # (G, f)
+    cost: Array  # (G,)
 
     @_quietly
     def at(self, step: Array) -> Array:
@@ -51,19 +44,10 @@ class Quadratics:
 
     @_quietly
     def steps(self, member: Array, penalty: tuple[Array, Array] | None = None) -> Array:
-        """Steps to the minimum over F sets of groups.
+        """Steps (F, f) to the minimum over F sets of groups; nan where a set does not determine the unknowns.
 
-        Parameters
-        ----------
-        member : (F, G) array
-            1 where a group belongs to the set, 0 elsewhere.
-        penalty : (f, f) array and (f,) array, optional
-            Prior, added to the matrix and to the right side.
-
-        Returns
-        -------
-        (F, f) array
-            nan where a set does not determine the unknowns.
+        `member` (F, G) is 1 where a group belongs to a set, 0 elsewhere. `penalty` is a prior, (f, f) and
+        (f,), added to the matrix and to the right side.
         """
         S, g = self.summed(member)
         return solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])

@@ -45,16 +45,11 @@ class LeastSquaresProblem(Protocol[Step, Trial]):
 
     `active` (A,) are the groups that still descend, in ascending order; the others must stay unchanged. All
     arrays hold only these groups. A problem of one group may ignore it.
-
-    Attributes
-    ----------
-    cost : (G,) array
-        The sums of squares at the start.
     """
 
     @property
     def cost(self) -> Array:
-        """(G,) sums of squares."""
+        """(G,) sums of squares at the start."""
         ...
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Step, Array]:
@@ -72,40 +67,22 @@ class LeastSquaresProblem(Protocol[Step, Trial]):
 
 @frozen_dataclass
 class DescentOptions:
-    """Damping and stopping criteria.
+    """Damping and stopping criteria."""
 
-    Parameters
-    ----------
-    damping : float
-        Initial lambda.
-    shrink : float
-        Smallest factor of lambda after an accepted step.
-    by_ratio : bool
-        Whether that factor follows rho. Otherwise it is `shrink` after every accepted step, as in Marquardt's
-        paper: bolder, for many random starts of which some may fail.
-    least_damping, largest_damping : float
-        Lower limit of lambda, and the value above which the descent counts as stuck.
-    tolerance : float
-        Converged when an accepted step gains less than this share of the cost.
-    negligible : float
-        Likewise as an absolute gain, added to that share.
-    by_promise : bool
-        Whether this gain is the predicted or the actual one. Near the minimum both are equal. Far from it, a
-        small actual gain may be accidental, and a small predicted gain a saddle point.
-    flat : float
-        The minimum is reached when a rejected step had predicted a gain of less than this share of the cost:
-        it failed by rounding only.
-    max_iterations : int
-    """
-
-    damping: float = 1e-4
-    shrink: float = 0.01
+    damping: float = 1e-4  # initial lambda
+    shrink: float = 0.01  # smallest factor of lambda after an accepted step
+    # Whether that factor follows rho. Otherwise it is `shrink` after every accepted step, as in Marquardt's
+    # paper: bolder, for many random starts of which some may fail.
     by_ratio: bool = True
-    least_damping: float = 1e-14
-    largest_damping: float = 1e10
-    tolerance: float = 1e-9
-    negligible: float = 0.0
+    least_damping: float = 1e-14  # lower limit of lambda
+    largest_damping: float = 1e10  # lambda above which the descent counts as stuck
+    tolerance: float = 1e-9  # converged when an accepted step gains less than this share of the cost
+    negligible: float = 0.0  # likewise as an absolute gain, added to that share
+    # Whether this gain is the predicted or the actual one. Near the minimum both are equal. Far from it, a
+    # small actual gain may be accidental, and a small predicted gain a saddle point.
     by_promise: bool = True
+    # The minimum is reached when a rejected step had predicted a gain of less than this share of the cost: it
+    # failed by rounding only.
     flat: float = 1e-6
     max_iterations: int = 200
 
@@ -122,18 +99,10 @@ class Stop(IntEnum):
 
 @frozen_dataclass(eq=False)
 class Outcome:
-    """How the descent of each group ended; the problem holds the state itself.
+    """How the descent of each group ended; the problem holds the state itself."""
 
-    Attributes
-    ----------
-    iterations : (G,) int array
-        Number of steps tried.
-    stop : (G,) int array
-        Values of `Stop`.
-    """
-
-    iterations: NDArray[np.int64]
-    stop: NDArray[np.int8]
+    iterations: NDArray[np.int64]  # (G,) number of steps tried
+    stop: NDArray[np.int8]  # (G,) values of `Stop`
 
     @property
     def settled(self) -> NDArray[np.bool_]:
@@ -144,15 +113,9 @@ class Outcome:
 def minimise(
     problem: LeastSquaresProblem[Any, Any], options: DescentOptions | None = None, floor: float | Array = 0.0
 ) -> Outcome:
-    """Descend in all groups until each has stopped.
+    """Descend in all groups until each has stopped; the problem is then at its minimum.
 
-    Parameters
-    ----------
-    problem : LeastSquaresProblem
-        At its start; afterwards at the minimum.
-    options : DescentOptions, optional
-    floor : float or (G,) array
-        Cost that rounding alone can cause.
+    `floor`, a number or (G,), is the cost that rounding alone can cause.
     """
     descent = LevenbergMarquardt(problem, options or DescentOptions(), floor)
     descent.run()
@@ -162,22 +125,9 @@ def minimise(
 class LevenbergMarquardt:
     """The descent step by step, for callers that act between steps.
 
-    Parameters
-    ----------
-    problem : LeastSquaresProblem
-    options : DescentOptions
-    floor : float or (G,) array
-    limit : (G,) int array, optional
-        Iterations of each group, instead of the options' `max_iterations`.
-
-    Attributes
-    ----------
-    active : (A,) int array
-        Groups that still descend.
-    cost, damping : (A,) arrays
-        Of these groups.
-    outcome : Outcome
-        Of the groups that have stopped.
+    `limit` (G,) are the iterations of each group, instead of the options' `max_iterations`; `floor` is as for
+    `minimise`. `active` (A,) are the groups that still descend, `cost` and `damping` (A,) are theirs, and
+    `outcome` is that of the groups that have stopped.
     """
 
     def __init__(

@@ -18,14 +18,9 @@ def unit_diagonal(H: Array) -> tuple[Array, Array]:
 
 
 def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
-    """Solve systems scaled to a unit diagonal; a singular one yields nan.
+    """Solve systems H (..., n, n), rhs (..., n, m) scaled to a unit diagonal; a singular one yields nan.
 
-    Parameters
-    ----------
-    H : (..., n, n) array
-    rhs : (..., n, m) array
-    ridge : float
-        Added to the unit diagonal; `ROUNDING` keeps undetermined unknowns finite.
+    `ridge` is added to the unit diagonal; `ROUNDING` keeps undetermined unknowns finite.
     """
     scaled, scale = unit_diagonal(H)
     if ridge:
@@ -41,20 +36,9 @@ def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
 def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
     """Marquardt's step (H + lambda diag H) d = g of each group, and its predicted gain.
 
-    Parameters
-    ----------
-    H : (G, n, n) array
-        Gauss-Newton matrices J^T J; damped in place.
-    g : (G, n) array
-        J^T r with r = observed - predicted: downhill.
-    damping : (G,) array
-
-    Returns
-    -------
-    step : (G, n) array
-        nan where the system is singular.
-    promised : (G,) array
-        Predicted drop of the sum of squares, 2 g.d - d.H d = d.(g + lambda diag(H) d).
+    H (G, n, n) are the Gauss-Newton matrices J^T J, which are damped in place. g (G, n) is J^T r with
+    r = observed - predicted: downhill. Returns the steps (G, n), nan where the system is singular, and the
+    predicted drops of the sum of squares (G,), 2 g.d - d.H d = d.(g + lambda diag(H) d).
     """
     places = range(H.shape[1])
     ridge = damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + NOTHING)

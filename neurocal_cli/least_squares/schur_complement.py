@@ -23,43 +23,21 @@ State = TypeVar("State")
 
 @frozen_dataclass(eq=False)
 class SchurCovariance:
-    """Blocks of the inverse of an arrowhead matrix.
+    """Blocks of the inverse of an arrowhead matrix."""
 
-    Attributes
-    ----------
-    shared : (f, f) array
-    own : (V, p, p) array
-    cross : (V, f, p) array
-        Between the shared unknowns and each block's own.
-    smallest : float
-        Smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular.
-    """
-
-    shared: Array
-    own: Array
-    cross: Array
-    smallest: float
+    shared: Array  # (f, f)
+    own: Array  # (V, p, p)
+    cross: Array  # (V, f, p) between the shared unknowns and each block's own
+    smallest: float  # smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular
 
 
 def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple[Array, Array, float]:
     """Damped Gauss-Newton step.
 
-    Parameters
-    ----------
-    N : (V, D, D) array
-        Products of the derivatives and, in the last column, the residuals of each block.
-    shared, own : (f,), (p,) int arrays
-        Columns of the unknowns.
-    damping : float
-        Share of the diagonal that is added to it (Marquardt).
-
-    Returns
-    -------
-    by_shared : (f,) array
-    by_own : (V, p) array
-        nan where the system is singular.
-    gain : float
-        Predicted drop of the sum of squares.
+    N (V, D, D) are the products of the derivatives and, in the last column, the residuals of each block.
+    `shared` (f,) and `own` (p,) are the columns of the unknowns, and `damping` is the share of the diagonal
+    that is added to it (Marquardt). Returns the steps of the shared (f,) and of the own unknowns (V, p), nan
+    where the system is singular, and the predicted drop of the sum of squares.
     """
     # Eliminate the own unknowns first, then solve the reduced system of the shared ones.
     p, f = len(own), len(shared)
@@ -87,15 +65,9 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
 class SharedAndOwn(Generic[State]):
     """A sum of squares of such unknowns as a `LeastSquaresProblem` of one group.
 
-    Parameters
-    ----------
-    start : State
-    blocks : callable
-        Products (V, D, D) of derivatives and residuals at a state, as for `schur_step`.
-    moved : callable
-        The state after a step of the shared (f,) and of the own (V, p) unknowns, and whether it is valid.
-    shared, own : (f,), (p,) int arrays
-        Columns of the unknowns.
+    `blocks` returns the products (V, D, D) of derivatives and residuals at a state, as for `schur_step`.
+    `moved` returns the state after a step of the shared (f,) and of the own (V, p) unknowns, and whether it
+    is valid. `shared` (f,) and `own` (p,) are the columns of the unknowns.
     """
 
     def __init__(
@@ -130,23 +102,12 @@ class SharedAndOwn(Generic[State]):
 
 
 def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:
-    """Eliminate a block's own unknowns from its normal matrix (Schur complement).
+    """Eliminate a block's own unknowns from its normal matrix N (..., D, D) (Schur complement).
 
-    Parameters
-    ----------
-    N : (..., D, D) array
-    kept : (k,) int array
-        Columns that stay; include the residual's column to keep the right side and the sum of squares.
-    own : (p,) int array
-    ridge : float
-        As for `solve_scaled`.
-
-    Returns
-    -------
-    reduced : (..., k, k) array
-        N_kk - N_ko N_oo^-1 N_ok.
-    solved : (..., p, k) array
-        N_oo^-1 N_ok: the response of the own unknowns to the others; in the residual's column, their step.
+    `own` (p,) are the columns of these unknowns, and `kept` (k,) those that stay; include the residual's
+    column to keep the right side and the sum of squares. `ridge` is as for `solve_scaled`. Returns the
+    reduced matrix N_kk - N_ko N_oo^-1 N_ok (..., k, k), and N_oo^-1 N_ok (..., p, k): the response of the own
+    unknowns to the others; in the residual's column, their step.
     """
     cross = N[..., own[:, None], kept]
     solved = solve_scaled(N[..., own[:, None], own], cross, ridge)

@@ -33,69 +33,41 @@ if TYPE_CHECKING:
 
 @frozen_dataclass(eq=False)
 class CovarianceBasis:
-    """Input of a camera's covariance (`covariance`, `counting_views`).
+    """Input of a camera's covariance (`covariance`, `counting_views`)."""
 
-    Attributes
-    ----------
-    normal : (V, 12 + K, 12 + K) array
-        As from `reprojection.normal_blocks`; if the target was estimated, with the efficient scores of the
-        free camera parameters.
-    shared : (f, f) array or None
-        Covariance of A's free entries and the free distortion coefficients, normalised, if it does not follow
-        from the normal matrices.
-    n_equations : float
-        Number of equations minus the effective number of estimated unknowns of the target.
-    moves_without : callable, optional
-        (P, f) moves of the free parameters when the views of each pose are left out and the target is
-        estimated again, given the pose (V,) of each view. None if there are many poses: then the efficient
-        scores give the same.
-    poses : (V, 6, 6) array, optional
-        Covariance of the poses, if it does not follow from the normal matrices.
-    """
-
+    # (V, 12 + K, 12 + K) as from `reprojection.normal_blocks`; if the target was estimated, with the
+    # efficient scores of the free camera parameters.
     normal: Array
+    # (f, f) covariance of A's free entries and the free distortion coefficients, normalised, if it does not
+    # follow from the normal matrices.
     shared: Array | None
-    n_equations: float
+    n_equations: float  # number of equations minus the effective number of estimated unknowns of the target
+    # (P, f) moves of the free parameters when the views of each pose are left out and the target is estimated
+    # again, given the pose (V,) of each view. None if there are many poses: then the efficient scores give
+    # the same.
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+    # (V, 6, 6) covariance of the poses, if it does not follow from the normal matrices.
     poses: Array | None = None
 
 
 @frozen_dataclass(eq=False)
 class CameraSeen:
-    """A camera at its minimum, with its observations.
-
-    Attributes
-    ----------
-    views, state, normal, free, free_poses, repeated
-        As for `counting_views`; the normal matrices are from `reprojection.normal_blocks`.
-    points : Correspondences
-        With the world coordinates of the estimated target, if any.
-    target : Target, optional
-        The estimated target.
-    choice : collection of str
-        Candidate models of the distortion selection; empty if the user named the model.
-    shared : (f, f) array, optional
-        Covariance of the free parameters, if it comes from elsewhere.
-    by_prior : float
-        Effective number of coefficients that a prior determines instead of the points.
-    target_kept : bool
-        Whether the given target was kept although it could have been estimated.
-    plain : Covariance, optional
-        From the normal matrices alone, if it is known already and the target is as given.
-    """
+    """A camera at its minimum, with its observations; the first six fields are as for `counting_views`."""
 
     views: Views
     state: CameraState
-    normal: Array
+    normal: Array  # from `reprojection.normal_blocks`
     free: NDArray[np.bool_]
     free_poses: bool
     repeated: RepeatedPoses
-    points: Correspondences
-    target: Target | None = None
+    points: Correspondences  # with the world coordinates of the estimated target, if any
+    target: Target | None = None  # the estimated target
+    # Candidate models of the distortion selection; empty if the user named the model.
     choice: Collection[str] = ()
-    shared: Array | None = None
-    by_prior: float = 0.0
-    target_kept: bool = False
+    shared: Array | None = None  # (f, f) covariance of the free parameters, if it comes from elsewhere
+    by_prior: float = 0.0  # effective number of coefficients that a prior determines instead of the points
+    target_kept: bool = False  # whether the given target was kept although it could have been estimated
+    # From the normal matrices alone, if it is known already and the target is as given.
     plain: Covariance | None = None
 
 
@@ -117,25 +89,13 @@ class WideCovariance:
 
 @frozen_dataclass(eq=False)
 class CameraCovariance:
-    """Covariance of a camera that was calibrated from points.
-
-    Attributes
-    ----------
-    basis : CovarianceBasis
-    plain : Covariance
-        From the normal matrices alone.
-    found : Covariance
-        With the jackknife over views and the model uncertainty.
-    wide : WideCovariance or None
-        None if the model selection leaves no coefficient open.
-    stretched : float
-        Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
-    """
+    """Covariance of a camera that was calibrated from points."""
 
     basis: CovarianceBasis
-    plain: Covariance
-    found: Covariance
-    wide: WideCovariance | None = None
+    plain: Covariance  # from the normal matrices alone
+    found: Covariance  # with the jackknife over views and the model uncertainty
+    wide: WideCovariance | None = None  # None if the model selection leaves no coefficient open
+    # Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
     stretched: float = 0.0
 
 

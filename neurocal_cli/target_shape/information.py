@@ -57,36 +57,23 @@ class Sight:
 class Information:
     """Blocks of the normal matrix and the right side: sums of products of derivatives and residuals [px].
 
-    With a bend in each view, a pose has p = 9 unknowns: its six, and the three coefficients of the view's
-    whole bend. Otherwise p = 6.
-
-    Attributes
-    ----------
-    camera, camera_right : (f, f), (f,) array
-        Free parameters of all cameras in sequence, each in its normalised units.
-    pose, pose_camera, pose_right : (P, p, p), (P, p, f), (P, p) array
-    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
-        Offsets in the world's axes and unit.
-    pose_point : (P, p, n, 3) array
-    cost : float
-        Sum of squares.
-    equations : float
-    log_precision : float
-        Sum of the logarithms of the prior precisions of the bends; see `held`.
+    The camera blocks are those of the free parameters of all cameras in sequence, each in its normalised
+    units. With a bend in each view, a pose has p = 9 unknowns: its six, and the three coefficients of the
+    view's whole bend. Otherwise p = 6. The points' unknowns are offsets in the world's axes and unit.
     """
 
-    camera: Array
-    camera_right: Array
-    pose: Array
-    pose_camera: Array
-    pose_right: Array
-    point: Array
-    point_camera: Array
-    point_right: Array
-    pose_point: Array
-    cost: float
+    camera: Array  # (f, f)
+    camera_right: Array  # (f,)
+    pose: Array  # (P, p, p)
+    pose_camera: Array  # (P, p, f)
+    pose_right: Array  # (P, p)
+    point: Array  # (n, 3, 3)
+    point_camera: Array  # (n, 3, f)
+    point_right: Array  # (n, 3)
+    pose_point: Array  # (P, p, n, 3)
+    cost: float  # sum of squares
     equations: float
-    log_precision: float = 0.0
+    log_precision: float = 0.0  # sum of the logarithms of the prior precisions of the bends; see `held`
 
     @property
     def spare(self) -> float:

@@ -33,34 +33,16 @@ from neurocal_cli.target_shape.system import Solved, System
 
 @frozen_dataclass(eq=False)
 class Posterior:
-    """The most probable offsets with their std, and the covariance of the cameras.
+    """The most probable offsets with their std, and the covariance of the cameras."""
 
-    Attributes
-    ----------
-    offsets : (n, 3) array [world unit]
-        Along each point's axes.
-    variance : float
-        Of the noise [px^2].
-    camera_step : (f,) array
-        Of the cameras' free parameters.
-    camera : (f, f) array
-        Covariance of these in units of the noise variance, with the offsets marginalised.
-    sizes : dict of float by name [world unit]
-    determined : float
-        Effective number of the offsets' unknowns that the data determine.
-    evidence : float
-        Log evidence, with a flat prior on the cameras' normalised parameters.
-    solved : (Solved, Prior, (3 n, g) array), optional
-        The solution, its prior and the gauge; None if the points stay as given.
-    """
-
-    offsets: Array
-    variance: float
-    camera_step: Array
-    camera: Array
-    sizes: dict[str, float]
-    determined: float
-    evidence: float
+    offsets: Array  # (n, 3) along each point's axes [world unit]
+    variance: float  # of the noise [px^2]
+    camera_step: Array  # (f,) of the cameras' free parameters
+    camera: Array  # (f, f) covariance of these in units of the noise variance, with the offsets marginalised
+    sizes: dict[str, float]  # of the prior's parts, by name [world unit]
+    determined: float  # effective number of the offsets' unknowns that the data determine
+    evidence: float  # log evidence, with a flat prior on the cameras' normalised parameters
+    # The solution, its prior and the gauge (3 n, g); None if the points stay as given.
     solved: tuple[Solved, Prior, Array] | None = None
 
     @property

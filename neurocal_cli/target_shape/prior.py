@@ -41,31 +41,16 @@ _MOST = 150  # most points from which the eigenfunctions are computed
 
 @frozen_dataclass(eq=False)
 class Prior:
-    """Gaussian prior of the offsets, as a sum of parts.
+    """Gaussian prior of the offsets, as a sum of parts."""
 
-    Attributes
-    ----------
-    axes : (n, 3, 3) array
-        Columns: each point's axes, two in its plane and the normal.
-    basis : (n, 3, m) array
-        Offsets along these axes [world unit] for unit coefficients.
-    groups : dict of int array by name
-        Indices of the coefficients with the same prior size.
-    gauge : (3 n, 7) array
-        Orthonormal gauge directions, which images do not determine: shifts, rotations and scale of the
-        target.
-    size : float
-        Of the target [world unit].
-    stated : (n, 3) array, optional [world unit]
-        Standard deviations of surveyed points.
-    """
-
-    axes: Array
-    basis: Array
-    groups: dict[str, NDArray[np.intp]]
+    axes: Array  # (n, 3, 3) columns: each point's axes, two in its plane and the normal
+    basis: Array  # (n, 3, m) offsets along these axes for unit coefficients [world unit]
+    groups: dict[str, NDArray[np.intp]]  # indices of the coefficients with the same prior size, by name
+    # (3 n, 7) orthonormal gauge directions, which images do not determine: shifts, rotations and scale of the
+    # target.
     gauge: Array
-    size: float
-    stated: Array | None = None
+    size: float  # of the target [world unit]
+    stated: Array | None = None  # (n, 3) standard deviations of surveyed points [world unit]
 
     def along_axes(self, world: Array) -> Array:
         """Convert offsets (n, 3) from the world's axes to each point's own."""

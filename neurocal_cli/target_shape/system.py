@@ -229,33 +229,18 @@ class Solved:
 
     The covariance of two unknowns is the product of their columns in the roots. To that of single points,
     `own` is added.
-
-    Attributes
-    ----------
-    camera : (f,) array
-        Step of the cameras.
-    smooth : (m,) array
-        Coefficients of the smooth parts.
-    single : (n, 3) array
-        Offsets of the single points' parts.
-    cost : float
-    logdet : float
-        Log determinant of the whole matrix.
-    camera_root, smooth_root, single_root : (d, f), (d, m), (d, 3 n) array
-    own : (n, 3, 3) array
-    pose_parts : callable
-        Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, d, 6) of the rest.
     """
 
-    camera: Array
-    smooth: Array
-    single: Array
+    camera: Array  # (f,) step of the cameras
+    smooth: Array  # (m,) coefficients of the smooth parts
+    single: Array  # (n, 3) offsets of the single points' parts
     cost: float
-    logdet: float
-    camera_root: Array
-    smooth_root: Array
-    single_root: Array
-    own: Array
+    logdet: float  # log determinant of the whole matrix
+    camera_root: Array  # (d, f)
+    smooth_root: Array  # (d, m)
+    single_root: Array  # (d, 3 n)
+    own: Array  # (n, 3, 3)
+    # Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, d, 6) of the rest.
     pose_parts: Callable[[], tuple[Array, Array]]
 
     def smooth_variance(self, places: NDArray[np.intp]) -> float:

@@ -53,10 +53,7 @@ def covariance_basis(
 ) -> CovarianceBasis:
     """Input of the covariance of a camera at its minimum, for an estimated target; see `CameraSeen`.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The points do not determine the camera.
+    Raises numpy.linalg.LinAlgError if the points do not determine the camera.
     """
     label = target.rows_of(target.straightened(points).world)
     label = label if views.order is None else label[views.order]

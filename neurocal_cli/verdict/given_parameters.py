@@ -52,13 +52,7 @@ _DISPLACED = "k1k2"  # the model of a lens that is given without one, and instea
 
 @frozen_dataclass
 class Reestimated:
-    """A given parameter and its estimate from the points.
-
-    Attributes
-    ----------
-    name : str
-    given, found, std : float [px]
-    """
+    """A given parameter and its estimate from the points [px]."""
 
     name: str
     given: float
@@ -68,24 +62,13 @@ class Reestimated:
 
 @frozen_dataclass
 class Doubt:
-    """Another camera that explains the points decidedly better than the given one.
+    """Another camera that explains the points decidedly better than the given one."""
 
-    Attributes
-    ----------
-    what : {"focal length or centre", "distortion"}
-        In what it differs.
-    model : str
-        Its distortion model.
-    explained : float
-        Share of the squared error that it explains.
-    poses : float
-        Rms change of the poses in their standard deviations; of the six parameters of a pose the one that
-        changes most.
-    """
-
-    what: str
-    model: str
-    explained: float
+    what: str  # in what it differs: "focal length or centre" or "distortion"
+    model: str  # its distortion model
+    explained: float  # share of the squared error that it explains
+    # Rms change of the poses in their standard deviations; of the six parameters of a pose the one that
+    # changes most.
     poses: float
 
 
@@ -99,23 +82,10 @@ def reestimate_given(
 ) -> tuple[Reestimated, ...]:
     """Estimate the given focal lengths and the given centre from the points.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        In normalised units, at its minimum.
-    given : frozenset of str
-        Names of the parameters that were not estimated.
-    free_poses : bool
-    free_k : (K,) bool array, optional
-        Distortion coefficients that are estimated with them. Default: none.
-    variance : float, optional
-        Largest variance of the residuals, normalised, with which the points count as explained.
-
-    Returns
-    -------
-    tuple of Reestimated
-        Empty if none is given, or if the points do not determine them, or are not explained by them.
+    `state` is normalised and at its minimum. `given` are the names of the parameters that were not estimated,
+    and `free_k` (K,) the distortion coefficients that are estimated with them, by default none. `variance` is
+    the largest variance of the residuals, normalised, with which the points count as explained. Empty if none
+    is given, or if the points do not determine them, or are not explained by them.
     """
     if given.isdisjoint(_NAMES):
         return ()
@@ -147,21 +117,9 @@ def reestimate_centre(
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre without tangential distortion, on the target as given.
 
-    Parameters
-    ----------
-    views : Views
-        With the points as given.
-    state : CameraState
-        In normalised units.
-    given, free_poses
-        As for `reestimate_given`.
-    variance : float
-        Of the residuals of the calibration, normalised.
-
-    Returns
-    -------
-    tuple of Reestimated
-        Empty if the centre is estimated, or if this simpler camera explains the points less well.
+    `views` have the points as given, `state` is normalised, and `variance` is that of the residuals of the
+    calibration, normalised; `given` and `free_poses` are as for `reestimate_given`. Empty if the centre is
+    estimated, or if this simpler camera explains the points less well.
     """
     if not {"u0", "v0"} <= given:
         return ()
@@ -181,26 +139,11 @@ def reestimate_centre_and_target(
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre together with the target, if that is decidedly more probable.
 
-    A bent target and a wrong centre may explain the points only together.
-
-    Parameters
-    ----------
-    points : Correspondences
-        With the target as given.
-    views : Views
-        The same, weighted as in the calibration.
-    state : CameraState
-        In pixels and world units.
-    given : frozenset of str
-        Of type 2.
-    variance : float
-        Of the residuals of the calibration, normalised.
-
-    Returns
-    -------
-    tuple of Reestimated
-        The std is the distance in which the evidence falls as that of a normal distribution. Empty if the
-        given centre is as probable, or if the points do not determine the target.
+    A bent target and a wrong centre may explain the points only together. `points` have the target as given,
+    `views` are the same, weighted as in the calibration, and `state` is in pixels and world units. `given`
+    are the parameters of type 2, and `variance` is as for `reestimate_centre`. The std is the distance in
+    which the evidence falls as that of a normal distribution. Empty if the given centre is as probable, or if
+    the points do not determine the target.
     """
     from neurocal_cli.target_shape.find import evidence_as_given, find_target
 
@@ -244,10 +187,7 @@ def other_distortion_explains(
 ) -> bool:
     """Whether the points are explained by another distortion than a given one; arguments as above.
 
-    Parameters
-    ----------
-    variance : float
-        Largest variance of the residuals, normalised, with which the points count as explained.
+    `variance` is the largest variance of the residuals, normalised, with which the points count as explained.
     """
     if "alpha_u" not in given:
         return False
@@ -270,18 +210,9 @@ def doubt_about_given(
     """The camera that explains the points best if other parameters are allowed; None if the given one does.
 
     The likelihood must tell them apart by more than five standard deviations, and the poses must differ by
-    more than five of those that are reported.
-
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        In normalised units, at its minimum.
-    given : frozenset of str
-    normal : array
-        Normal matrices of the views at the state.
-    std_of_poses : (V, 6) array
-        Reported standard deviations of omega and tau, normalised.
+    more than five of those that are reported. `state` is normalised and at its minimum, and `normal` are the
+    normal matrices of the views there. `std_of_poses` (V, 6) are the reported standard deviations of omega
+    and tau, normalised.
     """
     before = float(normal[:, -1, -1].sum())
     if given.isdisjoint(_NAMES) or not before > 0:
