@@ -35,27 +35,15 @@ Penalty = Callable[[CameraState], tuple[Array, Array]]
 
 @frozen_dataclass(eq=False)
 class Adjusted:
-    """Result of `adjust`.
-
-    Attributes
-    ----------
-    state : CameraState
-    normal : (V, 12 + K, 12 + K) array
-        From `reprojection.normal_blocks`.
-    cost : (V,) array
-        Sum of squared (whitened) residuals of each view.
-    iterations : int
-    each_settled : bool array
-        Whether each independent problem converged; a single value if all views are one problem.
-    before : float
-        Sum of squared (whitened) residuals of all views at the start, with the penalty's.
-    """
+    """Result of `adjust`."""
 
     state: CameraState
-    normal: Array
-    cost: Array
+    normal: Array  # (V, 12 + K, 12 + K) from `reprojection.normal_blocks`
+    cost: Array  # (V,) sum of squared (whitened) residuals of each view
     iterations: int
+    # Whether each independent problem converged; a single value if all views are one problem.
     each_settled: NDArray[np.bool_]
+    # Sum of squared (whitened) residuals of all views at the start, with the penalty's.
     before: float = np.nan
 
     @property
@@ -75,22 +63,11 @@ def adjust(
 ) -> Adjusted:
     """Minimise the reprojection error (3) from a start near the minimum.
 
-    Parameters
-    ----------
-    batches : PointBatches
-    start : CameraState
-        All points must lie in front of the camera.
-    free : (5 + K,) bool array
-        Which entries of A and distortion coefficients are estimated. If none is, or if each view has its
-        own camera, the views are independent problems, solved side by side, each with its own damping.
-    free_pose : bool
-        Whether the poses are estimated.
-    max_iterations : int
-    penalty : callable, optional
-        Extra residuals on the shared camera, whose squares are added to those of the pixels. The result's
-        `normal` and `cost` contain the pixels alone.
-    damping : float
-        At the start; less of it saves steps from a start close to the minimum.
+    At the start, all points must lie in front of the camera. `free` (5 + K,) tells which entries of A and
+    distortion coefficients are estimated. If none is, or if each view has its own camera, the views are
+    independent problems, solved side by side, each with its own damping. The penalty gives extra residuals on
+    the shared camera, whose squares are added to those of the pixels; the result's `normal` and `cost`
+    contain the pixels alone. Less `damping` at the start saves steps from a start close to the minimum.
     """
     problem = _Reprojection(batches, start, free, free_pose, penalty)
     options = replace(OPTIONS, max_iterations=max_iterations, damping=damping)

@@ -22,23 +22,12 @@ from neurocal_cli.geometry import Array
 
 @frozen_dataclass(eq=False)
 class Ambiguity:
-    """Cameras along the valley, in ascending order of xi.
+    """Cameras along the valley, in ascending order of xi."""
 
-    Attributes
-    ----------
-    xi : (m,) array
-    offsets : (m, 5 + K) array
-        Differences of A's entries and the coefficients from those of the best camera.
-    excess : (m,) array
-        chi^2 above that of the best camera.
-    volume : (m,) array
-        Logarithm of V up to a constant.
-    """
-
-    xi: Array
-    offsets: Array
-    excess: Array
-    volume: Array
+    xi: Array  # (m,)
+    offsets: Array  # (m, 5 + K) differences of A's entries and the coefficients from those of the best camera
+    excess: Array  # (m,) chi^2 above that of the best camera
+    volume: Array  # (m,) logarithm of V up to a constant
 
     def weights(self, inflation: float = 1.0) -> Array:
         """(m,) probability of each camera, for a variance `inflation` times that of the residuals."""
@@ -60,15 +49,10 @@ class Ambiguity:
         return np.asarray((offsets.T * self.weights(inflation)) @ offsets)
 
     def widened(self, covariance: Array, free: NDArray[np.bool_], inflation: float = 1.0) -> Array:
-        """(f, f) mean squared error of the free parameters, including xi (the first coefficient).
+        """(f, f) mean squared error of the free parameters (5 + K,), including xi (the first coefficient).
 
-        Parameters
-        ----------
-        covariance : (f, f) array
-            At the best camera; 0 for an xi that was held fixed there.
-        free : (5 + K,) bool array
-        inflation : float
-            Variance of the parameters over the variance that independent residuals would give.
+        `covariance` (f, f) is that at the best camera; it is 0 for an xi that was held fixed there.
+        `inflation` is the variance of the parameters over the variance that independent residuals would give.
         """
         xi = int(free[:5].sum())
         column = covariance[:, xi]

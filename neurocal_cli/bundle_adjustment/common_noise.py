@@ -46,30 +46,17 @@ _MEASURED, _MISFIT = 2.0, 4.0  # levels: measurement noise up to the first, mode
 
 @frozen_dataclass
 class Noise:
-    """How far the stated covariances are trusted.
+    """How far the stated covariances are trusted."""
 
-    Attributes
-    ----------
-    share : float
-        m, the share of the noise that is common to all points.
-    along : float
-        Weight along the edge of points measured across it.
-    """
-
-    share: float = 0.0
-    along: float = LEAST
+    share: float = 0.0  # m, the share of the noise that is common to all points
+    along: float = LEAST  # weight along the edge of points measured across it
 
 
 def noise_of(covariance: Array, residuals: Array, across: Array | None) -> Noise:
-    """The noise model that the residuals of a fit support.
+    """The noise model that the residuals (N, 2) [px] of a fit support.
 
-    Parameters
-    ----------
-    covariance : (N, 3) array [px^2]
-        suu, suv, svv as stated.
-    residuals : (N, 2) array [px]
-    across : (N, 2) array or None
-        Direction in which each point was measured.
+    The columns of `covariance` (N, 3) are suu, suv, svv as stated [px^2]. `across` (N, 2) is the direction in
+    which each point was measured.
     """
     share = common_share(covariance, residuals, across)
     if across is None:
@@ -89,16 +76,9 @@ def measured(covariance: Array) -> bool:
 
 
 def with_common_share(covariance: Array, share: float, across: Array | None = None) -> Array:
-    """Covariances (N, 3) with the same mean and a share `m` common to all points.
+    """Covariances (N, 3) suu, suv, svv with the same mean and a share m, 0 to 1, common to all points.
 
-    Parameters
-    ----------
-    covariance : (N, 3) array
-        suu, suv, svv.
-    share : float
-        m, from 0 to 1.
-    across : (N, 2) array, optional
-        Direction in which each point was measured.
+    `across` (N, 2) is the direction in which each point was measured.
     """
     if across is None:
         mean = 0.5 * float((covariance[:, 0] + covariance[:, 2]).mean())
@@ -110,14 +90,8 @@ def with_common_share(covariance: Array, share: float, across: Array | None = No
 def common_share(covariance: Array, residuals: Array, across: Array | None = None) -> float:
     """Share of the noise that is common to all points, estimated from residuals by maximum likelihood.
 
-    Parameters
-    ----------
-    covariance : (N, 3) array
-        suu, suv, svv as stated, any unit.
-    residuals : (N, 2) array
-        Residuals of a fit, any unit.
-    across : (N, 2) array, optional
-        Direction in which each point was measured.
+    The columns of `covariance` (N, 3) are suu, suv, svv as stated, and `residuals` (N, 2) are those of a fit;
+    each may be in any unit. `across` (N, 2) is the direction in which each point was measured.
     """
     some = slice(None, None, max(1, len(residuals) // _MOST_POINTS))
     C, n = covariance[some], None if across is None else across[some]

@@ -19,40 +19,21 @@ from neurocal_cli.least_squares.schur_complement import schur_covariance
 
 @frozen_dataclass(eq=False)
 class Covariance:
-    """Covariances in normalised units.
+    """Covariances in normalised units."""
 
-    Attributes
-    ----------
-    entries : (f, f) array
-        Of A's free entries and the free distortion coefficients.
-    poses : (V, 6, 6) array
-        Of omega and tau of each view; zero if the poses are given.
-    smallest : float
-        Smallest eigenvalue of the normal matrices scaled to a unit diagonal; 0 if singular.
-    """
-
-    entries: Array
-    poses: Array
-    smallest: float
+    entries: Array  # (f, f) of A's free entries and the free distortion coefficients
+    poses: Array  # (V, 6, 6) of omega and tau of each view; zero if the poses are given
+    smallest: float  # smallest eigenvalue of the normal matrices scaled to a unit diagonal; 0 if singular
 
 
 def covariance(
     normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float, shared: Array | None = None
 ) -> Covariance:
-    """Invert the normal matrix of an adjusted calibration.
+    """Invert the normal matrices (V, 12 + K, 12 + K) of a calibration, from `adjust`.
 
-    Parameters
-    ----------
-    normal : (V, 12 + K, 12 + K) array
-        From `adjust`.
-    free : (5 + K,) bool array
-        Of A's entries and the distortion coefficients.
-    free_pose : bool
-    n_residuals : int
-        Number of equations: two for most points; see `measured_directions`.
-    shared : (f, f) array, optional
-        Covariance of the free entries of A and the free coefficients, if it comes from elsewhere; the poses'
-        covariance is propagated from it.
+    `free` (5 + K,) tells which of A's entries and the distortion coefficients are estimated. `n_residuals` is
+    the number of equations: two for most points; see `measured_directions`. If the covariance `shared` (f, f)
+    of the free entries and coefficients comes from elsewhere, the poses' covariance is propagated from it.
     """
     f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     V = len(normal)

@@ -32,14 +32,9 @@ _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 @_quietly
 def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadratics:
-    """Eliminate the poses from normal matrices.
+    """Eliminate the poses from normal matrices (..., 12 + K, 12 + K) of `reprojection.normal_blocks`.
 
-    Parameters
-    ----------
-    normal : (..., 12 + K, 12 + K) array
-        From `reprojection.normal_blocks`.
-    free : (5 + K,) bool array
-    free_poses : bool
+    `free` (5 + K,) tells which of A's entries and the distortion coefficients are estimated.
     """
     return _eliminated(normal, free, free_poses)[0]
 
@@ -61,27 +56,14 @@ def _shared(free: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 @frozen_dataclass(eq=False)
 class Minimum:
-    """A calibration at its minimum.
-
-    Attributes
-    ----------
-    views : Views
-    state : CameraState
-    normal : (V, 12 + K, 12 + K) array
-        From `adjust`.
-    free : (5 + K,) bool array
-        Of A's entries and the distortion coefficients.
-    free_poses : bool
-    repeated : RepeatedPoses, optional
-        Views that repeat a pose; they stay in the same fold.
-    """
+    """A calibration at its minimum."""
 
     views: Views
     state: CameraState
-    normal: Array
-    free: NDArray[np.bool_]
+    normal: Array  # (V, 12 + K, 12 + K) from `adjust`
+    free: NDArray[np.bool_]  # (5 + K,) of A's entries and the distortion coefficients
     free_poses: bool
-    repeated: RepeatedPoses | None = None
+    repeated: RepeatedPoses | None = None  # views that repeat a pose; they stay in the same fold
 
 
 @_quietly
@@ -108,14 +90,9 @@ def held_out_views(
 ) -> Array:
     """Squared error of each view when it is held out; (V,), nan if the others do not determine the camera.
 
-    Parameters
-    ----------
-    normal, free, free_poses
-        As for `reduced`.
-    penalty : (f, f) array and (f,) array, optional
-        Prior, added to the normal matrix of the shared parameters and to its right side.
-    repeated : RepeatedPoses, optional
-        Views that repeat a pose are held out together.
+    `normal`, `free` and `free_poses` are as for `reduced`. The penalty is a prior, added to the normal matrix
+    (f, f) of the shared parameters and to its right side (f,). Views that repeat a pose are held out
+    together.
     """
     q = reduced(normal, free, free_poses)
     fold = folds_of(len(q.cost), FOLDS) if repeated is None else repeated.folds(FOLDS)
@@ -190,16 +167,11 @@ def _whole_steps(normal: Array, free: NDArray[np.bool_], free_poses: bool, penal
 
 @_quietly
 def disagreement(m: Minimum) -> tuple[Array, Array]:
-    """Difference between the shared parameters estimated from two halves of the data.
+    """Difference (f,) between the shared parameters of two halves of the data, and its covariance (f, f).
 
     The halves are alternate views (or alternate poses). If half of the views do not determine the camera,
-    they are two parts of each view's points.
-
-    Returns
-    -------
-    difference : (f,) array
-    covariance : (f, f) array
-        Of the difference, for residuals of unit variance; nan if a half does not determine the camera.
+    they are two parts of each view's points. The covariance is for residuals of unit variance; it is nan if a
+    half does not determine the camera.
     """
     repeated = m.repeated
     pose = np.arange(m.views.n_views) if repeated is None else repeated.group

@@ -39,11 +39,7 @@ def measured_part(errors: Array, across: Array | None) -> Array:
 def variance_across(covariance: Array, across: Array) -> Array:
     """Variance (N,) in the measured direction; the mean of both where both were measured.
 
-    Parameters
-    ----------
-    covariance : (N, 3) array
-        suu, suv, svv.
-    across : (N, 2) array
+    The columns of `covariance` (N, 3) are suu, suv, svv.
     """
     suu, suv, svv = covariance.T
     nu, nv = unit(across).T

@@ -28,10 +28,8 @@ _WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (
 def check_points(problem: Problem) -> None:
     """Refuse degenerate or insufficient points.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The points are too few or lie on one line, or there are too few views of a plane.
+    Raises DegenerateGeometryError if the points are too few or lie on one line, or if there are too few views
+    of a plane.
     """
     views = problem.views
     if problem.free_poses:
@@ -113,19 +111,10 @@ def _check_views_with_few_points(problem: Problem) -> None:
 
 
 def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -> None:
-    """Refuse a solution that the points do not determine.
+    """Refuse a solution, with its state at the minimum, that the points do not determine.
 
-    Parameters
-    ----------
-    problem : Problem
-    state : CameraState
-        At the minimum.
-    cov : Covariance
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The normal matrix is singular, or the relative std of a focal length is not below the limit.
+    Raises DegenerateGeometryError if the normal matrix is singular, or if the relative std of a focal length
+    is not below the limit.
     """
     views, relative_std = problem.views, relative_std_of_scale(problem, state, cov)
     singular = not cov.smallest > _SINGULAR

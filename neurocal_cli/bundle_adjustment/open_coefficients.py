@@ -48,73 +48,35 @@ _SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above 
 
 @frozen_dataclass(eq=False)
 class OpenPrior:
-    """Prior of the open unknowns.
+    """Prior of the open unknowns."""
 
-    Attributes
-    ----------
-    is_open : (f,) bool array
-        Which of the free unknowns are open.
-    left_out : (f,) bool array
-        Which of these were not estimated.
-    value : (o,) array
-        Reported values of the open unknowns; 0 if they were left out.
-    size : (o,) array
-        Prior std of the open unknowns around 0, if they are present.
-    groups : tuple of int arrays
-        Indices of open unknowns that are present or absent together.
-    odds : float
-        Prior odds that a group is present.
-    scales : tuple of float
-        Common factors of all sizes, equally probable.
-    """
-
-    is_open: NDArray[np.bool_]
-    left_out: NDArray[np.bool_]
-    value: Array
-    size: Array
-    groups: tuple[NDArray[np.intp], ...]
-    odds: float = _ODDS
-    scales: tuple[float, ...] = _SCALES
+    is_open: NDArray[np.bool_]  # (f,) which of the free unknowns are open
+    left_out: NDArray[np.bool_]  # (f,) which of these were not estimated
+    value: Array  # (o,) reported values of the open unknowns; 0 if they were left out
+    size: Array  # (o,) prior std of the open unknowns around 0, if they are present
+    groups: tuple[NDArray[np.intp], ...]  # indices of open unknowns that are present or absent together
+    odds: float = _ODDS  # prior odds that a group is present
+    scales: tuple[float, ...] = _SCALES  # common factors of all sizes, equally probable
 
 
 @frozen_dataclass(eq=False)
 class SpreadOfOpen:
-    """Posterior of the open unknowns o.
+    """Posterior of the open unknowns o."""
 
-    Attributes
-    ----------
-    E : (o, o) array
-        Term to add to the estimated covariance of the open unknowns, which is 0 for those left out; nan if
-        the points do not determine those that were estimated.
-    follow : (f, o) array
-        [T; 1], the response of all free unknowns to the open ones.
-    probability : float
-        Posterior probability that any group is present.
-    """
-
+    # (o, o) term to add to the estimated covariance of the open unknowns, which is 0 for those left out; nan
+    # if the points do not determine those that were estimated.
     E: Array
-    follow: Array
-    probability: float
+    follow: Array  # (f, o) [T; 1], the response of all free unknowns to the open ones
+    probability: float  # posterior probability that any group is present
 
 
 @frozen_dataclass(eq=False)
 class OpenCoefficients:
-    """A camera extended by the coefficients that its selected model leaves out.
+    """A camera extended by the coefficients that its selected model leaves out."""
 
-    Attributes
-    ----------
-    model : str
-        The richer model.
-    k : (K,) array
-        Its coefficients; those left out are 0.
-    free : (5 + K,) bool array
-        Free entries of A and coefficients, including those left out.
-    prior : OpenPrior
-    """
-
-    model: str
-    k: Array
-    free: NDArray[np.bool_]
+    model: str  # the richer model
+    k: Array  # (K,) its coefficients; those left out are 0
+    free: NDArray[np.bool_]  # (5 + K,) free entries of A and coefficients, including those left out
     prior: OpenPrior
 
     def state(self, state: CameraState) -> CameraState:
@@ -136,13 +98,7 @@ def corner_radius(
 ) -> float:
     """Distorted radius of the farthest corner in normalised image coordinates; 0 without an image size.
 
-    Parameters
-    ----------
-    entries : (5,) array
-        Entries of A, normalised.
-    pixel_centre, pixel_scale
-        Of the normalisation.
-    size : (width, height), optional
+    `entries` (5,) are those of A, normalised by `pixel_centre` and `pixel_scale`; `size` is width and height.
     """
     if size is None:
         return 0.0
@@ -162,15 +118,8 @@ def log_prior(state: CameraState, first: int, reach: float) -> float:
     """Logarithm of the prior density of the coefficients of a polynomial model, from the `first` on.
 
     A uniform density of 1, which the evidence of a target has for all cameras, is far too wide for them.
-
-    Parameters
-    ----------
-    state : CameraState
-        Normalised.
-    first : int
-        Number of coefficients that are not counted.
-    reach : float
-        `radius` of the farthest point.
+    `first` is the number of coefficients that are not counted. `state` is normalised, and `reach` is the
+    `radius` of the farthest point.
     """
     names = coefficient_names(state.model)
     size = {name: share / reach**power for members, power, share in _POLYNOMIAL for name in members}
@@ -181,20 +130,11 @@ def log_prior(state: CameraState, first: int, reach: float) -> float:
 def open_coefficients(
     model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
 ) -> OpenCoefficients | None:
-    """Open coefficients of a selected distortion model; None if there are none.
+    """Open coefficients of a selected distortion model with coefficients k (K,); None if there are none.
 
-    Parameters
-    ----------
-    model, k
-        The selected distortion.
-    free : (5 + K,) bool array
-        Which of A's entries and the coefficients were estimated.
-    choice : collection of str
-        The candidate models of the selection; empty if the user named the model.
-    reach : float
-        `radius` of the farthest point.
-    corner : float
-        `corner_radius`.
+    `free` (5 + K,) tells which of A's entries and the coefficients were estimated. `choice` contains the
+    candidate models of the selection; it is empty if the user named the model. `reach` is the `radius` of the
+    farthest point, and `corner` the `corner_radius`.
     """
     own = coefficient_names(model)
     richer = (
@@ -238,14 +178,9 @@ def open_of_calibration(
 ) -> OpenCoefficients | None:
     """Open coefficients of a calibrated camera's distortion model; None if there are none.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        With its points and poses.
-    free : (5 + K,) bool array
-        Which of A's entries and the coefficients were estimated.
-    k : (K,) array, optional
-        Coefficients of the same model, if they differ from those of the calibration.
+    The calibration must have its points and poses. `free` (5 + K,) tells which of A's entries and the
+    coefficients were estimated. `k` (K,) are coefficients of the same model, if they differ from those of the
+    calibration.
     """
     points, camera = calibration.points, calibration.camera
     poses = [calibration.views[name].pose for name in points.view_names]
@@ -259,15 +194,8 @@ def open_of_calibration(
 def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
     """Posterior of the open unknowns by model averaging.
 
-    Parameters
-    ----------
-    S : (f, f) array
-        Normal matrix of the free unknowns, with the poses eliminated.
-    g : (f,) array
-        Right side, J^T r, at the reported values.
-    variance : float
-        Of the residuals, enlarged if they are correlated.
-    prior : OpenPrior
+    S (f, f) is the normal matrix of the free unknowns with the poses eliminated, and g (f,) its right side,
+    J^T r, at the reported values. `variance` is that of the residuals, enlarged if they are correlated.
     """
     c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
     T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])

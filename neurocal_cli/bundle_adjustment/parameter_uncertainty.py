@@ -24,24 +24,11 @@ _TOLD_APART = 2.0  # standard deviations from which on a coefficient differs sig
 def parameter_covariance(
     intrinsics: Intrinsics, model: str, covariance: Array, pixel_scale: float, given: Collection[str]
 ) -> tuple[Array, dict[str, float]]:
-    """Covariance of the intrinsic parameters and the distortion coefficients, and their std.
+    """Covariance of the intrinsic parameters and the K distortion coefficients, and their std by name.
 
-    Parameters
-    ----------
-    intrinsics : Intrinsics
-    model : str
-        Distortion model with K coefficients.
-    covariance : (5 + K, 5 + K) array
-        Of A's entries A11, A12, A22, A13, A23 in normalised pixels and of the coefficients; 0 for given ones.
-    pixel_scale : float
-        S1 [px].
-    given : collection of str
-        Names whose std is 0.
-
-    Returns
-    -------
-    block : (5 + K, 5 + K) array
-    std : dict of float by name
+    `covariance` is that of A's entries A11, A12, A22, A13, A23 in normalised pixels and of the coefficients;
+    it is 0 for given ones. Both covariances are (5 + K, 5 + K). `pixel_scale` is S1 [px], and the std of the
+    `given` names is 0.
     """
     names = (*INTRINSIC_NAMES, *coefficient_names(model))
     J = np.eye(len(names))
@@ -52,17 +39,10 @@ def parameter_covariance(
 
 
 def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
-    """Standard deviations of angles and translations, (V, 6).
+    """Standard deviations (V, 6) of the angles and translations of poses with rotations R (V, 3, 3).
 
-    Parameters
-    ----------
-    R : (V, 3, 3) array
-    centre : (V, 3) array
-        Centre of each target in the camera's axes, R c [world unit].
-    scale : (V,) array
-        S2 [world unit].
-    covariance : (V, 6, 6) array
-        Of omega and tau about the centre, normalised.
+    `centre` (V, 3) is the centre of each target in the camera's axes, R c, and `scale` (V,) is S2, both in
+    world units. `covariance` (V, 6, 6) is that of omega and tau about the centre, normalised.
     """
     # t = scale tau - R c: omega turns R c with it.
     J = np.zeros((len(R), 6, 6))

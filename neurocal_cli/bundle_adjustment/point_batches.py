@@ -23,31 +23,16 @@ _POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, which fit into the second
 
 @frozen_dataclass(eq=False)
 class PointBatches:
-    """Points of several views in batches of n points.
+    """Points of several views in batches of n points."""
 
-    Attributes
-    ----------
-    local : (T, 3, n) array
-        World points of each batch in its view's own normalised frame.
-    pixels : (T, 2, n) array
-        Normalised pixels.
-    whitening : (T, 3, n) array or None
-        Entries (0, 0), (0, 1), (1, 1) of the upper triangular factor that whitens a residual; None if all
-        points have equal weight and no batch is padded.
-    first : (V,) int array
-        First batch of each view.
-    view : (T,) int array
-        View of each batch.
-    counts : (V,) int array
-        Points of each view.
-    """
-
-    local: Array
-    pixels: Array
+    local: Array  # (T, 3, n) world points of each batch in its view's own normalised frame
+    pixels: Array  # (T, 2, n) normalised
+    # (T, 3, n) entries (0, 0), (0, 1), (1, 1) of the upper triangular factor that whitens a residual; None if
+    # all points have equal weight and no batch is padded.
     whitening: Array | None
-    first: NDArray[np.intp]
-    view: NDArray[np.intp]
-    counts: NDArray[np.intp]
+    first: NDArray[np.intp]  # (V,) first batch of each view
+    view: NDArray[np.intp]  # (T,) view of each batch
+    counts: NDArray[np.intp]  # (V,) number of points of each view
     _memory: dict[int, Array] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -85,14 +70,9 @@ class PointBatches:
 def products(J: Array, out: Array) -> None:
     """Products J J^T of the rows of each batch without the last, summed over u and v and over the points.
 
-    The last row is multiplied as one column too many, so that NumPy does not detect the symmetric product: a
-    general product takes half of the time.
-
-    Parameters
-    ----------
-    J : (T, width + 1, 2, n) array
-        A part of `PointBatches.memory`.
-    out : (T, width, width) array
+    J (T, width + 1, 2, n) is a part of `PointBatches.memory`, and `out` (T, width, width) is filled. The last
+    row is multiplied as one column too many, so that NumPy does not detect the symmetric product: a general
+    product takes half of the time.
     """
     rows = J.transpose(2, 0, 1, 3)
     both = rows[:, :, :-1] @ rows.swapaxes(2, 3)
@@ -102,16 +82,9 @@ def products(J: Array, out: Array) -> None:
 def batches_of(
     local: Array, pixels: Array, whitening: Array | None, view: NDArray[np.intp], n_views: int
 ) -> PointBatches:
-    """Cut points into batches.
+    """Cut points into batches: `local` (N, 3), `pixels` (N, 2) and, if not None, `whitening` (N, 3).
 
-    Parameters
-    ----------
-    local : (N, 3) array
-    pixels : (N, 2) array
-    whitening : (N, 3) array or None
-    view : (N,) int array
-        View of each point; each of the `n_views` views has at least one.
-    n_views : int
+    `view` (N,) is the view of each point; each of the `n_views` views has at least one.
     """
     counts = np.bincount(view, minlength=n_views)
     order = np.argsort(view, kind="stable") if np.any(view[1:] < view[:-1]) else None

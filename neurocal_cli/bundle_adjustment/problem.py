@@ -33,48 +33,26 @@ _RIM, _HALVINGS = 0.02, 30
 
 @frozen_dataclass(eq=False)
 class Problem:
-    """Which parameters are estimated from which points.
-
-    Attributes
-    ----------
-    points : Correspondences
-    views : Views
-        The same points, normalised. A given distortion is removed from their pixels, because the networks
-        model a pinhole; `with_seen_pixels` restores it.
-    type : int
-    entries : (5,) array
-        A11, A12, A22, A13, A23 [px]; only the given ones are meaningful.
-    free : (5,) bool array
-        Entries to estimate.
-    poses : dict of Pose by view, or None
-        The given poses.
-    fixed : frozenset of str
-        Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
-    intrinsics : Intrinsics or None
-        The given intrinsics of type 3, returned unchanged.
-    distortion : Distortion
-        The final distortion model, with its coefficients if they are given.
-    free_distortion : bool
-        Whether the coefficients that are not fixed are estimated.
-    penalty : callable, optional
-        Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's
-        prior, which holds for any points.
-    turned : (V, 3, 3) array, optional
-        If a given wide lens is removed, each view has a pinhole that looks at its target: rotations from the
-        camera's frame to that pinhole's. None after `with_seen_pixels`.
-    """
+    """Which parameters are estimated from which points."""
 
     points: Correspondences
+    # The same points, normalised. A given distortion is removed from their pixels, because the networks model
+    # a pinhole; `with_seen_pixels` restores it.
     views: Views
     type: int
-    entries: Array
-    free: NDArray[np.bool_]
-    poses: Mapping[str, Pose] | None
+    entries: Array  # (5,) A11, A12, A22, A13, A23 [px]; only the given ones are meaningful
+    free: NDArray[np.bool_]  # (5,) entries to estimate
+    poses: Mapping[str, Pose] | None  # the given poses by view
+    # Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
     fixed: frozenset[str]
-    intrinsics: Intrinsics | None
-    distortion: Distortion
-    free_distortion: bool
+    intrinsics: Intrinsics | None  # the given intrinsics of type 3, returned unchanged
+    distortion: Distortion  # the final distortion model, with its coefficients if they are given
+    free_distortion: bool  # whether the coefficients that are not fixed are estimated
+    # Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's prior,
+    # which holds for any points.
     penalty: Penalty | None = None
+    # If a given wide lens is removed, each view has a pinhole that looks at its target: rotations (V, 3, 3)
+    # from the camera's frame to that pinhole's. None after `with_seen_pixels`.
     turned: Array | None = None
 
     @property
@@ -125,12 +103,8 @@ class Problem:
     def with_points(self, points: Correspondences) -> Problem:
         """The same problem with other points.
 
-        Raises
-        ------
-        InputError
-            The given distortion maps no ray to one of the pixels.
-        DegenerateGeometryError
-            All pixels coincide.
+        Raises InputError if the given distortion maps no ray to one of the pixels, and
+        DegenerateGeometryError if all pixels coincide.
         """
         if self.free_distortion:
             views, turned = arrange(points), None
@@ -203,24 +177,13 @@ def problem_for(
 ) -> Problem:
     """State a problem; check that the given parameters are those of its type.
 
-    Parameters
-    ----------
-    points : Correspondences
-    type : int
-    image_center, intrinsics, extrinsics, skew
-        As for `calibrate`.
-    distortion : Distortion, optional
-        The distortion: given with type 3, else the model to be estimated.
+    `image_center`, `intrinsics`, `extrinsics` and `skew` are as for `calibrate`. `distortion` is the given
+    one with type 3, else the model to be estimated.
 
-    Raises
-    ------
-    UsageError
-        The type does not exist, a parameter that it needs is missing, or one that it does not use is given.
-    InputError
-        There are no points, a value is not finite, the extrinsics lack a view, or the given distortion maps
-        no ray to a pixel.
-    DegenerateGeometryError
-        All pixels coincide.
+    Raises UsageError if the type does not exist, a parameter that it needs is missing, or one that it does
+    not use is given. Raises InputError if there are no points, a value is not finite, the extrinsics lack a
+    view, or the given distortion maps no ray to a pixel. Raises DegenerateGeometryError if all pixels
+    coincide.
     """
     if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
         raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")

@@ -28,18 +28,10 @@ _ROWS = 1000  # rows of the distance matrix computed at a time
 
 @frozen_dataclass(eq=False)
 class RepeatedPoses:
-    """Groups of views that share a pose.
+    """Groups of views that share a pose."""
 
-    Attributes
-    ----------
-    group : (V,) int array
-        Number of each view's pose, from 0 in the order of the views.
-    correlation : float
-        Correlation of a point's residuals between views of one pose, 0 to 1.
-    """
-
-    group: NDArray[np.intp]
-    correlation: float
+    group: NDArray[np.intp]  # (V,) number of each view's pose, from 0 in the order of the views
+    correlation: float  # of a point's residuals between views of one pose, 0 to 1
 
     @property
     def n_poses(self) -> int:
@@ -78,15 +70,9 @@ class RepeatedPoses:
 
 
 def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedPoses:
-    """Find views that repeat a pose.
+    """Find views that repeat a pose, given the normalised state of a fit.
 
-    Parameters
-    ----------
-    views : Views
-    state : CameraState
-        Normalised state of a fit.
-    errors : (N, 2) array
-        Its normalised residuals, in the order of the views' points.
+    `errors` (N, 2) are its normalised residuals, in the order of the views' points.
     """
     noise = float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
     group = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))

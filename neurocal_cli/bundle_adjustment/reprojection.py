@@ -34,24 +34,14 @@ def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
 
 @frozen_dataclass(eq=False)
 class CameraState:
-    """Camera and poses, the unknowns of an adjustment, in normalised units or in pixels and world units.
+    """Camera and poses, the unknowns of an adjustment, in normalised units or in pixels and world units."""
 
-    Attributes
-    ----------
-    entries : (1, 5) or (V, 5) array
-        A11, A12, A22, A13, A23 of the camera that all views share, or of each view's own camera.
-    R : (V, 3, 3) array
-    t : (V, 3) array
-    model : str
-        Distortion model, one of `distortion.MODELS`.
-    k : (K,) or (V, K) array
-        Its coefficients, the same for all views or each view's own.
-    """
-
+    # A11, A12, A22, A13, A23: (1, 5) of the camera that all views share, or (V, 5) of each view's own camera.
     entries: Array
-    R: Array
-    t: Array
-    model: str = "none"
+    R: Array  # (V, 3, 3)
+    t: Array  # (V, 3)
+    model: str = "none"  # distortion model, one of `distortion.MODELS`
+    # Coefficients of the model: (K,) the same for all views, or (V, K) each view's own.
     k: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -108,14 +98,11 @@ class CameraState:
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
-    """Normal matrices: products of derivatives and residuals, summed over each view's points.
+    """Normal matrices (V, 12 + K, 12 + K), and which views are sensible (V,).
 
-    Returns
-    -------
-    normal : (V, 12 + K, 12 + K) array
-        Columns: derivatives by A11, A12, A22, A13, A23, omega (3), tau (3), K coefficients, and the residual.
-    sensible : (V,) bool array
-        Whether all the view's points have positive depth and lie where the distortion is monotonic.
+    The matrices are products of derivatives and residuals, summed over each view's points. Their columns are
+    the derivatives by A11, A12, A22, A13, A23, omega (3), tau (3) and K coefficients, and the residual. A
+    view is sensible if all its points have positive depth and lie where the distortion is monotonic.
     """
     n_batches = len(batches.view)
     width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
@@ -136,14 +123,8 @@ def displaced_blocks(
 ) -> Array:
     """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
 
-    Parameters
-    ----------
-    batches, state
-        As for `normal_blocks`.
-    m : int
-        Number of ways in which the target may be displaced.
-    displaced : callable
-        Displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
+    These columns are the derivatives by m ways in which the target may be displaced. `displaced` returns the
+    displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
     """
     width, n = 12 + len(state.k), batches.local.shape[2]
     by_batch = np.empty((len(batches.view), width + m, width + m))
@@ -185,20 +166,9 @@ def squared_errors(batches: PointBatches, state: CameraState) -> Array:
 def predicted_pixels(
     state: CameraState, world: Array, view: NDArray[np.intp]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Project world points, each with the pose of its view.
+    """Project world points (N, 3), each with the pose of its view (N,); `state` is in pixels and world units.
 
-    Parameters
-    ----------
-    state : CameraState
-        In pixels and world units.
-    world : (N, 3) array
-    view : (N,) int array
-
-    Returns
-    -------
-    pixels : (N, 2) array [px]
-        ``nan`` for points that are not in front of the camera.
-    in_front : (N,) bool array
+    Returns the pixels (N, 2), and which points (N,) are in front of the camera; others have ``nan`` pixels.
     """
     X, Y, Z = ((state.R[view] @ world[..., None])[..., 0] + state.t[view]).T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

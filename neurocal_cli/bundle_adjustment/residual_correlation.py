@@ -20,16 +20,8 @@ _SOME_SAY = 0.5  # least weight along edges with which residuals in that directi
 def correlation(views: Views, errors: Array) -> float:
     """Correlation of the residuals of points that are neighbours in their view.
 
-    Parameters
-    ----------
-    views : Views
-    errors : (N, 2) array
-        Residual of each point, in the order of `views`; directions that were not measured are ignored.
-
-    Returns
-    -------
-    float
-        0 for noise, to 1 / sqrt(N); 1 for residuals that vary slowly over the image.
+    It is 0 for noise, to 1 / sqrt(N), and 1 for residuals that vary slowly over the image. `errors` (N, 2)
+    are the points' residuals in the order of `views`; directions that were not measured are ignored.
     """
     group, n_groups = views.index, views.n_views
     across = views.across if views.along < _SOME_SAY else None

@@ -18,10 +18,7 @@ _SETTLED = 0.005  # change of the share that is negligible for every result
 def reweighted(solution: Solution) -> Solution:
     """Alternate between adjusting and estimating the noise common to all points; see `common_noise`.
 
-    Parameters
-    ----------
-    solution : Solution
-        Adjusted with the stated covariances alone.
+    The given solution is adjusted with the stated covariances alone.
     """
     points = solution.problem.points
     if points.covariance is None or not measured(points.covariance):

@@ -29,25 +29,14 @@ if TYPE_CHECKING:
 
 @frozen_dataclass(eq=False)
 class TrainingRecord:
-    """Record of the training.
+    """Record of the training."""
 
-    Attributes
-    ----------
-    agreed : (V,) int array
-        Number of each view's random starts that ended at its best result.
-    starts, iterations : int
-        Number of random starts, and of their training steps.
-    squares, before : float
-        Sum of squares of E_2D after training; squared reprojection error at the start of bundle adjustment.
-    curve : (J,) array
-        Learning curve of the first view's best start.
-    """
-
-    agreed: NDArray[np.int64]
-    starts: int = 0
-    iterations: int = 0
-    squares: float = 0.0
-    before: float = 0.0
+    agreed: NDArray[np.int64]  # (V,) number of each view's random starts that ended at its best result
+    starts: int = 0  # number of random starts
+    iterations: int = 0  # number of their training steps
+    squares: float = 0.0  # sum of squares of E_2D after training
+    before: float = 0.0  # squared reprojection error at the start of bundle adjustment
+    # (J,) learning curve of the first view's best start.
     curve: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
@@ -73,54 +62,30 @@ class TrainingRecord:
 
 @frozen_dataclass(eq=False)
 class Solution:
-    """Solution of a problem, in normalised units.
-
-    Attributes
-    ----------
-    problem : Problem
-        The problem that it solves.
-    adjusted : Adjusted
-        The minimum of the reprojection error.
-    record : TrainingRecord
-    shared : (n, n) array, optional
-        Covariance of A's free entries and the free distortion coefficients, if it is not that of the normal
-        matrix.
-    by_prior : float
-        Effective number of estimated coefficients that a prior determines instead of the points.
-    common_noise : float
-        Share of the noise that is common to all points; see the module `common_noise`.
-    model_errors : dict of float by distortion model [px], optional
-        Cross-validation errors of the candidate models of ``distortion="auto"``.
-    would_take : frozenset of str
-        Models that one of these selections would have chosen, had they been preferred.
-    straight_lines : StraightLines, optional
-        The straight lines from which ``distortion="plumb-line"`` estimated the distortion.
-    refusal : str
-        Why this solution must be refused; empty if it is valid.
-    target : Target, optional
-        The target if it was estimated with the camera; the problem's points are then those of the target.
-    target_kept : bool
-        Whether the given target was kept although it could have been estimated.
-    ambiguity : Ambiguity, optional
-        Other cameras that explain the points equally well.
-    of_all : Solution, optional
-        The fit of all points, if some were rejected afterwards.
-    """
+    """Solution of a problem, in normalised units."""
 
     problem: Problem
-    adjusted: Adjusted
+    adjusted: Adjusted  # the minimum of the reprojection error
     record: TrainingRecord
+    # (n, n) covariance of A's free entries and the free distortion coefficients, if it is not that of the
+    # normal matrix.
     shared: Array | None = None
+    # Effective number of estimated coefficients that a prior determines instead of the points.
     by_prior: float = 0.0
+    # Share of the noise that is common to all points; see the module `common_noise`.
     common_noise: float = 0.0
+    # Cross-validation errors of the candidate models of ``distortion="auto"``, by distortion model [px].
     model_errors: Mapping[str, float] | None = None
+    # Models that one of these selections would have chosen, had they been preferred.
     would_take: frozenset[str] = frozenset()
+    # The straight lines from which ``distortion="plumb-line"`` estimated the distortion.
     straight_lines: StraightLines | None = None
-    refusal: str = ""
+    refusal: str = ""  # why this solution must be refused; empty if it is valid
+    # The target if it was estimated with the camera; the problem's points are then those of the target.
     target: Target | None = None
-    target_kept: bool = False
-    ambiguity: Ambiguity | None = None
-    of_all: Solution | None = None
+    target_kept: bool = False  # whether the given target was kept although it could have been estimated
+    ambiguity: Ambiguity | None = None  # other cameras that explain the points equally well
+    of_all: Solution | None = None  # the fit of all points, if some were rejected afterwards
 
     @property
     def state(self) -> CameraState:

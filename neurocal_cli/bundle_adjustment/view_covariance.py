@@ -55,24 +55,12 @@ def counting_views(
 ) -> Covariance:
     """Covariances for residuals that are independent between views only.
 
-    Parameters
-    ----------
-    found : Covariance
-        From the normal matrix.
-    normal, free, free_poses, n_residuals
-        As for `covariance.covariance`.
-    repeated : RepeatedPoses
-    moves_without : callable, optional
-        Moves of the free parameters when the views of each pose are left out, given the pose number of each
-        view; needed if they do not follow from the normal matrices.
-    bends : bool
-        Whether each view has bends of its own. They absorb contradictions between views that have other
-        causes, and only the jackknife reveals those.
-
-    Returns
-    -------
-    Covariance
-        `found` if the views contradict each other no more than the residuals explain.
+    The result is `found`, the covariance from the normal matrix, if the views contradict each other no more
+    than the residuals explain. `normal`, `free`, `free_poses` and `n_residuals` are as for
+    `covariance.covariance`. `moves_without` takes the pose number of each view and returns the moves of the
+    free parameters when the views of each pose are left out; it is needed if they do not follow from the
+    normal matrices. `bends` tells whether each view has bends of its own: they absorb contradictions between
+    views that have other causes, and only the jackknife reveals those.
     """
     if not free.any() or not np.isfinite(found.entries).all():
         return found
@@ -107,8 +95,8 @@ def counting_views(
 class _Determined:
     """Directions of the unknowns that the points determine: p = into z, z = back p."""
 
-    into: Array
-    back: Array
+    into: Array  # (f, r)
+    back: Array  # (r, f)
 
 
 def _determined(S: Array) -> _Determined | None:

@@ -25,64 +25,30 @@ _NEARLY_FLAT = 0.02
 
 @frozen_dataclass(eq=False)
 class Views:
-    """All points, sorted by view, in normalised coordinates.
-
-    Attributes
-    ----------
-    names : tuple of str
-    order : (N,) int array or None
-        Row of the original data for each point; None if the data were sorted already.
-    index : (N,) int array
-        View of each point.
-    counts, first : (V,) int arrays
-        Number of points of each view, and index of its first point.
-    distinct : (V,) int array
-        Number of different world points of each view.
-    local : (N, 3) array
-        (M - centre) / scale, each view with its own.
-    pixels : (N, 2) array
-        (m - pixel_centre) / pixel_scale.
-    weights : (N,) array
-        Scalar weights, mean 1.
-    across : (N, 2) array or None
-        Direction in which each point was measured; see `measured_directions`.
-    whitening : (N, 3) array or None
-        Upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
-    centre : (V, 3) array
-    scale : (V,) array
-        S2 of each view [world unit].
-    basis : (V, 3, 3) array
-        Columns: principal axes of each view's points, longest first; a rotation.
-    extent : (V, 3) array
-        Rms extents along them, normalised.
-    pixel_centre : (2,) array
-    pixel_scale : float
-        S1 [px].
-    along : float
-        Weight that points measured across an edge have along it.
-    rays : (N, 3) array, optional
-        Unit directions that the networks learn instead of (u, v, 1), from an assumed lens. Without them a
-        network models a pinhole.
-    """
+    """All points, sorted by view, in normalised coordinates."""
 
     names: tuple[str, ...]
+    # (N,) row of the original data for each point; None if the data were sorted already.
     order: NDArray[np.intp] | None
-    index: NDArray[np.intp]
-    counts: NDArray[np.intp]
-    first: NDArray[np.intp]
-    distinct: NDArray[np.intp]
-    local: Array
-    pixels: Array
-    weights: Array
-    across: Array | None
+    index: NDArray[np.intp]  # (N,) view of each point
+    counts: NDArray[np.intp]  # (V,) number of points of each view
+    first: NDArray[np.intp]  # (V,) index of each view's first point
+    distinct: NDArray[np.intp]  # (V,) number of different world points of each view
+    local: Array  # (N, 3) (M - centre) / scale, each view with its own
+    pixels: Array  # (N, 2) (m - pixel_centre) / pixel_scale
+    weights: Array  # (N,) scalar weights, mean 1
+    across: Array | None  # (N, 2) direction in which each point was measured; see `measured_directions`
+    # (N, 3) upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
     whitening: Array | None
-    centre: Array
-    scale: Array
-    basis: Array
-    extent: Array
-    pixel_centre: Array
-    pixel_scale: float
-    along: float = LEAST
+    centre: Array  # (V, 3) mean of each view's points [world unit]
+    scale: Array  # (V,) S2 of each view [world unit]
+    basis: Array  # (V, 3, 3) columns: principal axes of each view's points, longest first; a rotation
+    extent: Array  # (V, 3) rms extents along them, normalised
+    pixel_centre: Array  # (2,) [px]
+    pixel_scale: float  # S1 [px]
+    along: float = LEAST  # weight that points measured across an edge have along it
+    # (N, 3) unit directions that the networks learn instead of (u, v, 1), from an assumed lens. Without them
+    # a network models a pinhole.
     rays: Array | None = None
 
     @property
@@ -199,13 +165,7 @@ class Views:
 
 
 def arrange(points: Correspondences) -> Views:
-    """Sort points by view and normalise them.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        All pixels coincide.
-    """
+    """Sort points by view and normalise them; raises DegenerateGeometryError if all pixels coincide."""
     index, V = points.view_index, points.n_views
     world, pixels, covariance, across = points.world, points.pixels, points.covariance, points.across
     order = None
@@ -265,14 +225,9 @@ def noise_model(
 ) -> tuple[Array | None, Array | None]:
     """Scalar weights (N,) of mean 1 and whitening factors (N, 3) of mean square 1 for each equation.
 
-    Parameters
-    ----------
-    covariance : (N, 3) array or None
-        suu, suv, svv; None if equal for all points.
-    across : (N, 2) array, optional
-        Direction in which each point was measured; see `measured_directions`.
-    along : float
-        Weight of such points along their edge.
+    The columns of `covariance` (N, 3) are suu, suv, svv; it is None if they are equal for all points.
+    `across` (N, 2) is the direction in which each point was measured (see `measured_directions`), and `along`
+    is the weight of such points along their edge.
     """
     if covariance is None:
         if across is None:
