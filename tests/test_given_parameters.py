@@ -229,5 +229,5 @@ def test_points_all_around_a_given_camera_are_named() -> None:
     world = rays * np.linspace(500, 900, len(angle))[:, None]
     world[:, 1] = np.linspace(0, 99, len(angle))
     points = Correspondences(world, lens.project(world)[0])
-    with pytest.raises(InputError, match=r"row 22: .*more than 90 degrees from the middle"):
+    with pytest.raises(InputError, match=r"row 22: .*more than 84 degrees from the middle"):
         calibrate(points, type=3, intrinsics=lens, outliers="keep")

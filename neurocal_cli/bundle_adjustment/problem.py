@@ -254,7 +254,7 @@ def _undistorted_views(
     if behind.any():
         row = int(np.argmax(behind))
         raise InputError(
-            f"{points.place(row)}: this point is seen more than 90 degrees from the middle of the points in "
+            f"{points.place(row)}: this point is seen more than 84 degrees from the middle of the points in "
             "its view; leave such points out"
         )
     return arrange(replace(points, pixels=pixels)), turned
