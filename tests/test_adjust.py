@@ -10,13 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from support.distorted import BENT, SIGMA, bent_set
 from support.slow_cases import slow_but
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.neuro import solve
+from neurocal_cli.initialisation.options import options_for
 
 FREE = {
     "type 1": [1, 1, 1, 1, 1],
@@ -279,3 +283,17 @@ def test_a_refinement_that_is_cut_short_says_so() -> None:
     cut = adjust(problem.batches, far_start(problem, 0), np.ones(5, dtype=bool), max_iterations=2)
     assert cut.iterations == 2
     assert not cut.converged
+
+
+@pytest.mark.parametrize("model", BENT)
+@pytest.mark.parametrize("seed", slow_but(range(80000, 80020), range(80000, 80003)))
+def test_a_descent_ends_only_where_another_step_gains_nothing(model: str, seed: int) -> None:
+    """What is left is below a thousandth of chi-squared, 3 % of one standard deviation of one parameter."""
+    points = bent_set(model, seed)[0].points(SIGMA, np.random.default_rng([seed, 1]))
+    problem = problem_for(points, 1, skew=False, distortion=Distortion(model))
+    with np.errstate(all="ignore"):
+        found = solve(problem, options_for("lm", 20, 0)).adjusted
+    further = problem.adjust(found, damping=1e-12)
+    gained = found.cost.sum() - further.cost.sum()
+    assert found.converged
+    assert gained < 1e-3 * further.cost.sum() / problem.views.n_equations

@@ -223,9 +223,9 @@ def problem_for(
     free_distortion = type != 3 and distortion.model != "none"
     if type == 3:
         fixed |= set(coefficient_names(distortion.model))
-    views, turned = arrange(points), None
-    if not free_distortion:
-        views, turned = _undistorted_views(points, distortion, entries)
+    views, turned = (
+        (arrange(points), None) if free_distortion else _undistorted_views(points, distortion, entries)
+    )
     given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
     return Problem(points, views, *given, turned=turned)
 
