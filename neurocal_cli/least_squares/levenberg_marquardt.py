@@ -17,8 +17,8 @@ Nielsen's smallest factor is 1/3. Here it is an option, because starts near the 
 quickly. 2 rho - 1 is limited to 2, because the model does not hold either if a step gains far more than
 predicted.
 
-Near the minimum the predicted gains shrink by a constant factor or faster, so two of them foretell the next.
-The descent ends with a step whose own gain is negligible, or after which the next one certainly is.
+Near the minimum the gains shrink by a constant factor or faster, so two of them foretell the next. The
+descent ends with a step whose own gain is negligible, or after which the next one certainly is.
 
 Groups are independent problems solved side by side. They share no unknowns; each has its own lambda and its
 own end. A single problem is one group.
@@ -148,7 +148,7 @@ class LevenbergMarquardt:
         G = len(self.cost)
         self.active = np.arange(G)
         self.damping, self.growth = np.full(G, options.damping), np.full(G, 2.0)
-        self.promised = np.full(G, np.nan)  # predicted gain of the last step
+        self.gain = np.full(G, np.nan)  # of the last step, nan if it failed
         self.floor = np.zeros(G) + floor
         self.limit = np.full(G, options.max_iterations) if limit is None else limit
         self.soonest = int(self.limit.min(initial=options.max_iterations))  # first iteration at a limit
@@ -187,12 +187,10 @@ class LevenbergMarquardt:
         self.cost = after
         exact = self.cost <= self.floor
         negligible = self._last_gain(before)
-        if options.by_promise:
-            following = promised * (promised / self.promised)  # nan after a failed step
-            converged = better & ((promised < negligible) | (following < _FORETOLD * negligible))
-            self.promised = np.where(better, promised, np.nan) if failed else promised
-        else:
-            converged = better & (gained < negligible)
+        gain = promised if options.by_promise else gained
+        next_gain = gain * (gain / self.gain)  # nan after a failed step
+        converged = better & ((gain < negligible) | (next_gain < _FORETOLD * negligible))
+        self.gain = np.where(better, gain, np.nan) if failed else gain
         done = exact | converged
         if self.iteration >= self.soonest:
             done |= self.limit <= self.iteration
@@ -219,7 +217,7 @@ class LevenbergMarquardt:
         """
         self.cost = self.problem.cost.copy()
         self.damping = np.minimum(self.damping, self.options.damping)
-        self.growth, self.promised = np.full(len(self.cost), 2.0), np.full(len(self.cost), np.nan)
+        self.growth, self.gain = np.full(len(self.cost), 2.0), np.full(len(self.cost), np.nan)
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Record the groups that have stopped, and remove them from the active ones."""
@@ -227,4 +225,4 @@ class LevenbergMarquardt:
         self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
         self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]
         self.damping, self.growth = self.damping[going], self.growth[going]
-        self.limit, self.promised = self.limit[going], self.promised[going]
+        self.limit, self.gain = self.limit[going], self.gain[going]
