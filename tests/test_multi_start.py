@@ -64,3 +64,9 @@ def test_no_lens_of_many_ends_in_a_wrong_minimum(model: str) -> None:
             assert not one.rejected.views
     assert len(messages) <= 1
     assert all(f"the distortion model {model} is not monotonic" in one for one in messages)
+
+
+def test_a_simpler_model_that_folds_the_image_is_not_recommended() -> None:
+    """With k1 the points are explained as well, but k1 folds the image and would be refused, too."""
+    with pytest.raises(DegenerateGeometryError, match="k1k2p1p2 is not monotonic"):
+        found("k1k2p1p2", 80127, "k1k2p1p2", "keep")

@@ -19,6 +19,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import (
 )
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+from neurocal_cli.distortion.monotonic_fit import folds_back
 
 _STEPS = 60
 
@@ -40,7 +41,7 @@ def undetermined_coefficients(problem: Problem, adjusted: Adjusted) -> str:
 
 
 def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
-    """The simplest model that is better by the Bayesian information criterion; empty if none is."""
+    """The simplest monotonic model that is better by the Bayesian information criterion; empty if none is."""
     state, views = adjusted.state, problem.views
     alike = correlation(views, point_residuals(views, state))
     n, cost = effective_number(views.n_equations, alike), float(adjusted.cost.sum())
@@ -53,7 +54,9 @@ def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
         more = len(state.k) - len(start.k)
         if more <= 0:
             continue
-        left = float(problem.with_model(model).adjust(start, _STEPS).cost.sum())
-        if n * np.log(left / max(cost, 1e-300)) < more * np.log(n):
+        simpler = problem.with_model(model)
+        found = simpler.adjust(start, _STEPS)
+        as_well = n * np.log(float(found.cost.sum()) / max(cost, 1e-300)) < more * np.log(n)
+        if as_well and folds_back(simpler, found.state) is None:
             return model
     return ""
