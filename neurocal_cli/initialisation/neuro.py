@@ -86,6 +86,7 @@ class _Search:
     def __init__(self, problem: Problem, options: Options, rng: np.random.Generator) -> None:
         self.problem, self.options, self.rng = problem, options, rng
         self.views = problem.views
+        self.many_starts = max(options.starts, _FEW_POINT_STARTS)
 
     def _begin(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
         """First bundle adjustment; the error of its start is recorded."""
@@ -149,8 +150,7 @@ class _Search:
         from neurocal_cli.initialisation.random_cameras import find_camera
 
         problem = self.problem
-        starts = max(self.options.starts, _FEW_POINT_STARTS)
-        found = find_camera(self.views, problem.normalised_entries, problem.free, self.rng, starts)
+        found = find_camera(self.views, problem.normalised_entries, problem.free, self.rng, self.many_starts)
         if found is None:
             raise DegenerateGeometryError(
                 f"no random start found a camera for these {len(self.views.index)} points; give more points"
@@ -175,7 +175,7 @@ class _Search:
         R, t = np.zeros((views.n_views, 3, 3)), np.zeros((views.n_views, 3))
         R[members], t[members] = adjusted.state.R, adjusted.state.t
         state, record = self._with_random_poses(
-            replace(adjusted.state, R=R, t=t), replace(record, agreed=agreed), ~able
+            replace(adjusted.state, R=R, t=t), replace(record, agreed=agreed), ~able, self.many_starts
         )
         return try_mirrored(self.problem, self.problem.adjust(replace(adjusted, state=state))), record
 
@@ -187,18 +187,18 @@ class _Search:
         if able.any():
             groups, record = train_networks(problem, self.options, self.rng, able)
         state = cameras_from_products(problem, groups, problem.normalised_entries[None])
-        state, record = self._with_random_poses(state, record, ~able)
+        state, record = self._with_random_poses(state, record, ~able, self.many_starts)
         best, record = self._constrained(state, record)
         best = try_mirrored(problem, best)
         late = short_of_bound(problem, best, groups) | (able & (record.agreed < 2))
         if late.any():
-            state, record = self._with_random_poses(best.state, record, late)
+            state, record = self._with_random_poses(best.state, record, late, self.options.starts)
             best = better_by_view(problem, best, problem.adjust(state))
         refuse_mirrored(problem, best, groups)
         return best, record
 
     def _with_random_poses(
-        self, state: CameraState, record: TrainingRecord, which: NDArray[np.bool_]
+        self, state: CameraState, record: TrainingRecord, which: NDArray[np.bool_], starts: int
     ) -> tuple[CameraState, TrainingRecord]:
         """The state with some views' poses found from random rotations."""
         members = np.flatnonzero(which)
@@ -206,7 +206,6 @@ class _Search:
             return state, record
         from neurocal_cli.initialisation.random_cameras import find_poses
 
-        starts = max(self.options.starts, _FEW_POINT_STARTS)
         found = find_poses(self.views, members, state.entries, self.rng, starts)
         R, t = state.R.copy(), state.t.copy()
         R[members], t[members] = found.state.R, found.state.t
