@@ -55,6 +55,9 @@ _LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in on
 # Share of the gain required by the criterion that the rational model must predict; with less, it was never
 # selected (tests/test_model_selection.py, slow: 100 scenes).
 _PROMISING = 0.5
+# The selection admits a model with this number of coefficients more than another one only if it lowers the
+# rms error of held-out data by this factor.
+MORE, FAR_BETTER = 2, 1.25
 _ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
 _SPARE = 1.3  # fewest equations per unknown
@@ -233,7 +236,7 @@ class _Chain:
             c.not_monotonic == "image"
             and not c.noise
             and c.cost <= _BEHIND * lowest
-            and self.wanted in (None, c.problem.distortion.model)
+            and (self.wanted == c.problem.distortion.model if self.wanted else not _too_rich(c, fitted))
             for c in fitted
         ]
         if not any(near) or falls_short(self.problem.views, fitted):
@@ -280,6 +283,16 @@ class _Chain:
         bad = folds_back(problem, state)
         determined = _determined(problem, state, cov)
         return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
+
+
+def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
+    """Whether a sound model with far fewer coefficients predicts too well for this one to be selected."""
+    return any(
+        c.sound
+        and c.coefficients + MORE < candidate.coefficients
+        and c.held_out <= FAR_BETTER**2 * candidate.held_out
+        for c in fitted
+    )
 
 
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:

@@ -35,6 +35,8 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.distortion.candidate_models import (
+    FAR_BETTER,
+    MORE,
     Candidate,
     falls_short,
     fit_candidates,
@@ -55,8 +57,6 @@ _CERTAIN = 2.0
 _DECIDEDLY = 1.03
 _FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
-_FAR_BETTER = 1.25  # factor that admits more coefficients than the criterion favours
-_MORE = 2  # number of coefficients beyond the criterion's choice that is admitted
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
 _DECISIVE = 10.0  # difference of the criterion: odds of 150
 _CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
@@ -187,7 +187,7 @@ def _best(
     n = worth(views, eligible.values()) * repeated.worth
     sound = _eligible(_without_wide(fitted, n), views.n_views > 1)
     criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
-    most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
+    most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + MORE
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
     few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
     if not few:
@@ -196,7 +196,7 @@ def _best(
         name: candidate
         for name, candidate in finite.items()
         if name in few
-        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, _FAR_BETTER) for c in few.values())
+        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, FAR_BETTER) for c in few.values())
     }
     best = min(pool, key=lambda name: pool[name].held_out)
     good = {
