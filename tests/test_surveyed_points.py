@@ -26,7 +26,7 @@ from neurocal_cli.target_shape.find import sight_of
 from neurocal_cli.target_shape.information import Information, information_of
 from neurocal_cli.target_shape.posterior import known_sizes
 from neurocal_cli.target_shape.prior import Prior, surveyed_prior
-from neurocal_cli.target_shape.system import System
+from neurocal_cli.target_shape.system import PointsFirst, PosesFirst
 
 OPTIONS = {"distortion": "none", "skew": False}
 
@@ -57,21 +57,14 @@ def test_the_covariances_are_those_of_the_whole_dense_system(monkeypatch: pytest
         H[at, at] = info.point[k] + 0.09 * np.diag((2 * prior.stated[k]) ** -2)
     inverse = np.linalg.inv(np.tril(H) + np.tril(H, -1).T)
 
-    class PosesFirst(System):
-        def __init__(self, info: Information, prior: Prior) -> None:
-            super().__init__(info, prior)
-            if self.points_first:
-                self.points_first = False
-                self._eliminate_poses()
-
-    for _ in range(2):
+    for solved_by in (PointsFirst, PosesFirst):
+        monkeypatch.setattr(posterior_module, "system_of", solved_by)
         found = known_sizes(info, prior, {"stated": 2.0}, 0.09)
         np.testing.assert_allclose(found.camera, inverse[c, c], rtol=1e-6)
         np.testing.assert_allclose(found.std.ravel(), 0.3 * np.sqrt(np.diagonal(inverse)[d]), rtol=1e-6)
         for k in range(P):
             at = slice(f + 6 * k, f + 6 * k + 6)
             np.testing.assert_allclose(found.poses[k], inverse[at, at], rtol=1e-5, atol=1e-12)
-        monkeypatch.setattr(posterior_module, "System", PosesFirst)
 
 
 def test_stated_standard_deviations_make_camera_and_points_better() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -24,12 +24,13 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.target import distinct_points, planes_of
 from neurocal_cli.target_shape import find as find_module
 from neurocal_cli.target_shape import posterior as posterior_module
+from neurocal_cli.target_shape.coordinates import coordinates_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, evidence_as_given, find_target, sight_of
-from neurocal_cli.target_shape.information import Information, information_of
+from neurocal_cli.target_shape.information import Information, folded_information, information_of, joined
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
-from neurocal_cli.target_shape.posterior import evidence_of_given, known_sizes, posterior
+from neurocal_cli.target_shape.posterior import evidence_of_given, known_sizes, posterior, prior_covariance
 from neurocal_cli.target_shape.prior import Prior, prior_of
-from neurocal_cli.target_shape.system import System
+from neurocal_cli.target_shape.system import PointsFirst, PosesFirst
 
 PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 TOO_SIMPLE = tuple(
@@ -90,22 +91,66 @@ def test_the_evidence_of_the_given_target_needs_no_derivatives_by_its_points() -
 
 def test_points_first_and_poses_first_solve_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     info, prior = equations(photographed("both", 2, 6, amount=0.1)[0])
+    monkeypatch.setattr(posterior_module, "system_of", PointsFirst)
     one = known_sizes(info, prior, SIZES, 0.01)
-
-    class PosesFirst(System):
-        def __init__(self, info: Information, prior: Prior) -> None:
-            super().__init__(info, prior)
-            assert self.points_first
-            self.points_first = False
-            self._eliminate_poses()
-
-    monkeypatch.setattr(posterior_module, "System", PosesFirst)
+    monkeypatch.setattr(posterior_module, "system_of", PosesFirst)
     other = known_sizes(info, prior, SIZES, 0.01)
     for name in ("offsets", "camera_step", "camera", "followed", "std"):
         a, b = getattr(one, name), getattr(other, name)
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7 * np.abs(a).max(), err_msg=name)
     assert one.evidence == pytest.approx(other.evidence, abs=1e-5)
     assert one.determined == pytest.approx(other.determined, rel=1e-6)
+
+
+@pytest.mark.parametrize("solved_by", [PointsFirst, PosesFirst])
+def test_a_changed_stretch_is_solved_as_if_from_the_beginning(
+    solved_by: type[PointsFirst | PosesFirst],
+) -> None:
+    system = solved_by(*equations(photographed("both", 2, 6, amount=0.1)[0]))
+    ratios = {name: 10.0 * size for name, size in SIZES.items()}
+    before = system.solve(ratios | {"stretch": 1e-4})
+    for size in (1e-4, 2.0):
+        changed = ratios | {"stretch": size}
+        one, other = before.changed(changed, "stretch"), system.solve(changed)
+        assert one.cost == pytest.approx(other.cost, rel=1e-9)
+        assert one.logdet == pytest.approx(other.logdet, abs=1e-6)
+        for a, b in ((one.offsets, other.offsets), (one.camera, other.camera)):
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8 * np.abs(b).max())
+        for name, part in other.parts.items():
+            assert one.parts[name].squares == pytest.approx(part.squares, rel=1e-6, abs=1e-12)
+            assert one.parts[name].determined == pytest.approx(part.determined, rel=1e-6, abs=1e-9)
+        np.testing.assert_allclose(one.joint().offset_root, other.joint().offset_root)
+        before = one
+
+
+def test_coordinates_are_independent_under_the_prior() -> None:
+    _, prior = equations(photographed("flat", 1, 4)[0])
+    coordinates, covariance = coordinates_of(prior), prior_covariance(prior, SIZES)
+    basis = coordinates.offsets(np.eye(len(coordinates.variances(SIZES)))).reshape(-1, len(covariance))
+    np.testing.assert_allclose(
+        (basis.T * coordinates.variances(SIZES)) @ basis, covariance, atol=1e-12 * covariance.max()
+    )
+    np.testing.assert_allclose(coordinates.precision(SIZES) @ covariance, np.eye(len(covariance)), atol=1e-8)
+    rows = np.random.default_rng(0).standard_normal((len(covariance), 2))
+    np.testing.assert_allclose(coordinates.of_rows(rows), basis @ rows, atol=1e-12 * np.abs(basis).max())
+
+
+def test_the_folds_of_the_views_sum_up_to_all() -> None:
+    points, _ = photographed("both", 1, 7, amount=0.1)
+    for some in (points, points.select(np.arange(len(points)) % 11 > 0)):  # the latter with gaps
+        problem, adjusted = minimum(some)
+        _, label, _ = distinct_points([some])
+        sight = sight_of(problem, adjusted, label)
+        folded = folded_information([sight], 63, [np.arange(7) % 3])
+        parts = folded.parts(folded.whole, lambda info: info)
+        for k, part in enumerate(parts):
+            own = information_of([sight.of_views(np.arange(k, 7, 3))], 63)
+            for field in fields(Information):
+                a, b = getattr(part, field.name), getattr(own, field.name)
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0))
+        whole = information_of([sight], 63)
+        assert joined(parts).cost == pytest.approx(whole.cost)
+        np.testing.assert_allclose(joined(parts).point_camera, whole.point_camera, rtol=1e-9, atol=1e-6)
 
 
 def test_the_posterior_is_that_of_the_whole_dense_system() -> None:

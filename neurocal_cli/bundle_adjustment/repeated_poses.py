@@ -23,7 +23,7 @@ from neurocal_cli.least_squares.leave_out import folds_of
 # thousand random views are called the same.
 _STILL = 1.0  # px by which the target's points may move, or
 _NOISE = 3.0  # this many standard deviations of their noise, if that is more
-_ROWS = 1000  # rows of the distance matrix computed at a time
+_ROWS = 100  # rows of the distance matrix computed at a time: they stay in the cache
 
 
 @frozen_dataclass(eq=False)

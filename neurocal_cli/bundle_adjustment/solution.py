@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.units import in_pixels
@@ -60,6 +61,30 @@ class TrainingRecord:
         )
 
 
+class TargetPosterior(Protocol):
+    """What the posterior of an estimated target tells of its camera; see `target_shape.posterior`."""
+
+    @property
+    def variance(self) -> float:
+        """Variance of the noise [px^2]."""
+
+    @property
+    def camera(self) -> Array:
+        """(f, f) covariance of the free parameters for unit noise, with the offsets marginalised."""
+
+    @property
+    def poses(self) -> Array | None:
+        """(P, 6, 6) covariance of each pose for unit noise."""
+
+    @property
+    def followed(self) -> Array:
+        """(f, n, 3) regression of the cameras' scores on those of the offsets, along each point's axes."""
+
+    @property
+    def determined(self) -> float:
+        """Effective number of the offsets' unknowns that the data determine."""
+
+
 @frozen_dataclass(eq=False)
 class Solution:
     """Solution of a problem, in normalised units."""
@@ -83,6 +108,8 @@ class Solution:
     refusal: str = ""  # why this solution must be refused; empty if it is valid
     # The target if it was estimated with the camera; the problem's points are then those of the target.
     target: Target | None = None
+    # A minimum, and a function that returns the posterior of the target there for a noise variance [px^2].
+    target_posterior: tuple[Adjusted, Callable[[float], TargetPosterior]] | None = None
     target_kept: bool = False  # whether the given target was kept although it could have been estimated
     ambiguity: Ambiguity | None = None  # other cameras that explain the points equally well
     of_all: Solution | None = None  # the fit of all points, if some were rejected afterwards
@@ -96,6 +123,11 @@ class Solution:
     def residuals(self) -> Array:
         """(N, 2) normalised residuals of the points, in the order of the problem's views."""
         return point_residuals(self.problem.views, self.state)
+
+    @cached_property
+    def repeated(self) -> RepeatedPoses:
+        """Which views repeat a pose."""
+        return repeated_poses(self.problem.views, self.state, self.residuals)
 
     @cached_property
     def covariance(self) -> Covariance:

@@ -10,9 +10,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
-from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.target_shape.find import Found, evidence_as_given
@@ -96,7 +94,7 @@ def _changes_between_views(solution: Solution, found: Found) -> bool:
     views, free = problem.views, problem.free_camera
     if not problem.free.any():
         return False
-    repeated = repeated_poses(views, adjusted.state, point_residuals(views, adjusted.state))
+    repeated = solution.repeated
     spare = views.n_equations - problem.n_parameters
     scores = scores_of_poses(adjusted.normal, free, problem.free_poses, repeated)
     variance = float(adjusted.cost.sum()) / spare

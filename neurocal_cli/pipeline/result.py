@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +18,8 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     with_scale,
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.bundle_adjustment.solution import Solution, TargetPosterior
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
@@ -45,13 +46,13 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    errors = solution.residuals
-    repeated = repeated_poses(views, state, errors)
+    errors, repeated = solution.residuals, solution.repeated
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
-            problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
-            solution.by_prior, solution.target_kept, solution.covariance if solution.target is None else None,
+            problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
+            solution.shared, solution.by_prior, solution.target_kept,
+            solution.covariance if solution.target is None else None,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
@@ -110,6 +111,12 @@ def calibration_of(
             *_rejection_warnings(rejected, len(problem.points)),
         ),
     )
+
+
+def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
+    """The posterior of the target for a variance, unless the camera has been adjusted again."""
+    adjusted, posterior = solution.target_posterior or (None, None)
+    return posterior if adjusted is solution.adjusted else None
 
 
 def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | None) -> Array:

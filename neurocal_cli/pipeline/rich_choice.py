@@ -15,7 +15,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_views
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
@@ -53,10 +53,9 @@ def with_rich_lens(
     if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:
         return solution, rejected
     views = solution.problem.views
-    errors = point_residuals(views, solution.state)
-    if views.n_views < _FEWEST or correlation(views, errors) < _ALIKE:
+    if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return solution, rejected
-    repeated = repeated_poses(views, solution.state, errors)
+    repeated = solution.repeated
     if repeated.n_poses < _FEWEST:
         return solution, rejected
     rich = _rich(solution, repeated)

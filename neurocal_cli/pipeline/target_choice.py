@@ -14,8 +14,6 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
-from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
@@ -101,7 +99,17 @@ def _searched(
         if found is None:
             break
         (new, adjusted), *_ = found.fits
-        best = replace(again[0], problem=new, adjusted=adjusted, target=found.target), again[1]
+        known_there = None if found.posterior is None else (adjusted, found.posterior)
+        best = (
+            replace(
+                again[0],
+                problem=new,
+                adjusted=adjusted,
+                target=found.target,
+                target_posterior=known_there,
+            ),
+            again[1],
+        )
         if new.distortion.model == lens:
             break
     return best
@@ -168,15 +176,14 @@ def _noise_of_views(problem: Problem, adjusted: Adjusted) -> float:
 
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     """Whether there are enough independent views to estimate the target."""
-    problem, views = solution.problem, solution.problem.views
+    problem = solution.problem
     points = problem.points if known is None else known.straightened(problem.points)
     given, label, point = distinct_points([points])
-    repeated = repeated_poses(views, solution.state, point_residuals(views, solution.state))
     plane = planes_of(given, point) if known is None else known.plane
-    if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
+    if not enough_views(label, solution.repeated.n_poses, int(plane.max()) + 1):
         return False
     # Errors common to repeated views look like errors of the target.
-    return choice != "auto" or not repeated.worth < _WORTH
+    return choice != "auto" or not solution.repeated.worth < _WORTH
 
 
 def _is_where_it_was(found: Found, again: Solution) -> bool:

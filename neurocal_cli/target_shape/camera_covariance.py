@@ -19,6 +19,7 @@ from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.bundle_adjustment.solution import TargetPosterior
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -62,6 +63,8 @@ class CameraSeen:
     repeated: RepeatedPoses
     points: Correspondences  # with the world coordinates of the estimated target, if any
     target: Target | None = None  # the estimated target
+    # Function that returns the posterior of the target for a variance of the noise, if there is one already.
+    posterior: Callable[[float], TargetPosterior] | None = None
     # Candidate models of the distortion selection; empty if the user named the model.
     choice: Collection[str] = ()
     shared: Array | None = None  # (f, f) covariance of the free parameters, if it comes from elsewhere
@@ -105,7 +108,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
     """
     asked = seen.free, seen.free_poses
-    basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
+    basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared, seen.posterior)
     plain = seen.plain or covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
     if basis.poses is not None:
         plain = replace(plain, poses=basis.poses)
@@ -184,10 +187,17 @@ def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
 
 
 def _basis(
-    seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
+    seen: CameraSeen,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    normal: Array,
+    shared: Array | None = None,
+    posterior: Callable[[float], TargetPosterior] | None = None,
 ) -> CovarianceBasis:
     if seen.target is None:
         return CovarianceBasis(normal, shared, seen.views.n_equations)
     from neurocal_cli.target_shape.uncertainty import covariance_basis
 
-    return covariance_basis(seen.target, seen.views, state, free, seen.free_poses, seen.points, normal)
+    return covariance_basis(
+        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, posterior
+    )

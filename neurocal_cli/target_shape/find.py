@@ -6,8 +6,9 @@ and poses to their minimum for the updated target.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +26,20 @@ from neurocal_cli.target_shape.bend_evidence import bends_are_valid, most_probab
 from neurocal_cli.target_shape.information import (
     Information,
     Sight,
+    folded_information,
     information_of,
     of_views,
     steps_of_poses,
 )
-from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
+from neurocal_cli.target_shape.posterior import (
+    Posterior,
+    evidence_of_given,
+    given_posterior,
+    posterior,
+    posterior_of,
+)
 from neurocal_cli.target_shape.prior import prior_of
-from neurocal_cli.target_shape.target_validation import passes_cross_validation
+from neurocal_cli.target_shape.target_validation import folds_of, passes_cross_validation
 
 _STEPS = 10
 # Unknowns of the dense system: with more than the first, only some views are used; with more than the second,
@@ -58,12 +66,14 @@ class Found:
     """An estimated target, with the problems and their minima for it.
 
     The points of each problem have the target's coordinates. The log evidence is comparable between
-    distortion models.
+    distortion models. For a variance of the noise [px^2], `posterior` returns the posterior at this minimum;
+    it is None if not all views were used.
     """
 
     target: Target
     fits: tuple[tuple[Problem, Adjusted], ...]
     evidence: float
+    posterior: Callable[[float], Posterior] | None = None
 
 
 def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
@@ -145,7 +155,7 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
         points = problem.points if known is None else known.as_given(problem.points)
         world = found.target.applied(points).world
         moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
-    return replace(found, fits=tuple(moved))
+    return replace(found, fits=tuple(moved), posterior=None)
 
 
 class Search:
@@ -199,7 +209,7 @@ class Search:
         noise: float | None = None
         last = 0.0
         for step in range(_STEPS):
-            here = self.information()
+            here = information_of(self.sights(), len(self.given)).turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             info = self._around_given(here)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
@@ -218,36 +228,49 @@ class Search:
             # The next step would be shorter than this one by the same factor as this one than the last.
             settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
             last = length
-            if not self._move(found, info):
+            states = self._moved(found, info)
+            if states is None:
                 return None
-            if settled:
+            if settled or step == _STEPS - 1:
                 break
-        if found.evidence - self._without(info) < least_gain or not self._passes_cross_validation(found):
+            if not self._adjust(states, _ITERATIONS):
+                return None
+        assert states is not None
+        if found.evidence - self._without(info) < least_gain or not self._adjust(self._aligned(states)):
             return None
-        self._align()
+        folds = folds_of([problem.views.n_views for problem, _ in self.fits])
+        folded = folded_information(self.sights(), len(self.given), folds)
+        whole = self._in_offsets(folded.whole)
+        if not self._passes_cross_validation(found, folded.parts(self._held(whole), self._in_offsets)):
+            return None
         target = self._target(found, found.evidence - evidence_of_given(info.straight()))
         if not target.stretch() < self.most_stretched:
             return None
-        return Found(target, tuple(self.fits), found.evidence)
+        posterior_here = partial(posterior_of, target, whole, self.prior)
+        return Found(target, tuple(self.fits), found.evidence, posterior_here)
 
     def _without(self, info: Information) -> float:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
 
-    def _passes_cross_validation(self, found: Posterior) -> bool:
-        sights = self.sights()
-        if self.surface is not None and not bends_are_valid(sights[0], self.bends, self.precision):
+    def _passes_cross_validation(self, found: Posterior, parts: list[Information]) -> bool:
+        if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
             return False
-        return self.still or passes_cross_validation(
-            sights, self.prior, self.offsets, found.sizes, found.variance, self.precision
-        )
+        return self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)
 
     def _around_given(self, info: Information) -> Information:
         """The quadratic in the whole offsets; with bends, also with their prior of the most probable size."""
-        if self.surface is None:
-            return info.around_given(self.offsets)
-        self.precision = most_probable_precision(info, self.prior.size)
-        return info.around_given(self.offsets).held(self.precision)
+        if self.surface is not None:
+            self.precision = most_probable_precision(info, self.prior.size)
+        return self._held(info.around_given(self.offsets))
+
+    def _held(self, info: Information) -> Information:
+        """With bends, add their prior."""
+        return info if self.surface is None else info.held(self.precision)
+
+    def _in_offsets(self, info: Information) -> Information:
+        """The quadratic around the current target, in the whole offsets along each point's axes."""
+        return info.turned(self.prior.axes).around_given(self.offsets)
 
     def sights(self) -> list[Sight]:
         """Observations of each camera for the current target."""
@@ -256,10 +279,6 @@ class Search:
             return sights
         shapes = self.surface.offsets(self._common())
         return [replace(sight, shapes=shapes, bends=self.bends) for sight in sights]
-
-    def information(self) -> Information:
-        """The quadratic around the current target."""
-        return information_of(self.sights(), len(self.given)).turned(self.prior.axes)
 
     def _common(self) -> Array:
         """(n, 3) current common points of all views."""
@@ -273,19 +292,23 @@ class Search:
         shapes = self.surface.offsets(common)[self.label[k]]
         return common[self.label[k]] + (shapes @ self.bends[points.view_index][..., None])[..., 0]
 
-    def _move(self, found: Posterior, info: Information) -> bool:
+    def _moved(self, found: Posterior, info: Information) -> list[CameraState] | None:
+        """Move the target, and return the cameras' predicted states in pixels; None if it moves too far."""
         if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
-            return False
+            return None
         own = steps_of_poses(info, found.camera_step, found.offsets)
         if self.surface is not None:
             self.bends = own[:, 6:]
             bent = self.surface.offsets(self._common()) @ self.bends.T
             if not np.abs(bent).max() < _LARGEST * self.prior.size:
-                return False
+                return None
         self.offsets, self.sizes = found.offsets, found.sizes
-        moved = self._predicted(found.camera_step, own[:, :6])
+        return self._predicted(found.camera_step, own[:, :6])
+
+    def _adjust(self, states: list[CameraState], iterations: int = OPTIONS.max_iterations) -> bool:
+        """Adjust the cameras to the current target, from states in pixels; whether that succeeded."""
         self.fits = [
-            at_world(*self.fits[k], state, self._world(k), _ITERATIONS) for k, state in enumerate(moved)
+            at_world(*self.fits[k], state, self._world(k), iterations) for k, state in enumerate(states)
         ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
@@ -303,25 +326,23 @@ class Search:
             states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
         return states
 
-    def _align(self) -> None:
-        """Rotate, shift and scale the target to be nearest to the given one, and adjust the cameras to it.
+    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
+        """Rotate, shift and scale the target to be nearest to the given one, and the cameras with it.
 
         Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
-            self.fits = [(problem, problem.adjust(adjusted)) for problem, adjusted in self.fits]
-            return
+            return states
         world = self._common()
         s, R, t = nearest_similarity(world, self.given)
         held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
         s, t = held * s, held * t
         world = s * world @ R.T + t
         self.offsets = self.prior.along_axes(world - self.given)
-        for k, (problem, adjusted) in enumerate(self.fits):
-            state = in_pixels(problem, adjusted.state)
-            turned = state.R @ R.T
-            state = replace(state, R=turned, t=s * state.t - turned @ t)
-            self.fits[k] = at_world(problem, adjusted, state, self._world(k))
+        turned = [state.R @ R.T for state in states]
+        return [
+            replace(state, R=own, t=s * state.t - own @ t) for state, own in zip(states, turned, strict=True)
+        ]
 
     def _target(self, found: Posterior, gain: float) -> Target:
         axes = self.prior.axes

@@ -7,7 +7,8 @@ coupled only through c and d, and different points only through c and q, so both
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import operator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -98,6 +99,26 @@ class Information:
             cost=self.cost + float((bends * cost).sum()),
         )
 
+    def with_poses_of(self, other: Information, which: NDArray[np.bool_] | slice) -> Information:
+        """The same sums, with the blocks of some poses (P,) of another."""
+        return replace(
+            self,
+            pose=other.pose[which],
+            pose_camera=other.pose_camera[which],
+            pose_right=other.pose_right[which],
+            pose_point=other.pose_point[which],
+        )
+
+    def of_cameras(self, kept: NDArray[np.bool_]) -> Information:
+        """The quadratic in some parameters (f,) of the cameras, where the others are held."""
+        return replace(
+            self,
+            camera=self.camera[np.ix_(kept, kept)],
+            camera_right=self.camera_right[kept],
+            pose_camera=self.pose_camera[:, :, kept],
+            point_camera=self.point_camera[:, :, kept],
+        )
+
     def pose_by(self, offsets: Array) -> Array:
         """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
         P, p = self.pose.shape[:2]
@@ -141,24 +162,67 @@ class Information:
         )
 
 
+@frozen_dataclass(eq=False)
+class FoldedInformation:
+    """Information of all views, and of each fold of the views."""
+
+    whole: Information
+    sums: list[Information]  # of each fold, without the blocks of its poses
+    fold: NDArray[np.intp]  # (P,) of each pose
+
+    def parts(self, whole: Information, change: Callable[[Information], Information]) -> list[Information]:
+        """Information of each fold after a change; that of all views has been changed already."""
+        return [change(some).with_poses_of(whole, self.fold == k) for k, some in enumerate(self.sums)]
+
+
 def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     """Sum over the observations of all cameras; each camera has its own free parameters and poses."""
+    one_fold = [np.zeros(sight.views.n_views, dtype=np.intp) for sight in sights]
+    return folded_information(sights, n_points, one_fold).whole
+
+
+def folded_information(
+    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]]
+) -> FoldedInformation:
+    """The same, and the sums over each fold; `folds` (V,) are the folds of each camera's views, from 0."""
+    n_folds = 1 + max(int(fold.max()) for fold in folds)
     widths = [int(sight.free.sum()) for sight in sights]
     poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
     f, P = sum(widths), sum(poses)
     p = 6 if sights[0].shapes is None else 6 + N_SHAPES
-    found = Information(
-        np.zeros((f, f)), np.zeros(f), np.zeros((P, p, p)), np.zeros((P, p, f)), np.zeros((P, p)),
-        np.zeros((n_points, 3, 3)), np.zeros((n_points, 3, f)), np.zeros((n_points, 3)),
-        np.zeros((P, p, n_points, 3)), 0.0, sum(sight.views.n_equations for sight in sights),
+    found = Information(  # the sums have one more axis, for the folds
+        np.zeros((n_folds, f, f)), np.zeros((n_folds, f)), np.zeros((P, p, p)), np.zeros((P, p, f)),
+        np.zeros((P, p)), np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f)),
+        np.zeros((n_folds, n_points, 3)), np.zeros((P, p, n_points, 3)), 0.0, 0.0,
     )  # fmt: skip
-    cost = 0.0
+    cost, equations, of_poses = np.zeros(n_folds), np.zeros(n_folds), []
     ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
-    for sight, width, count, (end, last) in zip(sights, widths, poses, ends, strict=True):
-        cost += _add(found, sight, slice(end - width, end), slice(last - count, last))
-    found = replace(found, cost=cost)
+    for sight, of_views, width, count, (end, last) in zip(sights, folds, widths, poses, ends, strict=True):
+        cost += _add(found, sight, slice(end - width, end), slice(last - count, last), of_views)
+        equations += np.bincount(of_views, sight.views.equations, n_folds)
+        of_poses.append(of_views[:count])
+    fold = np.concatenate(of_poses)
     bends = [sight.bends for sight in sights if sight.bends is not None]
-    return found.around_straight(np.concatenate(bends)) if bends else found
+
+    def sums(taken: Callable[[Array], Any], of: NDArray[np.bool_] | slice) -> Information:
+        info = replace(
+            found.with_poses_of(found, of),
+            camera=taken(found.camera),
+            camera_right=taken(found.camera_right),
+            point=taken(found.point),
+            point_camera=taken(found.point_camera),
+            point_right=taken(found.point_right),
+            cost=float(taken(cost)),
+            equations=float(taken(equations)),
+        )
+        return info.around_straight(np.concatenate(bends)[of]) if bends else info
+
+    whole = sums(lambda values: values.sum(axis=0), slice(None))
+    of_folds = []
+    for k in range(n_folds):
+        own = fold == k if bends else slice(0)  # bends add products with the blocks of poses to the sums
+        of_folds.append(sums(operator.itemgetter(k), own).with_poses_of(found, slice(0)))
+    return FoldedInformation(whole, of_folds, fold)
 
 
 def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
@@ -176,27 +240,30 @@ def joined(parts: Sequence[Information]) -> Information:
     return Information(**blocks)
 
 
-def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
-    """Add the observations of one camera; return its cost."""
+def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> Array:
+    """Add the observations of one camera to the sums of the folds (V,) of its views; return their costs."""
     views = sight.views
     columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
-    label = labelled(views, sight.label)
-    terms = point_terms(
-        views.batches, sight.state, views.scale, label, columns, len(found.point), sight.shapes
+    label, (n_folds, n_points) = labelled(views, sight.label), found.point.shape[:2]
+    # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
+    cross = found.pose_point[poses] if sight.free_poses else None
+    terms = folded_terms(
+        views.batches, sight.state, views.scale, label, columns, n_points, fold, n_folds, sight.shapes, cross
     )
     normal, px2 = terms.normal, views.pixel_scale**2
-    found.camera[own, own] += px2 * normal[:, columns[:, None], columns].sum(axis=0)
-    found.camera_right[own] += px2 * normal[:, columns, -1].sum(axis=0)
+    by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
+    found.camera[:, own, own] += by_fold[:, columns[:, None], columns]
+    found.camera_right[:, own] += by_fold[:, columns, -1]
     found.point[...] += px2 * terms.point
-    found.point_camera[:, :, own] += px2 * terms.point_camera
+    found.point_camera[..., own] += px2 * terms.point_camera
     found.point_right[...] += px2 * terms.point_right
     if sight.free_poses:
         of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
         found.pose[poses] = px2 * normal[:, of_pose[:, None], of_pose]
         found.pose_camera[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
         found.pose_right[poses] = px2 * normal[:, of_pose, -1]
-        found.pose_point[poses] = px2 * terms.pose_point
-    return px2 * float(normal[:, -1, -1].sum())
+        found.pose_point[poses] *= px2
+    return np.asarray(by_fold[:, -1, -1])
 
 
 @frozen_dataclass(eq=False)
@@ -204,7 +271,7 @@ class PointTerms:
     """Sums of products with the derivatives by the target points, for one camera, normalised.
 
     `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
-    the residual. The rest is as in `Information`.
+    the residual. The rest is as in `Information`; from `folded_terms`, sums over views have one more axis.
     """
 
     normal: Array
@@ -228,26 +295,54 @@ def point_terms(
     `scale` (V,) is S2 of each view, `label` (T, n) from `labelled`, `columns` (f,) those of the camera's free
     parameters, and `shapes` as in `Sight`.
     """
+    fold = np.zeros(batches.n_views, dtype=np.intp)
+    terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1, shapes)
+    return replace(
+        terms, point=terms.point[0], point_camera=terms.point_camera[0], point_right=terms.point_right[0]
+    )
+
+
+def folded_terms(
+    batches: PointBatches,
+    state: CameraState,
+    scale: Array,
+    label: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    n_points: int,
+    fold: NDArray[np.intp],
+    n_folds: int,
+    shapes: Array | None = None,
+    out: Array | None = None,
+) -> PointTerms:
+    """The same sums over each of `n_folds` folds (V,) of the views.
+
+    `out` (V, p, n, 3) are zeros that become those of poses and points.
+    """
     f, V, by_batch = len(columns), batches.n_views, blocks_by_batch(batches, state, shapes)
     whole = by_batch.shape[1]
     of_pose = pose_columns(whole, shapes is not None)
     p, kept = len(of_pose), np.append(columns, whole - 1)
     once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
     alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
-    summed, cross = np.zeros((n_points, 3, f + 4)), np.zeros((V, p, n_points, 3))
+    summed = np.zeros((n_folds, n_points, 3, f + 4))
+    cross = np.zeros((V, p, n_points, 3)) if out is None else out
     for chunk, part, by_point in linearised(batches, state, scale, label[:1] if alike else label, shapes):
         view, seen = batches.view[chunk], label[chunk]
         products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, kept]], axis=1)
         crossed = np.swapaxes(_of_each(part[:, of_pose], by_point), 2, 3)  # (T, p, n, 3)
         if alike:
-            own = by_point.transpose(3, 1, 0, 2).reshape(seen.shape[1], 3, -1)
-            summed[seen[0]] += own @ rows.transpose(3, 0, 2, 1).reshape(seen.shape[1], -1, f + 4)
+            own, rows = by_point.transpose(3, 1, 0, 2), rows.transpose(3, 0, 2, 1)
+            n = len(own)
+            for k in range(n_folds):
+                of = fold[view] == k if n_folds > 1 else slice(None)
+                summed[k, seen[0]] += own[:, :, of].reshape(n, 3, -1) @ rows[:, of].reshape(n, -1, f + 4)
             cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
             continue
         real = seen >= 0
         every, flat = np.moveaxis(_of_each(by_point, rows), 3, 1)[real], seen[real]
-        summed += _summed_by(flat, every.reshape(len(flat), -1), n_points).reshape(summed.shape)
+        place = (fold[view][:, None] * n_points + seen)[real]
+        summed += _summed_by(place, every.reshape(len(flat), -1), n_folds * n_points).reshape(summed.shape)
         places = np.broadcast_to(view[:, None], real.shape)[real], flat
         each = np.swapaxes(crossed, 1, 2)[real]
         if once:
@@ -255,7 +350,7 @@ def point_terms(
         else:
             np.add.at(np.swapaxes(cross, 1, 2), places, each)
     return PointTerms(
-        batches.sum_by_view(by_batch), summed[:, :, :3], summed[:, :, 3:-1], summed[:, :, -1], cross
+        batches.sum_by_view(by_batch), summed[..., :3], summed[..., 3:-1], summed[..., -1], cross
     )
 
 

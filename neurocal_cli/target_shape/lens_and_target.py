@@ -14,8 +14,8 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.open_coefficients import log_prior, radius
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
-from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+from neurocal_cli.bundle_adjustment.reprojection import camera_columns, normal_blocks
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 
@@ -64,17 +64,26 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
     """
     end = len(POLYNOMIAL_MODELS)
     places = [_PLACES.get(a.state.model, end) if problem.free[0] else end for problem, a in fits]
+    if min(places) >= end - 1:
+        return False
     least = 0.5 * (evidence_as_given(fits) + found.evidence)
+    richest = [
+        _linearised_with(*fit, POLYNOMIAL_MODELS[-1]) if own < end else fit
+        for fit, own in zip(fits, places, strict=True)
+    ]
     for place in range(min(places) + 1, end):
+        model = POLYNOMIAL_MODELS[place]
+        richer = [
+            _without_last(*linearised, model) if own < place else fit
+            for fit, linearised, own in zip(fits, richest, places, strict=True)
+        ]
         # A linear prediction that reaches less than half of the found target's gain settles it.
-        for richer_of, wanted in ((_linearised_with, least), (_adjusted_with, found.evidence)):
-            richer = [
-                richer_of(*fit, POLYNOMIAL_MODELS[place]) if own < place else fit
-                for fit, own in zip(fits, places, strict=True)
-            ]
-            if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > wanted:
-                break
-        else:
+        if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > least:
+            continue
+        richer = [
+            _adjusted_with(*fit, model) if own < place else fit for fit, own in zip(fits, places, strict=True)
+        ]
+        if evidence_as_given(richer) + _log_prior_of_added(fits, richer) > found.evidence:
             return True
     return False
 
@@ -96,4 +105,13 @@ def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Pr
 def _linearised_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
     state = adjusted.state.with_model(model)
     normal, _ = normal_blocks(problem.views.batches, state)
+    return problem.with_model(model), replace(adjusted, state=state, normal=normal)
+
+
+def _without_last(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    """A simpler model's linearisation from that of a richer one, whose last coefficients are left out."""
+    n = len(coefficient_names(model))
+    kept = np.append(np.arange(camera_columns(n)[-1] + 1), -1)
+    state = replace(adjusted.state, model=model, k=adjusted.state.k[:n])
+    normal = adjusted.normal[:, kept[:, None], kept]
     return problem.with_model(model), replace(adjusted, state=state, normal=normal)

@@ -18,7 +18,7 @@ The evidence, with the noise variance marginalised as well, decides whether ther
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -26,9 +26,10 @@ import numpy as np
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
+from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.prior import STRETCH, Prior
-from neurocal_cli.target_shape.system import Solved, System
+from neurocal_cli.target_shape.prior import STATED, STRETCH, Prior
+from neurocal_cli.target_shape.system import JointCovariance, Solved, system_of
 
 
 @frozen_dataclass(eq=False)
@@ -42,38 +43,36 @@ class Posterior:
     sizes: dict[str, float]  # of the prior's parts, by name [world unit]
     determined: float  # effective number of the offsets' unknowns that the data determine
     evidence: float  # log evidence, with a flat prior on the cameras' normalised parameters
-    # The solution, its prior and the gauge (3 n, g); None if the points stay as given.
-    solved: tuple[Solved, Prior, Array] | None = None
+    # The covariance of cameras, offsets and poses and the gauge (3 n, g); None if the points stay as given.
+    joint: tuple[Callable[[], JointCovariance], Array] | None = None
 
     @property
     def followed(self) -> Array:
         """(f, n, 3) S_cd S_dd^-1: regression of the cameras' scores on those of the offsets."""
         whole = np.zeros((len(self.camera), *self.offsets.shape))
-        if self.solved is None or not len(whole):
+        if self.joint is None or not len(whole):
             return whole
-        solved, prior, _ = self.solved
-        along = solved.camera_root.T @ solved.offset_root(prior)
+        joint = self.joint[0]()
+        along = joint.camera_root.T @ joint.offset_root
         return np.asarray(-np.linalg.solve(self.camera, along).reshape(whole.shape))
 
     @property
     def std(self) -> Array:
         """(n, 3) standard deviations of the offsets, along each point's axes [world unit]."""
-        if self.solved is None:
+        if self.joint is None:
             return np.zeros_like(self.offsets)
-        solved, prior, gauge = self.solved
-        return np.sqrt(self.variance * np.maximum(solved.offset_variance(prior, gauge), 0.0))
+        joint, gauge = self.joint
+        return np.sqrt(self.variance * np.maximum(joint().offset_variance(gauge), 0.0))
 
     @property
     def poses(self) -> Array | None:
         """(P, 6, 6) covariance of each pose in units of the noise variance, with the target's gauge held."""
-        if self.solved is None:
+        if self.joint is None:
             return None
-        solved, prior, gauge = self.solved
-        return solved.poses(prior, gauge)
+        joint, gauge = self.joint
+        return joint().poses(gauge)
 
 
-_SINGLE = {"place": [0, 1], "height": [2]}  # axes of the parts of single points
-_STATED = "stated"  # the only part of surveyed points: the factor of their stated standard deviations
 _OUT_OF_PLANE = ("bend", "height")
 _START = {
     "fold": 3e-3,
@@ -156,10 +155,10 @@ def posterior(
     """
     parts = _Parts(info, prior, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
-    start = sizes or {name: _START[name] * prior.size for name in (*prior.groups, *_SINGLE)}
+    start = sizes or {name: _START[name] * prior.size for name in prior.names}
     now = parts.climbed(parts.at({name: size / noise for name, size in parts.allowed(start).items()}))
     if with_stretch and "stretch" in now.ratios:
-        other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
+        other = parts.climbed(parts.with_stretch_changed(now))
         now = other if other.evidence > now.evidence else now
     return parts.posterior(now)
 
@@ -175,7 +174,7 @@ def given_posterior(info: Information, prior: Prior) -> Posterior:
         variance=cost / info.spare,
         camera_step=inverse @ g,
         camera=np.asarray(inverse, dtype=float),
-        sizes=dict.fromkeys((*prior.groups, *_SINGLE), _NOTHING * prior.size),
+        sizes=dict.fromkeys(prior.names, _NOTHING * prior.size),
         determined=0.0,
         evidence=log_evidence(info.spare, cost, logdet),
     )
@@ -193,14 +192,21 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     return found if prior.stated is None else replace(found, variance=variance)
 
 
+def posterior_of(target: Target, info: Information, prior: Prior, variance: float) -> Posterior:
+    """The posterior of the offsets of an estimated target; with bends, they are integrated out."""
+    if target.bends is not None:
+        info = info.held(variance / target.bends.size**2)
+    if target.only_bends:
+        return given_posterior(info, prior)
+    return known_sizes(info, prior, target.sizes, variance)
+
+
 def minimum_of(
     info: Information, prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> tuple[Array, Array]:
     """Step (f,) of the cameras and offsets (n, 3) of `known_sizes`, without the covariances."""
-    parts, noise = _Parts(info, prior, flat=False), np.sqrt(variance)
-    ratios = {name: size / noise for name, size in sizes.items()}
-    step, smooth, single = parts.system.minimum(parts.of_smooth(ratios), parts.of_points(ratios))
-    return step, np.asarray(prior.basis @ smooth + single)
+    noise = math.sqrt(variance)
+    return system_of(info, prior).minimum({name: size / noise for name, size in sizes.items()})
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
@@ -208,27 +214,20 @@ def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[flo
 
     The log determinant is that of H minus that of the precisions.
     """
-    parts = _Parts(info, prior, flat=False)
+    system = system_of(info, prior)
 
     def at(ratio: float) -> tuple[float, float]:
-        single = parts.of_points({_STATED: ratio})
-        cost, logdet = parts.system.least(np.zeros(0), single)
-        return max(cost, _NO_COST), logdet - float(np.log(single).sum())
+        cost, logdet = system.least({STATED: ratio})
+        return max(cost, _NO_COST), logdet
 
     return at
 
 
 def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
     """(3 n, 3 n) prior covariance of the offsets along each point's axes, for given sizes [world unit]."""
-    n, m = len(prior.axes), prior.basis.shape[2]
-    if prior.stated is not None:
-        return np.diag((sizes[_STATED] * prior.stated.ravel()) ** 2)
-    weight = np.empty(m)
-    for name, places in prior.groups.items():
-        weight[places] = (sizes[name] / prior.size) ** 2
-    basis = prior.basis.reshape(3 * n, m)
-    own = np.tile([sizes["place"], sizes["place"], sizes["height"]], n) ** 2
-    return np.asarray((basis * weight) @ basis.T + np.diag(own))
+    basis = prior.basis.reshape(3 * len(prior.axes), -1)
+    smooth = (basis * prior.of_coefficients(sizes)) @ basis.T
+    return np.asarray(smooth + np.diag(prior.of_points(sizes).ravel()))
 
 
 @frozen_dataclass(eq=False)
@@ -246,50 +245,21 @@ class _Parts:
 
     def __init__(self, info: Information, prior: Prior, flat: bool, least_gain: float = _NO_GAIN) -> None:
         self.least_gain = least_gain
-        self.system, self.prior, self.flat = System(info, prior), prior, flat
+        self.system, self.prior, self.flat = system_of(info, prior), prior, flat
         self.least, self.stretch = _NOTHING * prior.size, STRETCH * prior.size
         self.spare, self.log_precision = info.spare, info.log_precision
+        self.gauge = prior.gauge if len(info.pose) else prior.gauge[:, :0]
 
     def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
         """The sizes, without out-of-plane parts if the target must stay flat."""
         return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
 
     def at(self, ratios: dict[str, float]) -> _Solution:
-        smooth, single = self.of_smooth(ratios), self.of_points(ratios)
-        solved = self.system.solve(smooth, single)
-        logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
-        evidence = log_evidence(self.spare, solved.cost, solved.logdet - logprior)
+        return self._solution(ratios, self.system.solve(ratios))
+
+    def _solution(self, ratios: dict[str, float], solved: Solved) -> _Solution:
+        evidence = log_evidence(self.spare, solved.cost, solved.logdet - self.log_precision)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
-
-    def of_smooth(self, ratios: Mapping[str, float]) -> Array:
-        """(m,) precisions of the smooth coefficients, in units of the noise precision."""
-        smooth = np.empty(self.system.m)
-        for name, places in self.prior.groups.items():
-            smooth[places] = (self.prior.size / ratios[name]) ** 2
-        return smooth
-
-    def of_points(self, ratios: Mapping[str, float]) -> Array:
-        """(n, 3) precisions of the single points' parts, in units of the noise precision."""
-        if self.prior.stated is not None:
-            return np.asarray((ratios[_STATED] * self.prior.stated) ** -2)
-        place, height = (ratios[name] ** -2 for name in _SINGLE)
-        return np.tile([place, place, height], (self.system.n, 1))
-
-    def _parts(self, now: _Solution) -> Iterator[tuple[str, float, int, float, float]]:
-        """Name, size, number, sum of squares and sum of variances of each part's coefficients."""
-        solved, prior = now.solved, self.prior
-        for name, places in prior.groups.items():
-            w = solved.smooth[places]
-            size = now.ratios[name] / prior.size
-            yield name, size, len(w), float(w @ w), solved.smooth_variance(places)
-        variance, squares = solved.single_variance(), solved.single**2
-        if prior.stated is not None:
-            squares, variance = squares / prior.stated**2, variance / prior.stated**2
-            yield _STATED, now.ratios[_STATED], squares.size, float(squares.sum()), float(variance.sum())
-            return
-        for name, columns in _SINGLE.items():
-            w2 = squares[:, columns]
-            yield name, now.ratios[name], w2.size, float(w2.sum()), float(variance[:, columns].sum())
 
     def renewed(self, now: _Solution) -> tuple[dict[str, float], dict[str, float]]:
         """MacKay's update of the sizes, and the slopes of the log evidence by the logarithms of the sizes.
@@ -297,10 +267,10 @@ class _Parts:
         The step is lengthened for parts that the data hardly determine, where MacKay's step is too short.
         """
         new, slope, noise = {}, {}, math.sqrt(now.variance)
-        for name, size, number, squares, variance in self._parts(now):
-            share = min(max(1.0 - variance / (number * size**2), 1e-6), 1.0)
-            change = squares / number / (size * noise) ** 2 / share
-            slope[name] = number * share * (change - 1.0)
+        for name, part in now.solved.parts.items():
+            share = min(max(part.determined / part.number, 1e-6), 1.0)
+            change = part.squares / (part.number * now.variance * share)
+            slope[name] = part.number * share * (change - 1.0)
             least, most = self.least, self.prior.size
             if name == "stretch":
                 least, most = (self.stretch, _MOST * most) if self.is_stretched(now) else (least, least)
@@ -313,10 +283,11 @@ class _Parts:
         """Whether the stretch has the size of prints."""
         return now.ratios["stretch"] * float(np.sqrt(now.variance)) > np.sqrt(self.stretch * self.least)
 
-    def with_stretch_changed(self, now: _Solution) -> dict[str, float]:
-        """The sizes with the stretch switched on or off."""
+    def with_stretch_changed(self, now: _Solution) -> _Solution:
+        """The solution with the stretch switched on or off."""
         size = self.least if self.is_stretched(now) else self.stretch
-        return now.ratios | {"stretch": size / float(np.sqrt(now.variance))}
+        ratios = now.ratios | {"stretch": size / math.sqrt(now.variance)}
+        return self._solution(ratios, now.solved.changed(ratios, "stretch"))
 
     def climbed(self, now: _Solution) -> _Solution:
         """Ascend to the most probable sizes; steps grow for sizes that keep changing in one direction."""
@@ -361,15 +332,14 @@ class _Parts:
         return now
 
     def posterior(self, now: _Solution) -> Posterior:
-        prior, solved, noise = self.prior, now.solved, math.sqrt(now.variance)
-        determined = sum(number - variance / size**2 for _, size, number, _, variance in self._parts(now))
+        solved, noise = now.solved, math.sqrt(now.variance)
         return Posterior(
-            offsets=(prior.basis @ solved.smooth) + solved.single,
+            offsets=solved.offsets,
             variance=now.variance,
-            camera_step=solved.camera,
-            camera=solved.camera_root.T @ solved.camera_root,
+            camera_step=solved.camera_step,
+            camera=solved.camera,
             sizes={name: ratio * noise for name, ratio in now.ratios.items()},
-            determined=determined,
+            determined=sum(part.determined for part in solved.parts.values()),
             evidence=now.evidence,
-            solved=(solved, prior, self.system.gauge),
+            joint=(solved.joint, self.gauge),
         )

@@ -17,6 +17,7 @@ plane, represented by its largest eigenfunctions. A solid target warps in all di
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -37,6 +38,19 @@ STRETCH = 1.5e-3
 # bent ones 1 % smaller (tests/test_simulated_targets.py, slow). The verdict names a larger shear.
 _LEANING = 0.3
 _MOST = 150  # most points from which the eigenfunctions are computed
+SINGLE = ("place", "place", "height")
+"""The part of single points along each axis."""
+STATED = "stated"
+"""The only part of surveyed points: the factor of their stated standard deviations."""
+
+
+@frozen_dataclass(eq=False)
+class Part:
+    """The coefficients of a part of the offsets, in units of their prior's standard deviation."""
+
+    number: int
+    squares: float  # of the most probable coefficients
+    determined: float  # effective number that the data determine
 
 
 @frozen_dataclass(eq=False)
@@ -59,6 +73,35 @@ class Prior:
     def in_world(self, along: Array) -> Array:
         """Convert offsets (n, 3) from each point's own axes to the world's."""
         return np.asarray((self.axes @ along[..., None])[..., 0])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parts."""
+        return (STATED,) if self.stated is not None else (*self.groups, *dict.fromkeys(SINGLE))
+
+    def of_coefficients(self, sizes: Mapping[str, float]) -> Array:
+        """(m,) variances of the coefficients of the basis for given sizes of the parts."""
+        variances = np.empty(self.basis.shape[2])
+        for name, places in self.groups.items():
+            variances[places] = (sizes[name] / self.size) ** 2
+        return variances
+
+    def of_points(self, sizes: Mapping[str, float]) -> Array:
+        """(n, 3) variances of the single points for given sizes of the parts."""
+        if self.stated is not None:
+            return np.asarray((sizes[STATED] * self.stated) ** 2)
+        return np.tile([sizes[name] ** 2 for name in SINGLE], (len(self.axes), 1))
+
+    def parts_of_points(self, squares: Array, determined: Array) -> dict[str, Part]:
+        """Parts of the single points from the terms (n, 3) of each; see `Part`."""
+        if self.stated is not None:
+            return {STATED: Part(squares.size, float(squares.sum()), float(determined.sum()))}
+        found = {}
+        for name in dict.fromkeys(SINGLE):
+            along = [axis for axis, other in enumerate(SINGLE) if other == name]
+            terms = squares[:, along], determined[:, along]
+            found[name] = Part(terms[0].size, float(terms[0].sum()), float(terms[1].sum()))
+        return found
 
 
 def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:

@@ -1,29 +1,204 @@
-"""Solve the normal equations of cameras, poses and offsets for given prior precisions of the offsets' parts.
+"""Solve the normal equations of cameras, poses and offsets for given sizes of the prior's parts.
 
-The Schur complement eliminates the poses or the points, whichever have more unknowns, block by block. The
-remaining system is dense. So the work grows linearly with the number of views or of points.
+The Schur complement eliminates the poses or the points block by block, and the remaining system is dense. So
+the work grows linearly with the number of views or of points.
+
+- `PosesFirst` leaves the cameras and the whole offsets. Their coordinates are those in which the prior is
+  diagonal whatever its sizes, so that a change of the sizes changes only the diagonal of the matrix.
+- `PointsFirst` leaves the cameras, the poses and the coefficients of the smooth parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.coordinates import coordinates_of
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.prior import Prior
+from neurocal_cli.target_shape.prior import Part, Prior
 
 _SMALL = 48  # largest triangular matrix that is inverted directly; others are split in halves
 _RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefinite
+# Offsets over poses and smooth coefficients, up to which eliminating the poses is faster. On boards of 54 to
+# 300 points in 8 to 60 views, both take the same time at 1.7; at 0.75 and 3.9 one takes three times as long.
+_AS_FAST = 1.75
 
 
-class System:
-    """The quadratic in the whole offsets along each point's axes, with its parts.
+@frozen_dataclass(eq=False)
+class Solved:
+    """The minimum of the quadratic, and the covariance for unit noise."""
 
-    Everything independent of the precisions is computed once. `s` is the number of camera parameters and
+    camera_step: Array  # (f,)
+    offsets: Array  # (n, 3) whole offsets
+    cost: float
+    logdet: float  # log determinant of the whole matrix over that of the prior's precisions
+    parts: dict[str, Part]
+    camera: Array  # (f, f) covariance of the cameras
+    joint: Callable[[], JointCovariance]
+    # The same after a change of one linear part, with the sizes of all parts and the name of that one.
+    changed: Callable[[Mapping[str, float], str], Solved]
+
+
+@frozen_dataclass(eq=False)
+class JointCovariance:
+    """Covariance of cameras, offsets and poses for unit noise.
+
+    The covariance of two unknowns is the product of their columns in the roots. To that of the offsets of
+    one point, `own` is added.
+    """
+
+    camera_root: Array  # (d, f)
+    offset_root: Array  # (d, 3 n)
+    own: Array  # (n, 3, 3)
+    # Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, 6, d) of the rest.
+    pose_parts: Callable[[], tuple[Array, Array]]
+
+    def offset_variance(self, gauge: Array) -> Array:
+        """(n, 3) variance of the offsets, without the gauge: rotations, shifts and scale of all points.
+
+        With G the orthonormal gauge directions (3 n, 7), it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        root = self.offset_root - (self.offset_root @ gauge) @ gauge.T
+        G = gauge.reshape(*self.own.shape[:2], -1)
+        own = self.own @ G
+        inner = np.einsum("nig,nih->gh", G, own)
+        by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
+        return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
+
+    def poses(self, gauge: Array) -> Array:
+        """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
+        own, root = self.pose_parts()
+        covariance = own + root @ np.swapaxes(root, 1, 2)
+        if not gauge.size:
+            return np.asarray(covariance)
+        by_gauge = self.offset_root @ gauge
+        G = gauge.reshape(*self.own.shape[:2], -1)
+        of_gauge = by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G)
+        across = root @ by_gauge
+        return np.asarray(covariance - across @ np.linalg.inv(of_gauge) @ np.swapaxes(across, 1, 2))
+
+
+def system_of(info: Information, prior: Prior) -> PosesFirst | PointsFirst:
+    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster."""
+    return (PointsFirst if points_first(info.pose_right.size, prior) else PosesFirst)(info, prior)
+
+
+def points_first(of_poses: int, prior: Prior) -> bool:
+    """Whether it is faster to eliminate the points than the poses, which have this number of unknowns."""
+    n, _, m = prior.basis.shape
+    return 3 * n > _AS_FAST * (m + of_poses)
+
+
+class PosesFirst:
+    """The system with the poses eliminated: cameras and independent coordinates of the offsets.
+
+    Everything independent of the sizes is computed once.
+    """
+
+    def __init__(self, info: Information, prior: Prior) -> None:
+        self.coordinates, self.f = coordinates_of(prior), len(info.camera)
+        self.without = WithoutPoses(info)
+        M = self._by_coordinates(self._by_coordinates(self.without.matrix()).T)
+        self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
+        self.sum = np.empty(self.matrix.shape)  # large arrays are quicker to fill again than to allocate
+
+    def _by_coordinates(self, rows: Array) -> Array:
+        """Rows by cameras, coordinates and right side, instead of by cameras, offsets and right side."""
+        f = self.f
+        return np.concatenate([rows[:f], self.coordinates.of_rows(rows[f:-1]), rows[-1:]])
+
+    def _with_prior(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
+        """The matrix with the precisions of the prior, and the variances of the coordinates."""
+        variances = self.coordinates.variances(ratios)
+        M, at = self.sum, np.arange(self.f, len(self.matrix))
+        M[...] = self.matrix
+        M[at, at] += 1.0 / variances
+        return M, variances
+
+    def solve(self, ratios: Mapping[str, float]) -> Solved:
+        """Solve for given sizes of the parts, in units of the noise's standard deviation."""
+        M, prior = self._with_prior(ratios)
+        logprior = float(np.log(prior).sum())
+        root, logdet = _root_of_inverse(M)
+        half, camera = root @ self.right, root[:, : self.f]
+        x, variances = half @ root, np.einsum("ij,ij->j", root, root)
+        cost, logdet = self.given_cost - float(half @ half), logdet + self.without.logdet + logprior
+
+        def changed(ratios: Mapping[str, float], name: str) -> Solved:
+            """By the formula of Woodbury, because only a few precisions change."""
+            places = self.coordinates.groups[name]
+            after, rows = self.coordinates.variances(ratios)[places], self.f + places
+            across, gain = root.T @ root[:, rows], np.diag(1.0 / after - 1.0 / prior[places])
+            factor = np.eye(len(rows)) + gain @ across[rows]
+            inner = np.linalg.solve(factor, gain)
+            by_inner, own = across @ inner, x[rows]
+            more = np.linalg.slogdet(factor)[1] + np.log(after / prior[places]).sum()
+            return self._solved(
+                ratios,
+                x - by_inner @ own,
+                variances - (by_inner * across).sum(axis=1),
+                cost + float(own @ inner @ own),
+                logdet + float(more),
+                camera.T @ camera - by_inner[: self.f] @ across[: self.f].T,
+                cache(lambda: self.solve(ratios).joint()),
+                lambda new, other: self.solve(ratios).changed(new, other),
+            )
+
+        return self._solved(
+            ratios, x, variances, cost, logdet, camera.T @ camera, cache(lambda: self._joint(root)), changed
+        )
+
+    def _solved(
+        self,
+        ratios: Mapping[str, float],
+        x: Array,
+        variances: Array,
+        cost: float,
+        logdet: float,
+        camera: Array,
+        joint: Callable[[], JointCovariance],
+        changed: Callable[[Mapping[str, float], str], Solved],
+    ) -> Solved:
+        """The solution with the unknowns x, which have these variances."""
+        f, coordinates = self.f, self.coordinates
+        return Solved(
+            x[:f], coordinates.offsets(x[f:]), cost, logdet,
+            coordinates.parts(ratios, x[f:], variances[f:]), camera, joint, changed,
+        )  # fmt: skip
+
+    def _joint(self, root: Array) -> JointCovariance:
+        n, camera = len(self.coordinates.prior.axes), root[:, : self.f]
+        offsets = self.coordinates.offsets(root[:, self.f :]).reshape(len(root), 3 * n)
+
+        def poses() -> tuple[Array, Array]:
+            P, p = self.without.root.shape[:2]
+            inverse = np.swapaxes(self.without.root, 1, 2)[:, :6]
+            gain = inverse @ self.without.rows[:, :-1].reshape(P, p, -1)
+            by_root = gain.reshape(6 * P, -1) @ np.concatenate([camera, offsets], axis=1).T
+            return inverse @ np.swapaxes(inverse, 1, 2), -by_root.reshape(P, 6, len(root))
+
+        return JointCovariance(camera, offsets, np.zeros((n, 3, 3)), poses)
+
+    def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
+        """Cost and log determinant of `Solved`, without the rest."""
+        M, prior = self._with_prior(ratios)
+        cost, logdet = _least(M, self.right, self.given_cost)
+        return cost, logdet + self.without.logdet + float(np.log(prior).sum())
+
+    def minimum(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
+        """Step (f,) of the cameras and offsets (n, 3) of `Solved`, without the rest."""
+        x = np.asarray(np.linalg.solve(self._with_prior(ratios)[0], self.right))
+        return x[: self.f], self.coordinates.offsets(x[self.f :])
+
+
+class PointsFirst:
+    """The system with the points eliminated: cameras, coefficients of the smooth parts and poses.
+
+    Everything independent of the sizes is computed once. `s` is the number of camera parameters and
     smooth coefficients.
     """
 
@@ -32,16 +207,7 @@ class System:
         self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
         self.s = self.f + self.m
-        self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
-        self.points_first = 3 * self.n >= self.p * self.P
-        if self.points_first:
-            self._prepare()
-        else:
-            self._eliminate_poses()
-
-    def _prepare(self) -> None:
-        """Compute the matrices from which the points will be eliminated."""
-        info, basis = self.info, self.prior.basis
+        basis = prior.basis
         by_basis = info.point @ basis  # (n, 3, m)
         flat = basis.reshape(3 * self.n, self.m)
         across = info.point_camera.reshape(3 * self.n, self.f).T @ flat
@@ -73,137 +239,104 @@ class System:
         M[-1, :dim] = M[:dim, -1]
         return M
 
-    def _eliminate_poses(self) -> None:
-        """Eliminate the poses: the bordered matrix of cameras, smooth parts and points."""
-        without = WithoutPoses(self.info)
-        M, f, s, m = without.matrix(), self.f, self.s, self.m
-        basis = self.prior.basis.reshape(3 * self.n, m)
-        by_basis = M[:, f:-1] @ basis
-        dense = np.empty((len(M) + m,) * 2)
-        old = np.r_[:f, s : len(dense)]
-        dense[np.ix_(old, old)] = M
-        dense[old, f:s] = by_basis
-        dense[f:s, old] = by_basis.T
-        dense[f:s, f:s] = basis.T @ by_basis[f:-1]
-        self.dense, self.logdet_poses = dense, without.logdet
-
-    def solve(self, smooth: Array, single: Array) -> Solved:
-        """Solve for given precisions (m,) of the smooth parts and (n, 3) of the single points."""
-        return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
-
-    def least(self, smooth: Array, single: Array) -> tuple[float, float]:
-        """Cost at the minimum and log determinant, without the rest of `Solved`."""
-        if self.points_first:
-            M, root, _ = self._without_points(smooth, single)
-            logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
-        else:
-            M, logdet = self._without_poses(smooth, single), self.logdet_poses
-        scale = 1.0 / np.sqrt(np.diagonal(M)[:-1])
-        scaled = M[:-1, :-1] * scale[:, None] * scale
-        try:
-            factor = np.linalg.cholesky(scaled)
-        except np.linalg.LinAlgError:
-            factor = np.linalg.cholesky(scaled + _RIDGE * np.eye(len(scaled)))
-        part = np.linalg.solve(factor, scale * M[:-1, -1])
-        return float(M[-1, -1] - part @ part), logdet + 2 * float(
-            np.log(np.diagonal(factor)).sum() - np.log(scale).sum()
-        )
-
-    def minimum(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
-        """Step (f,) of the cameras, coefficients (m,) of smooth parts, offsets (n, 3) of single points."""
-        if not self.points_first:
-            M = self._without_poses(smooth, single)
-            x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
-            return x[: self.f], x[self.f : self.s], x[self.s :].reshape(self.n, 3)
-        M, root, rows = self._without_points(smooth, single)
-        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
-        own = rows[:, :, -1] - rows[:, :, :-1] @ x
-        return x[: self.f], x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
-
-    def _without_poses(self, smooth: Array, single: Array) -> Array:
-        """The bordered matrix of cameras, smooth parts and points, with the precisions."""
-        s, f = self.s, self.f
-        M = self.dense.copy()
-        at = np.arange(len(M) - 1)
-        M[at[f:s], at[f:s]] += smooth
-        M[at[s:], at[s:]] += single.ravel()
-        return M
-
-    def _poses_first(self, smooth: Array, single: Array) -> Solved:
-        M = self._without_poses(smooth, single)
-        root, logdet = _root_of_inverse(M[:-1, :-1])
+    def solve(self, ratios: Mapping[str, float]) -> Solved:
+        """Solve for given sizes of the parts, in units of the noise's standard deviation."""
+        f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
+        M, own_root, rows, logdet = self._without_points(ratios)
+        root, of_rest = _root_of_inverse(M[:-1, :-1])
         half = root @ M[:-1, -1]
-        x, s = half @ root, self.s
+        x, back = half @ root, np.swapaxes(own_root, 1, 2)
+        # Back-substitution of the points: their response to all other unknowns.
+        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
+        follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
+        camera, smooth, single, own = root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root
+
+        def joint() -> JointCovariance:
+            offsets = single + smooth @ self.prior.basis.reshape(3 * n, -1).T
+            poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].transpose(1, 2, 0)
+            return JointCovariance(camera, offsets, own, lambda: (np.zeros((P, 6, 6)), poses))
+
+        variances = np.einsum("ij,ij->j", single, single).reshape(n, 3) + np.diagonal(own, axis1=1, axis2=2)
+        parts = self._parts(ratios, x[f:s], np.einsum("ij,ij->j", smooth, smooth), e, variances)
         return Solved(
-            x[: self.f], x[self.f : s], x[s:].reshape(self.n, 3), float(M[-1, -1] - half @ half),
-            logdet + self.logdet_poses, root[:, : self.f], root[:, self.f : s], root[:, s:],
-            np.zeros((self.n, 3, 3)), lambda: self._followed_poses(root),
+            x[:f], self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest, parts,
+            camera.T @ camera, joint, lambda new, _: self.solve(new),
         )  # fmt: skip
 
-    def _followed_poses(self, root: Array) -> tuple[Array, Array]:
-        """Poses eliminated first: covariances (P, 6, 6) for known other unknowns, and roots (P, d, 6)."""
-        info = self.info
-        by_point = info.pose_point.reshape(self.P, self.p, 3 * self.n)
-        by_smooth = by_point @ self.prior.basis.reshape(3 * self.n, self.m)
-        own = np.linalg.inv(info.pose)
-        gain = own[:, :6] @ np.concatenate([info.pose_camera, by_smooth, by_point], axis=2)
-        return np.asarray(own[:, :6, :6]), -root @ np.swapaxes(gain, 1, 2)
+    def _parts(
+        self, ratios: Mapping[str, float], smooth: Array, of_smooth: Array, single: Array, of_single: Array
+    ) -> dict[str, Part]:
+        """The parts, from the most probable coefficients (m,) and (n, 3) and their posterior variances."""
+        prior = self.prior.of_coefficients(ratios)
+        squares, determined = smooth**2 / prior, 1.0 - of_smooth / prior
+        parts = {
+            name: Part(len(places), float(squares[places].sum()), float(determined[places].sum()))
+            for name, places in self.prior.groups.items()
+        }
+        prior = self.prior.of_points(ratios)
+        return parts | self.prior.parts_of_points(single**2 / prior, 1.0 - of_single / prior)
 
-    def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
-        """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
-        own = self.info.point + single[:, :, None] * np.eye(3)
+    def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
+        """Cost and log determinant of `Solved`, without the rest."""
+        M, _, _, logdet = self._without_points(ratios)
+        cost, of_rest = _least(M[:-1, :-1], M[:-1, -1], float(M[-1, -1]))
+        return cost, logdet + of_rest
+
+    def minimum(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
+        """Step (f,) of the cameras and offsets (n, 3) of `Solved`, without the rest."""
+        M, root, rows, _ = self._without_points(ratios)
+        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+        own = rows[:, :, -1] - rows[:, :, :-1] @ x
+        single = (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
+        return x[: self.f], np.asarray(self.prior.basis @ x[self.f : self.s] + single)
+
+    def _without_points(self, ratios: Mapping[str, float]) -> tuple[Array, Array, Array, float]:
+        """The bordered matrix of all other unknowns; roots and rows of the points.
+
+        The log determinant is that of the points' matrices over that of all precisions of the prior.
+        """
+        of_smooth, of_single = self.prior.of_coefficients(ratios), self.prior.of_points(ratios)
+        own = self.info.point + np.eye(3) / of_single[:, :, None]
         root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
         rows = np.matmul(root, self.by_point, out=self.rows)
         flat = rows.reshape(3 * self.n, -1)
         M = self.bordered - flat.T @ flat
         at = np.arange(self.f, self.s)
-        M[at, at] += smooth
-        return M, root, rows
-
-    def _points_first(self, smooth: Array, single: Array) -> Solved:
-        f, s, n, P, p = self.f, self.s, self.n, self.P, self.p
-        M, own_root, rows = self._without_points(smooth, single)
-        root, logdet = _root_of_inverse(M[:-1, :-1])
-        half = root @ M[:-1, -1]
-        x, back = half @ root, np.swapaxes(own_root, 1, 2)
-        # Back-substitution of the points: their response to all other unknowns.
-        e = back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None]
-        follow = (back @ rows[:, :, :-1]).reshape(3 * n, len(x))
-        logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
-        poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].swapaxes(0, 1)
-        return Solved(
-            x[:f], x[f:s], e[..., 0], float(M[-1, -1] - half @ half), logdet,
-            root[:, :f], root[:, f:s], root @ -follow.T, back @ own_root,
-            lambda: (np.zeros((P, 6, 6)), poses),
-        )  # fmt: skip
+        M[at, at] += 1.0 / of_smooth
+        logdet = -2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum()
+        return M, root, rows, float(logdet + np.log(of_smooth).sum() + np.log(of_single).sum())
 
 
 class WithoutPoses:
     """Information with the poses eliminated (Schur complement); results for different views can be added.
 
-    `rows` (P p, f + 3 n + 1) is a factor of the correction for cameras, offsets and the right side, and
-    `logdet` the log determinant of the poses' part.
+    With the lower triangular Cholesky factors L of the poses' matrices, `root` (P, p, p) is their inverses,
+    and `rows` (P p, f + 3 n + 1) the products of these with the coupling to cameras, offsets and the right
+    side. `logdet` is the log determinant of the poses' part.
     """
 
     def __init__(self, info: Information) -> None:
         self.info, (P, p), d = info, info.pose.shape[:2], info.point_right.size
-        root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        columns = [info.pose_camera, info.pose_point.reshape(P, p, d), info.pose_right[..., None]]
-        self.rows = (root @ np.concatenate(columns, axis=2)).reshape(P * p, len(info.camera) + d + 1)
-        self.logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        self.root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        f = len(info.camera)
+        rows = np.empty((P, p, f + d + 1))
+        np.matmul(self.root, info.pose_camera, out=rows[:, :, :f])
+        np.matmul(self.root, info.pose_point.reshape(P, p, d), out=rows[:, :, f:-1])
+        np.matmul(self.root, info.pose_right[..., None], out=rows[:, :, -1:])
+        self.rows = rows.reshape(P * p, f + d + 1)
+        self.logdet = -2 * float(np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum())
 
     def matrix(self) -> Array:
         """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
         info, f, n = self.info, len(self.info.camera), len(self.info.point)
-        M = self.rows.T @ -self.rows
+        M = self.rows.T @ self.rows
+        np.negative(M, out=M)
         M[:f, :f] += info.camera
         across = info.point_camera.reshape(3 * n, f)
         M[f:-1, :f] += across
         M[:f, f:-1] += across.T
-        at = f + 3 * np.arange(n)
-        for i in range(3):
-            for j in range(3):
-                M[at + i, at + j] += info.point[:, i, j]
+        blocks = M[f:-1, f:-1].reshape(n, 3, n, 3)
+        np.einsum("ninj->nij", blocks)[...] += info.point
         right = np.concatenate([info.camera_right, info.point_right.ravel(), [info.cost]])
         M[-1] += right
         M[:-1, -1] += right[:-1]
@@ -223,85 +356,34 @@ class WithoutPoses:
         )
 
 
-@frozen_dataclass(eq=False)
-class Solved:
-    """The minimum of the quadratic, and the inverse of its matrix: the covariance for unit noise.
-
-    The covariance of two unknowns is the product of their columns in the roots. To that of single points,
-    `own` is added.
-    """
-
-    camera: Array  # (f,) step of the cameras
-    smooth: Array  # (m,) coefficients of the smooth parts
-    single: Array  # (n, 3) offsets of the single points' parts
-    cost: float
-    logdet: float  # log determinant of the whole matrix
-    camera_root: Array  # (d, f)
-    smooth_root: Array  # (d, m)
-    single_root: Array  # (d, 3 n)
-    own: Array  # (n, 3, 3)
-    # Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, d, 6) of the rest.
-    pose_parts: Callable[[], tuple[Array, Array]]
-
-    def smooth_variance(self, places: NDArray[np.intp]) -> float:
-        """Sum of the variances of some coefficients."""
-        return float(np.square(self.smooth_root[:, places]).sum())
-
-    def single_variance(self) -> Array:
-        """(n, 3) variances of the single points' parts."""
-        by_root = np.einsum("ij,ij->j", self.single_root, self.single_root).reshape(-1, 3)
-        return by_root + np.diagonal(self.own, axis1=1, axis2=2)
-
-    def offset_root(self, prior: Prior) -> Array:
-        """(d, 3 n) root of the whole offsets."""
-        return self.single_root + self.smooth_root @ prior.basis.reshape(self.single.size, -1).T
-
-    def offset_variance(self, prior: Prior, gauge: Array) -> Array:
-        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
-
-        With G the orthonormal gauge directions (3 n, 7), it is the diagonal of (I - G G^T) C (I - G G^T).
-        """
-        root = self.offset_root(prior)
-        root = root - (root @ gauge) @ gauge.T
-        G = gauge.reshape(*self.single.shape, -1)
-        own = self.own @ G
-        inner = np.einsum("nig,nih->gh", G, own)
-        by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
-        return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
-
-    def poses(self, prior: Prior, gauge: Array) -> Array:
-        """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
-        own, root = self.pose_parts()
-        covariance = own + np.swapaxes(root, 1, 2) @ root
-        if not gauge.size:
-            return np.asarray(covariance)
-        by_gauge = self.offset_root(prior) @ gauge
-        G = gauge.reshape(*self.single.shape, -1)
-        of_gauge = by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G)
-        across = np.swapaxes(root, 1, 2) @ by_gauge
-        return np.asarray(covariance - across @ np.linalg.solve(of_gauge, np.swapaxes(across, 1, 2)))
+def _least(M: Array, right: Array, cost: float) -> tuple[float, float]:
+    """Cost at the minimum of a quadratic, and the log determinant of its matrix."""
+    factor = _cholesky(M)
+    part = np.linalg.solve(factor, right)
+    return cost - float(part @ part), 2 * float(np.log(np.diagonal(factor)).sum())
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
     """A factor R of the inverse R^T R, and the log determinant of the matrix."""
-    scale = 1.0 / np.sqrt(np.diagonal(M))
-    scaled = M * scale[:, None]
-    scaled *= scale
+    root = _cholesky(M)
+    _invert_triangular(root)
+    return root, -2 * float(np.log(np.diagonal(root)).sum())
+
+
+def _cholesky(M: Array) -> Array:
     try:
-        root = _inverse_of_triangular(np.linalg.cholesky(scaled))
+        return np.asarray(np.linalg.cholesky(M))
     except np.linalg.LinAlgError:  # nearly degenerate coefficients, such as xi and alpha
-        root = _inverse_of_triangular(np.linalg.cholesky(scaled + _RIDGE * np.eye(len(M))))
-    logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
-    root *= scale
-    return root, logdet
+        diagonal = np.diagonal(M)
+        return np.asarray(np.linalg.cholesky(M + np.diag(_RIDGE * diagonal)))
 
 
-def _inverse_of_triangular(L: NDArray[np.floating]) -> Array:
-    """Inverse of a lower triangular matrix, by halves: in a third of the time of NumPy's general inverse."""
+def _invert_triangular(L: Array) -> None:
+    """Invert a lower triangular matrix in place, by halves: in a third of the time of NumPy's inverse."""
     n, h = len(L), len(L) // 2
     if n <= _SMALL:
-        return np.asarray(np.linalg.inv(L))
-    inverse = np.zeros((n, n))
-    inverse[:h, :h], inverse[h:, h:] = _inverse_of_triangular(L[:h, :h]), _inverse_of_triangular(L[h:, h:])
-    inverse[h:, :h] = -inverse[h:, h:] @ (L[h:, :h] @ inverse[:h, :h])
-    return inverse
+        L[...] = np.linalg.inv(L)
+        return
+    _invert_triangular(L[:h, :h])
+    _invert_triangular(L[h:, h:])
+    np.matmul(-L[h:, h:], L[h:, :h] @ L[:h, :h], out=L[h:, :h])

@@ -17,70 +17,66 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
-from neurocal_cli.target_shape.posterior import camera_step, minimum_of, prior_covariance
+from neurocal_cli.target_shape.coordinates import coordinates_of
+from neurocal_cli.target_shape.information import Information, joined
+from neurocal_cli.target_shape.posterior import camera_step, minimum_of
 from neurocal_cli.target_shape.prior import Prior
-from neurocal_cli.target_shape.system import WithoutPoses
+from neurocal_cli.target_shape.system import WithoutPoses, points_first
 
 _FEWEST = 4  # fewest views, so that the others determine a camera
 _FOLDS = 5
 
 
+def folds_of(n_views: Sequence[int]) -> list[NDArray[np.intp]]:
+    """The fold of each view (V,) of each camera; a single one if there are too few views for a test."""
+    n_folds = min(max(n_views), _FOLDS) if sum(n_views) >= _FEWEST else 1
+    return [np.arange(n) % n_folds for n in n_views]
+
+
 def passes_cross_validation(
-    sights: Sequence[Sight],
-    prior: Prior,
-    offsets: Array,
-    sizes: Mapping[str, float],
-    variance: float,
-    precision: float = 1.0,
+    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> bool:
     """Whether offsets estimated from the other views fit the held-out ones; True if that cannot be tested.
 
-    The sights are at the minimum for the estimated target with these offsets (n, 3), along each point's axes,
-    and `variance` [px^2] is that of the noise. `precision` is that of the prior of the bends of single views,
-    if any, in units of the noise precision.
+    The parts are the folds, in the whole offsets along each point's axes and with the prior of the bends of
+    single views, if any. `variance` [px^2] is that of the noise.
     """
-    n_views = max(sight.views.n_views for sight in sights)
-    if sum(sight.views.n_views for sight in sights) < _FEWEST:
+    if len(parts) == 1:
         return True
-
-    def information(folds: NDArray[np.intp]) -> Information:
-        which = [np.isin(np.arange(sight.views.n_views) % n_folds, folds) for sight in sights]
-        some = [sight.of_views(np.flatnonzero(w)) for sight, w in zip(sights, which, strict=True) if w.any()]
-        info = information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
-        return info.held(precision)
-
-    n_folds = min(n_views, _FOLDS)
-    parts = [information(np.array([fold])) for fold in range(n_folds)]
+    folds = np.arange(len(parts))
     # A camera with fewer views than folds is missing in some folds.
-    by_parts = len({len(part.camera) for part in parts}) == 1
-    folds = np.arange(n_folds)
+    seen = [np.diagonal(part.camera) > 0 for part in parts]
+    by_parts = all(some.all() for some in seen)
     try:
         if by_parts:
-            estimated = [found for _, found in without_each(parts, prior, sizes, variance)]
+            without = [WithoutPoses(part) for part in parts]
+            estimated = [found for _, found in without_each(without, prior, sizes, variance)]
         else:
-            others = [information(folds[folds != fold]) for fold in range(n_folds)]
+            others = [_seen(joined([part for part in parts if part is not out])) for out in parts]
             estimated = [minimum_of(some, prior, sizes, variance)[1] for some in others]
     except np.linalg.LinAlgError:
         return True
-    tried = np.stack([np.zeros_like(offsets), *estimated])
+    tried = np.stack([np.zeros_like(parts[0].point_right), *estimated])
     # Costs minimised over cameras and poses: without offsets, and with those from all but each fold.
     if by_parts:
-        terms = [
-            np.stack(term) for term in zip(*(WithoutPoses(part).at(tried) for part in parts), strict=True)
-        ]
+        terms = [np.stack(term) for term in zip(*(some.at(tried) for some in without), strict=True)]
         sums = [term.sum(axis=0) for term in terms]
         whole = _least(*sums)
         out = _least(*terms)
         rest = _least(*(total - term for total, term in zip(sums, terms, strict=True)))
     else:
-        whole = _least(*WithoutPoses(information(folds)).at(tried))
-        out = np.stack([_least(*WithoutPoses(part).at(tried)) for part in parts])
+        whole = _least(*WithoutPoses(joined(parts)).at(tried))
+        out = np.stack([_least(*WithoutPoses(_seen(part)).at(tried)) for part in parts])
         rest = np.stack([_least(*WithoutPoses(other).at(tried)) for other in others])
     own = out[folds, 1 + folds], rest[folds, 1 + folds]
     alone = (own[0] - out[:, 0]).sum()
-    together = (whole[1:] - own[1] + rest[:, 0]).sum() - n_folds * whole[0]
+    together = (whole[1:] - own[1] + rest[:, 0]).sum() - len(parts) * whole[0]
     return bool(alone < 0 or together < 0)
+
+
+def _seen(info: Information) -> Information:
+    """Information without the cameras that have no views."""
+    return info.of_cameras(np.diagonal(info.camera) > 0)
 
 
 def _least(S: Array, g: Array, cost: Array) -> Array:
@@ -89,7 +85,7 @@ def _least(S: Array, g: Array, cost: Array) -> Array:
 
 
 def without_each(
-    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
+    parts: Sequence[WithoutPoses], prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> list[tuple[Array, Array]]:
     """Step (f,) of the cameras and offsets (n, 3) from all parts but one, for each part left out.
 
@@ -97,17 +93,16 @@ def without_each(
     `variance` [px^2] is that of the noise. Raises `numpy.linalg.LinAlgError` if the other parts do not
     determine the cameras.
     """
-    if 3 * len(prior.axes) > sum(part.pose_right.size for part in parts):
-        others = (joined([part for part in parts if part is not out]) for out in parts)
+    if points_first(sum(part.info.pose_right.size for part in parts), prior):
+        others = (joined([part.info for part in parts if part is not out]) for out in parts)
         return [minimum_of(some, prior, sizes, variance) for some in others]
-    matrices = [WithoutPoses(part).matrix() for part in parts]
-    f = len(parts[0].camera)
-    precision = np.zeros_like(matrices[0][:-1, :-1])
-    precision[f:, f:] = variance * np.linalg.inv(prior_covariance(prior, sizes))
-    whole = sum(matrices)
+    matrices = [part.matrix() for part in parts]
+    f = len(parts[0].info.camera)
+    whole = np.sum(matrices, axis=0)
+    whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []
     for out in matrices:
         M = whole - out
-        x = np.asarray(np.linalg.solve(M[:-1, :-1] + precision, M[:-1, -1]))
+        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
         estimated.append((x[:f], x[f:].reshape(-1, 3)))
     return estimated

@@ -9,7 +9,9 @@ information.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bends import N_SHAPES, surface_of
 from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns
+from neurocal_cli.bundle_adjustment.solution import TargetPosterior
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.schur_complement import eliminate
@@ -27,14 +30,16 @@ from neurocal_cli.target_shape.information import (
     Information,
     Sight,
     blocks_by_batch,
+    folded_information,
     information_of,
     joined,
     labelled,
     linearised,
 )
-from neurocal_cli.target_shape.posterior import camera_step_of, given_posterior, known_sizes
+from neurocal_cli.target_shape.posterior import camera_step_of, posterior_of
 from neurocal_cli.target_shape.prior import prior_of_target
 from neurocal_cli.target_shape.surveyed import noise_variance
+from neurocal_cli.target_shape.system import WithoutPoses
 from neurocal_cli.target_shape.target_validation import without_each
 
 # Poses that are left out one by one, each with a target of its own; with more that takes too long. From the
@@ -50,10 +55,12 @@ def covariance_basis(
     free_poses: bool,
     points: Correspondences,
     normal: Array,
+    posterior: Callable[[float], TargetPosterior] | None = None,
 ) -> CovarianceBasis:
     """Input of the covariance of a camera at its minimum, for an estimated target; see `CameraSeen`.
 
-    Raises numpy.linalg.LinAlgError if the points do not determine the camera.
+    For a variance of the noise [px^2], `posterior` returns that of the target at this minimum; without it,
+    that is computed here. Raises `numpy.linalg.LinAlgError` if the points do not determine the camera.
     """
     label = target.rows_of(target.straightened(points).world)
     label = label if views.order is None else label[views.order]
@@ -65,36 +72,40 @@ def covariance_basis(
         sight = replace(sight, shapes=surface_of(target.given).offsets(target.found), bends=bends)
         bent = target.bends.determined(bends)
     offsets = prior.along_axes(target.offsets)
-    info = information_of([sight], n).turned(prior.axes).around_given(offsets)
-    if prior.stated is None:
-        variance = float(normal[:, -1, -1].sum()) * views.pixel_scale**2 / (info.spare - bent)
-    else:
-        variance = noise_variance(info, prior, target.sizes["stated"])
+
+    def in_offsets(info: Information) -> Information:
+        """The quadratic in the whole offsets."""
+        return info.turned(prior.axes).around_given(offsets)
 
     def held(info: Information) -> Information:
         """Add the prior of the bends of single views, if there are any."""
         return info if target.bends is None else info.held(variance / target.bends.size**2)
 
+    if prior.stated is None:
+        unknowns = int(free.sum()) + (6 * views.n_views if free_poses else 0)
+        spare = views.n_equations - unknowns - bent
+        variance = float(normal[:, -1, -1].sum()) * views.pixel_scale**2 / spare
+    else:
+        variance = noise_variance(in_offsets(information_of([sight], n)), prior, target.sizes["stated"])
+
     def moves_without(group: NDArray[np.intp]) -> Array | None:
         n_poses = int(group.max()) + 1
         if n_poses > _MOST_POSES:
             return None
-        parts = []
-        for pose in range(n_poses):
-            part = information_of([sight.of_views(np.flatnonzero(group == pose))], n)
-            parts.append(held(part.turned(prior.axes).around_given(offsets)))
+        folded = folded_information([sight], n, [group])
+        parts = folded.parts(held(in_offsets(folded.whole)), in_offsets)
         try:
             if target.only_bends:
                 others = (joined([part for part in parts if part is not out]) for out in parts)
                 return np.stack([camera_step_of(some) for some in others])
-            return np.stack([step for step, _ in without_each(parts, prior, target.sizes, variance)])
+            without = [WithoutPoses(part) for part in parts]
+            return np.stack([step for step, _ in without_each(without, prior, target.sizes, variance)])
         except np.linalg.LinAlgError:
             return None
 
-    if target.only_bends:
-        found = given_posterior(held(info), prior)
-    else:
-        found = known_sizes(held(info), prior, target.sizes, variance)
+    if posterior is None:
+        posterior = partial(posterior_of, target, in_offsets(information_of([sight], n)), prior)
+    found = posterior(variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for label -1
     normal = _efficient(sight, labelled(views, label), followed)

@@ -153,7 +153,7 @@ class _AtMinimum:
         known = camera_covariance(
             CameraSeen(
                 self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
-                self.points, calibration.target, tuple(calibration.lens_choice),
+                self.points, calibration.target, choice=tuple(calibration.lens_choice),
                 target_kept=calibration.target_stretched > 0,
             )
         )  # fmt: skip
