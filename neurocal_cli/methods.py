@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +40,6 @@ _NOT_FOUND = (
     "these points do not determine it, which needs three different views of most points and offsets below "
     "2 % of the target's size"
 )
-_KEPT = 2**25 - 2**16  # bytes; glibc's limit is 2^25 with its header
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 
 
@@ -123,7 +121,6 @@ def calibrate(
     InputError, DegenerateGeometryError
         The points do not determine the camera; the message says why.
     """
-    _keep_freed_memory()
     known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed)
@@ -185,17 +182,6 @@ def calibrate(
         if text == str(error):
             raise
         raise DegenerateGeometryError(text) from error
-
-
-@cache
-def _keep_freed_memory() -> None:
-    """Let the C library keep freed memory for the next arrays instead of returning it to the system.
-
-    Steps of a calibration allocate arrays of 0.1 to 10 MB again and again, and new pages took up to a seventh
-    of the time. glibc keeps as much as the largest block that was ever freed, up to 32 MB (mallopt(3),
-    M_MMAP_THRESHOLD). This block is never touched, so it takes no memory itself.
-    """
-    np.empty(_KEPT, dtype=np.uint8)
 
 
 def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
