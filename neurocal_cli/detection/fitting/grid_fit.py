@@ -27,6 +27,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
     SHARP,
     edge_model,
     edge_pixels,
+    levels_beside,
     light_at,
     moments,
     usual_stride,
@@ -195,8 +196,8 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = _shading_of(found.map, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
-    mapped, sigma = _by_moments(grid_image, found, shading)
-    first = _first_fit(grid_image, mapped, sigma, shading, noise)
+    mapped, sigma, levels = _by_moments(grid_image, found, shading)
+    first = _first_fit(grid_image, mapped, sigma, shading, levels, noise)
     return _last_fit(grid_image, first)
 
 
@@ -227,28 +228,36 @@ def _may_be_wide(found: MapFit, vertices: Array) -> bool:
     return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
 
 
-def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
-    """Fit the map to offsets from moments, and estimate the blur [px]."""
+def _by_moments(
+    grid_image: GridImage, found: MapFit, shading: Shading
+) -> tuple[MapFit, float, tuple[Array, Array]]:
+    """Fit the map to offsets from moments, and estimate the blur [px] and the levels of each edge."""
     lines = grid_image.edges.lines(found.map)
     # Oblique crossing lines enter wide strips, so these are narrower.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
     strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
-    offset, _, blur = moments(strips, half, *shading.at(lines.middle))
+    levels = levels_beside(strips, half, *shading.at(lines.middle))
+    offset, _, blur = moments(strips, half, *levels)
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
-    return fit_map(found.map, observations, found.shift), sigma
+    return fit_map(found.map, observations, found.shift), sigma, levels
 
 
 def _first_fit(
-    grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
+    grid_image: GridImage,
+    mapped: MapFit,
+    sigma: float,
+    shading: Shading,
+    levels: tuple[Array, Array],
+    noise: float,
 ) -> GridFit:
     """Fit edges with independent levels, and the map through them."""
     lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
-    good = is_typical(fit)
+    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, levels, noise)
+    good = is_typical(fit, lines.middle)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
@@ -278,7 +287,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
-    trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
     # More accurate edges may need a richer model.
     richer = first.map.map.models[first.map.model_index :]
