@@ -210,7 +210,7 @@ def level_prior(
     [DN^2] that of a pixel.
     """
     mean, contrast = shading.at(place)
-    low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
+    low, high = 1 / (shading.spread_at(place) + _LEAST_SPREAD * noise)
     precision = np.zeros((len(place), 3, 3))
     # Precisions of A = (light + dark) / 2 and B = (light - dark) / 2 from those of dark and light.
     precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low

@@ -40,8 +40,8 @@ from neurocal_cli.detection.fitting.shading import (
     Levels,
     LocalShading,
     Shading,
+    adapted_shading,
     fit_shading,
-    has_shadow,
     square_levels,
 )
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
@@ -194,7 +194,9 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
-    shading = _shading_of(found.map, dark, light)
+    shading = fit_shading(found.map.frame, dark, light)
+    if isinstance(found.map, WideMap):
+        shading = LocalShading.of(shading, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma, levels = _by_moments(grid_image, found, shading)
     first = _first_fit(grid_image, mapped, sigma, shading, levels, noise)
@@ -416,10 +418,7 @@ def _shading(first: GridFit) -> Shading:
     place = first.lines.middle[good]
     dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
     light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    return _shading_of(first.map.map, dark, light)
-
-
-def _shading_of(at: SmoothMap, dark: Levels, light: Levels) -> Shading:
-    smooth = fit_shading(at.frame, dark, light)
-    uneven = isinstance(at, WideMap) or has_shadow(smooth, dark, light)
-    return LocalShading.of(smooth, dark, light) if uneven else smooth
+    smooth = fit_shading(first.map.map.frame, dark, light)
+    if isinstance(first.map.map, WideMap):
+        return LocalShading.of(smooth, dark, light)
+    return adapted_shading(smooth, dark, light)
