@@ -66,6 +66,7 @@ _NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tr
 _PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
 _ANCHOR = 2.0  # px; standard deviation of the found vertices as anchors, which keep later maps regular
 _ENOUGH = 60  # edges above which such anchors are not needed
+_UNEVEN_BLUR = 0.1  # relative deviation of the edges' blur above which it may change over the board
 _MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
 _WIDEST = 12.0  # px; greatest half width of the strips for moments
 _STEPS = 6  # greatest number of Gauss-Newton steps
@@ -310,7 +311,7 @@ def _fine_fit(
     n = len(first.good)
     shape = profile_shape(first.fit, first.good)
     noise = PixelNoise.of(first.fit, grid_image.floor)
-    blur = _blur(first, lines, lines)
+    blur = _blur(first, lines).at(lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that failed in the dark rim of the image starts at the map again.
@@ -329,7 +330,7 @@ def _fitted(
     image: Image,
     lines: Lines,
     offset: Array,
-    blur: tuple[Array, Array | float],
+    blur: tuple[Array, Array],
     shading: Shading,
     shape: ProfileShape,
     noise: PixelNoise,
@@ -353,7 +354,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
         grid_image.image,
         lines,
         np.full(len(edges.index), shift),
-        _blur(fitted, fitted.lines, lines),
+        _blur(fitted, fitted.lines).at(lines),
         fitted.shading,
         fitted.fit.shape.elsewhere(half_widths(lines.normal)),
         fitted.noise,
@@ -374,7 +375,8 @@ def fit_grid_vertices(
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
+    blur = _blur(fitted, fitted.lines)
+    (first, spread), (second, _) = (blur.at(line) for line in lines)
     sigma = 0.5 * (first + second)
     data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
@@ -392,14 +394,15 @@ def fit_grid_vertices(
     return fit, lines, is_reliable(fit, departure)
 
 
-def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:
-    """Blur (E,) [px] of lines from the fits of all edges, and variance of single edges around it [px^2]."""
-    if isinstance(fitted.map.map, WideMap):
-        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
-        sigma = field.along(lines.normal, lines.middle)
-        return sigma, field.relative * sigma**2
+def _blur(fitted: GridFit, edges: Lines) -> BoardBlur | FieldBlur:
+    """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
     board = BoardBlur.of(fitted.fit, edges.normal, fitted.good)
-    return board.along(lines.normal), board.spread
+    wide = isinstance(fitted.map.map, WideMap)
+    if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
+        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
+        if wide or field.relative * board.usual**2 < _CLEARLY * board.spread:
+            return field
+    return board
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
