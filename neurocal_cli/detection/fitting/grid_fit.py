@@ -46,7 +46,14 @@ from neurocal_cli.detection.fitting.shading import (
 )
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, vertex_lines, vertex_model, vertex_pixels
+from neurocal_cli.detection.fitting.vertex_fit import (
+    FIRST,
+    SECOND,
+    vertex_lines,
+    vertex_model,
+    vertex_pixels,
+    with_gradients,
+)
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -385,6 +392,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
