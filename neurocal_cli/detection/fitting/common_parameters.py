@@ -138,6 +138,7 @@ class BoardBlur:
 
     matrix: Array  # (2, 2) [px^2] S; a multiple of the identity if there is no motion blur and no astigmatism
     spread: float  # [px^2] variance of the blur of single edges around it, without the variance of the fits
+    usual: float  # [px] median of the edges' blur
 
     @classmethod
     def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
@@ -153,18 +154,26 @@ class BoardBlur:
         normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_EDGES
         uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
         matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
-        left = sigma - cls(matrix, 0.0).along(normal[good])
-        return cls(matrix, excess_variance(left, fit.covariance[good, BLUR, BLUR]))
+        left = sigma - cls(matrix, 0.0, usual).along(normal[good])
+        return cls(matrix, excess_variance(left, fit.covariance[good, BLUR, BLUR]), usual)
 
     def along(self, normal: Array) -> Array:
         """(E,) blur [px] of edges with normals (E, 2)."""
         square = ((normal @ self.matrix) * normal).sum(axis=1)
         return np.sqrt(np.maximum(square, LEAST_BLUR**2))
 
+    def at(self, lines: Lines) -> tuple[Array, Array]:
+        """(E,) blur [px] of lines, and (E,) variance of single edges around it [px^2]."""
+        sigma = self.along(lines.normal)
+        return sigma, np.full_like(sigma, self.spread)
+
 
 @frozen_dataclass(eq=False)
 class FieldBlur:
-    """Blur of a wide lens, which grows towards the rim: log sigma as a function of place and direction."""
+    """Blur that changes over the board: log sigma as a function of place and direction.
+
+    It grows towards the rim of a wide lens, and with the distance from the plane in focus.
+    """
 
     frame: Frame
     # (8,) coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a
@@ -190,10 +199,11 @@ class FieldBlur:
         terms[0] += np.log(usual)
         return cls(frame, terms, relative)
 
-    def along(self, normal: Array, place: Array) -> Array:
-        """(E,) blur [px] of edges with normals (E, 2) at places (E, 2) [px]."""
-        log = _places_and_directions(self.frame, place, normal) @ self.terms
-        return np.asarray(np.maximum(np.exp(log), LEAST_BLUR))
+    def at(self, lines: Lines) -> tuple[Array, Array]:
+        """(E,) blur [px] of lines, and (E,) variance of single edges around it [px^2]."""
+        log = _places_and_directions(self.frame, lines.middle, lines.normal) @ self.terms
+        sigma = np.asarray(np.maximum(np.exp(log), LEAST_BLUR))
+        return sigma, self.relative * sigma**2
 
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
@@ -201,16 +211,14 @@ def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
     return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
-def level_prior(
-    shading: Shading, place: Array, sigma: Array, blur_spread: Array | float, noise: float
-) -> LevelPrior:
+def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: Array, noise: float) -> LevelPrior:
     """Prior for the levels and the blur of single edges at places (E, 2) [px] from those of the whole board.
 
-    `sigma` (E,) [px] is their blur, `blur_spread` [px^2] the variance of single edges around it, and `noise`
-    [DN^2] that of a pixel.
+    `sigma` (E,) [px] is their blur, `blur_spread` (E,) [px^2] the variance of single edges around it, and
+    `noise` [DN^2] that of a pixel.
     """
     mean, contrast = shading.at(place)
-    low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
+    low, high = 1 / (shading.spread_at(place) + _LEAST_SPREAD * noise)
     precision = np.zeros((len(place), 3, 3))
     # Precisions of A = (light + dark) / 2 and B = (light - dark) / 2 from those of dark and light.
     precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low

@@ -42,6 +42,10 @@ _NEAREST_FIRST, _ENDS = 2.0, 0.12  # the same before the last fit: sigma, at mos
 _NEAREST_SHARP = 0.75  # px; the same for sharp edges: the crossing lines cut only nearer pixels
 _RIM, _RIM_BLUR = 0.1, 3.0  # share of the length, and sigma, left out at the board's end, which may be cut
 _COLUMNS = 40  # columns of pixels along an edge before the last fit
+_PLATEAU = 0.67  # of a strip's half width; farther pixels have the levels of the squares
+# Relative to the expected contrast: the least contrast that is an edge; the least ratio, or its inverse, and
+# the greatest difference of the means that are no other light.
+_VISIBLE, _LEAST_RATIO, _MEAN_OFF = 0.1, 0.7, 0.15
 OFFSET, TILT = 0, 1  # the first two values of an edge's fit
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
@@ -106,6 +110,30 @@ def edge_pixels(
 def usual_stride(lines: Lines) -> int:
     """Stride of columns before the last fit, chosen for speed."""
     return max(2, int(upper_median(lines.length) / _COLUMNS))
+
+
+def levels_beside(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array]:
+    """Mean level and half contrast of edges: the expected ones (E,), or those of the pixels on both sides.
+
+    The expected levels are wrong where the light changes within a square or two, as at a shadow's border.
+    Then the outer pixels of the strips, of half widths (E,) [px], show the levels. In small or blurred
+    squares they show them less well, so they are used only if they clearly differ. Where they show no edge,
+    something hides the board.
+    """
+    far = (_PLATEAU * half_width).astype(np.float32)[:, None]
+    sides = [(strips.inside & (sign * strips.d > far)).astype(np.float32) for sign in (-1, 1)]
+    counts = [side.sum(axis=1) for side in sides]
+    dark, light = (
+        np.einsum("en,en->e", strips.value, side).astype(float) / np.maximum(count, 1)
+        for side, count in zip(sides, counts, strict=True)
+    )
+    own_mean, own_contrast = 0.5 * (light + dark), 0.5 * (light - dark)
+    ratio = own_contrast / contrast
+    other = (
+        (np.abs(own_mean - mean) > _MEAN_OFF * contrast) | (ratio < _LEAST_RATIO) | (ratio > 1 / _LEAST_RATIO)
+    )
+    other &= (ratio > _VISIBLE) & (counts[0] > 0) & (counts[1] > 0)
+    return np.where(other, own_mean, mean), np.where(other, own_contrast, contrast)
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:

@@ -16,6 +16,9 @@ from neurocal_cli.geometry import Array
 # Insensitive as long as they admit a ratio of 1 to the prior, and fits of 8 pixels for the smallest squares.
 # tests/test_measuring.py counts the fits of hidden edges that are accepted.
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
+# In a shadow or far from a lamp: least contrast relative to the board's median, and number of neighbours that
+# have such a contrast, too.
+_FAINTEST, _NEIGHBOURS = 0.12, 9
 _MOST_BLUR = 2.0  # greatest ratio to the prior, or of the prior to it
 _MOST_BEYOND = 0.3  # greatest share of the pixels outside the image
 _LEAST_COUNT = 8  # pixels
@@ -28,13 +31,23 @@ _MOST_SPREAD = 0.5  # sigma; greatest standard deviation of an offset
 _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 
 
-def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
-    """(E,) mask of fits whose contrast and chi2 are like those of most fits of the board."""
-    contrast = fit.values[:, CONTRAST] / upper_median(fit.values[:, CONTRAST])
+def is_typical(fit: BatchFit, place: Array) -> NDArray[np.bool_]:
+    """(E,) mask of fits at places (E, 2) [px] with contrast and chi2 like those of most fits of the board.
+
+    Where the light is weaker, it is sufficient to have the contrast of the neighbours.
+    """
+    contrast = fit.values[:, CONTRAST]
+    usual = upper_median(contrast)
+    seen = contrast > _LEAST_CONTRAST**2 * usual
+    faint = np.flatnonzero(~seen & (contrast > _FAINTEST * usual))
+    if len(faint):
+        away = ((place[faint, None] - place) ** 2).sum(axis=-1)
+        near = np.argsort(away, axis=1)[:, :_NEIGHBOURS]
+        seen[faint] = contrast[faint] > _LEAST_CONTRAST * np.median(contrast[near], axis=1)
     rough = fit.chi2_per_pixel
     usual = upper_median(rough)
     scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
-    return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
+    return seen & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
 def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
     SHARP,
     edge_model,
     edge_pixels,
+    levels_beside,
     light_at,
     moments,
     usual_stride,
@@ -39,13 +40,20 @@ from neurocal_cli.detection.fitting.shading import (
     Levels,
     LocalShading,
     Shading,
+    adapted_shading,
     fit_shading,
-    has_shadow,
     square_levels,
 )
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, vertex_lines, vertex_model, vertex_pixels
+from neurocal_cli.detection.fitting.vertex_fit import (
+    FIRST,
+    SECOND,
+    vertex_lines,
+    vertex_model,
+    vertex_pixels,
+    with_gradients,
+)
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -65,6 +73,7 @@ _NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tr
 _PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
 _ANCHOR = 2.0  # px; standard deviation of the found vertices as anchors, which keep later maps regular
 _ENOUGH = 60  # edges above which such anchors are not needed
+_UNEVEN_BLUR = 0.1  # relative deviation of the edges' blur above which it may change over the board
 _MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
 _WIDEST = 12.0  # px; greatest half width of the strips for moments
 _STEPS = 6  # greatest number of Gauss-Newton steps
@@ -193,10 +202,12 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
-    shading = _shading_of(found.map, dark, light)
+    shading = fit_shading(found.map.frame, dark, light)
+    if isinstance(found.map, WideMap):
+        shading = LocalShading.of(shading, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
-    mapped, sigma = _by_moments(grid_image, found, shading)
-    first = _first_fit(grid_image, mapped, sigma, shading, noise)
+    mapped, sigma, levels = _by_moments(grid_image, found, shading)
+    first = _first_fit(grid_image, mapped, sigma, shading, levels, noise)
     return _last_fit(grid_image, first)
 
 
@@ -227,28 +238,36 @@ def _may_be_wide(found: MapFit, vertices: Array) -> bool:
     return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
 
 
-def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
-    """Fit the map to offsets from moments, and estimate the blur [px]."""
+def _by_moments(
+    grid_image: GridImage, found: MapFit, shading: Shading
+) -> tuple[MapFit, float, tuple[Array, Array]]:
+    """Fit the map to offsets from moments, and estimate the blur [px] and the levels of each edge."""
     lines = grid_image.edges.lines(found.map)
     # Oblique crossing lines enter wide strips, so these are narrower.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
     strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
-    offset, _, blur = moments(strips, half, *shading.at(lines.middle))
+    levels = levels_beside(strips, half, *shading.at(lines.middle))
+    offset, _, blur = moments(strips, half, *levels)
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
-    return fit_map(found.map, observations, found.shift), sigma
+    return fit_map(found.map, observations, found.shift), sigma, levels
 
 
 def _first_fit(
-    grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
+    grid_image: GridImage,
+    mapped: MapFit,
+    sigma: float,
+    shading: Shading,
+    levels: tuple[Array, Array],
+    noise: float,
 ) -> GridFit:
     """Fit edges with independent levels, and the map through them."""
     lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
-    good = is_typical(fit)
+    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, levels, noise)
+    good = is_typical(fit, lines.middle)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
@@ -278,7 +297,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
-    trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
     # More accurate edges may need a richer model.
     richer = first.map.map.models[first.map.model_index :]
@@ -299,7 +318,7 @@ def _fine_fit(
     n = len(first.good)
     shape = profile_shape(first.fit, first.good)
     noise = PixelNoise.of(first.fit, grid_image.floor)
-    blur = _blur(first, lines, lines)
+    blur = _blur(first, lines).at(lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that failed in the dark rim of the image starts at the map again.
@@ -318,7 +337,7 @@ def _fitted(
     image: Image,
     lines: Lines,
     offset: Array,
-    blur: tuple[Array, Array | float],
+    blur: tuple[Array, Array],
     shading: Shading,
     shape: ProfileShape,
     noise: PixelNoise,
@@ -342,7 +361,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
         grid_image.image,
         lines,
         np.full(len(edges.index), shift),
-        _blur(fitted, fitted.lines, lines),
+        _blur(fitted, fitted.lines).at(lines),
         fitted.shading,
         fitted.fit.shape.elsewhere(half_widths(lines.normal)),
         fitted.noise,
@@ -363,7 +382,8 @@ def fit_grid_vertices(
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
+    blur = _blur(fitted, fitted.lines)
+    (first, spread), (second, _) = (blur.at(line) for line in lines)
     sigma = 0.5 * (first + second)
     data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
@@ -372,6 +392,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
@@ -381,14 +402,15 @@ def fit_grid_vertices(
     return fit, lines, is_reliable(fit, departure)
 
 
-def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:
-    """Blur (E,) [px] of lines from the fits of all edges, and variance of single edges around it [px^2]."""
-    if isinstance(fitted.map.map, WideMap):
-        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
-        sigma = field.along(lines.normal, lines.middle)
-        return sigma, field.relative * sigma**2
+def _blur(fitted: GridFit, edges: Lines) -> BoardBlur | FieldBlur:
+    """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
     board = BoardBlur.of(fitted.fit, edges.normal, fitted.good)
-    return board.along(lines.normal), board.spread
+    wide = isinstance(fitted.map.map, WideMap)
+    if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
+        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
+        if wide or field.relative * board.usual**2 < _CLEARLY * board.spread:
+            return field
+    return board
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -407,10 +429,7 @@ def _shading(first: GridFit) -> Shading:
     place = first.lines.middle[good]
     dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
     light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    return _shading_of(first.map.map, dark, light)
-
-
-def _shading_of(at: SmoothMap, dark: Levels, light: Levels) -> Shading:
-    smooth = fit_shading(at.frame, dark, light)
-    uneven = isinstance(at, WideMap) or has_shadow(smooth, dark, light)
-    return LocalShading.of(smooth, dark, light) if uneven else smooth
+    smooth = fit_shading(first.map.map.frame, dark, light)
+    if isinstance(first.map.map, WideMap):
+        return LocalShading.of(smooth, dark, light)
+    return adapted_shading(smooth, dark, light)

@@ -31,16 +31,23 @@ _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to co
 
 
 def fit_initial(
-    image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
+    image: NDArray[np.generic],
+    lines: Lines,
+    offset: Array,
+    sigma: float,
+    shading: Shading,
+    levels: tuple[Array, Array],
+    noise: float,
 ) -> BatchFit:
     """Fit edges with independent levels, from initial distances (E,) from their lines and blur [px].
 
-    `noise` [DN^2] is the variance of a pixel.
+    `levels` are mean level and half contrast of each edge, two arrays (E,), known roughly. `noise` [DN^2] is
+    the variance of a pixel.
     """
-    known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
+    known = np.stack([*levels, np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
     started = _few_steps(image, lines, start, known, shading, noise)
-    typical = is_typical(started)
+    typical = is_typical(started, lines.middle)
     found = upper_median(started.values[typical, BLUR]) if typical.any() else sigma
     # The effect of crossing lines on the pixels depends on the blur.
     if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
@@ -68,16 +75,16 @@ def _few_steps(
 
 def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
     """Continue the fits with each blur profile, and choose the one with the lower chi2."""
-    results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
+    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
     smooth, box = (upper_median(results[k].chi2_per_pixel) for k in (0, -1))
     # Prefer the pixel's box if they are about equal, as they are if all edges run along the pixels.
     return results[0] if smooth < _CLEARLY * box else results[-1]
 
 
-def _converged(fit: BatchFit, shape: ProfileShape) -> BatchFit:
+def _converged(fit: BatchFit, lines: Lines, shape: ProfileShape) -> BatchFit:
     if (shape.half is None) != (fit.shape.half is None):
         fit = fit.continued(shape, _FEW_STEPS, 0)
-    return fit.continued(profile_shape(fit, is_typical(fit)), _STEPS)
+    return fit.continued(profile_shape(fit, is_typical(fit, lines.middle)), _STEPS)
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:

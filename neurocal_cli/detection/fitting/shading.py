@@ -5,7 +5,7 @@ In: levels measured inside squares or by edge fits. Out: `Shading`, the levels a
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +29,14 @@ _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, to avoid division by 0
 _NEAREST = 3  # the distance of the n-th nearest level is the width of the weights
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
-# A shadow has a border if so many light squares differ so much from the polynomial, relative to the contrast,
-# but are so much lighter than the nearest dark ones: on something that hides the board both levels are equal.
-# Chosen on one darkened photograph (docs/figures.md); tests/test_measuring.py has shadows and hidden edges.
-_SHADOWED, _OFF, _LIGHTER = 0.04, 0.25, 0.2
+# Coefficients of richer polynomials, of degree 3 to 5; the ratio of their scatter to that of the best simpler
+# one from which they are used; and the spread of the levels around that, relative to their variances, from
+# which they are tried. Chosen on rendered lamps and vignetting (tests/test_uneven_light.py).
+_RICHER, _GAIN, _NOTABLE = (10, 15, 21), 0.5, 1.0
+_EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which degree 2 is sufficient
+# A shadow is looked for if so many levels differ so much from the polynomials, relative to the contrast. It
+# is found if nearby levels predict a level with an error that is smaller by a factor.
+_SHADOWED, _OFF, _CLEARLY = 0.03, 0.1, 0.7
 
 
 @frozen_dataclass(eq=False)
@@ -51,23 +55,32 @@ class Shading:
     """Dark and light level as polynomials of the place, scaled by the frame."""
 
     frame: Frame
-    dark: Array  # (6,) [DN] coefficients of 1, x, y, x^2, x y, y^2
-    light: Array  # (6,) [DN] the same
+    dark: Array  # (M,) [DN] coefficients of 1, x, y, x^2, x y, y^2, x^3, ...
+    light: Array  # (M,) [DN] the same
     # (2,) [DN^2] variance of single dark and light squares around the polynomials, including that of these
     spread: Array
 
+    def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
+        """Differences of measured dark and light levels from the polynomials [DN]."""
+        dark, light = (
+            levels.level - polynomial_terms(self.frame, levels.place, len(coefficients)) @ coefficients
+            for levels, coefficients in zip(both, (self.dark, self.light), strict=True)
+        )
+        return dark, light
+
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = quadratic_terms(self.frame, place)
+        terms = polynomial_terms(self.frame, place, len(self.dark))
         dark, light = terms @ self.dark, terms @ self.light
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
+    def spread_at(self, place: Array) -> Array:
+        """(2, N) variance [DN^2] of single dark and light levels around those at places (N, 2)."""
+        return np.broadcast_to(self.spread[:, None], (2, len(place)))
+
     def slopes(self, place: Array) -> tuple[Array, Array]:
         """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
-        x, y = ((place - self.frame.centre) / self.frame.unit).T
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        du = np.stack([zero, one, zero, 2 * x, y, zero], axis=-1) / self.frame.unit
-        dv = np.stack([zero, zero, one, zero, x, 2 * y], axis=-1) / self.frame.unit
+        du, dv = _polynomial_slopes(self.frame, place, len(self.dark))
         dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
@@ -96,35 +109,59 @@ class LocalShading(Shading):
         """Add the levels to which polynomials were fitted; with few levels, return the polynomials."""
         if min(len(dark.level), len(light.level)) <= _NEAREST:
             return smooth
-        above, spread = [], []
-        for levels, coefficients, before in zip(
-            (dark, light), (smooth.dark, smooth.light), smooth.spread, strict=True
-        ):
-            rest = levels.level - quadratic_terms(smooth.frame, levels.place) @ coefficients
-            left = rest - _nearby(levels.place, rest, levels.place, itself=False)
-            above.append(rest)
-            spread.append(min(excess_variance(left, levels.variance), before))
+        above = smooth.off_levels((dark, light))
+        spread = [
+            min(
+                excess_variance(rest - _Nearby.of(x.place, x.place, itself=False).mean(rest), x.variance),
+                before,
+            )
+            for x, rest, before in zip((dark, light), above, smooth.spread, strict=True)
+        ]
         near = dark.place, light.place
-        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
+        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above)
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = quadratic_terms(self.frame, place)
+        terms = polynomial_terms(self.frame, place, len(self.dark))
         dark, light = (
-            terms @ coefficients + _nearby(near, above, place)
+            terms @ coefficients + _Nearby.of(near, place).mean(above)
             for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
         )
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
+    def spread_at(self, place: Array) -> Array:
+        """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
+        return np.stack(
+            [
+                base + _Nearby.of(near, place).variance(above)
+                for base, near, above in zip(self.spread, self.near, self.above, strict=True)
+            ]
+        )
 
-def _nearby(near: Array, value: Array, place: Array, itself: bool = True) -> Array:
-    """(N,) means at places (N, 2) of values (M,) at places `near` (M, 2), weighted by their distances."""
-    away = ((place[:, None] - near) ** 2).sum(axis=-1)
-    if not itself:
-        np.fill_diagonal(away, np.inf)
-    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
-    weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
-    return np.asarray(weight @ value / np.maximum(weight.sum(axis=1), 1e-12))
+
+@frozen_dataclass(eq=False)
+class _Nearby:
+    """Weights (N, M) of places near others, normal in their distances."""
+
+    weight: Array
+
+    @classmethod
+    def of(cls, near: Array, place: Array, itself: bool = True) -> _Nearby:
+        """Weights of places `near` (M, 2) at places (N, 2)."""
+        away = ((place[:, None] - near) ** 2).sum(axis=-1)
+        if not itself:
+            np.fill_diagonal(away, np.inf)
+        width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
+        weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
+        return cls(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
+
+    def mean(self, value: Array) -> Array:
+        """(N,) means of values (M,)."""
+        return np.asarray(self.weight @ value)
+
+    def variance(self, value: Array) -> Array:
+        """(N,) variances of values (M,) around their means."""
+        return np.maximum(self.weight @ value**2 - self.mean(value) ** 2, 0.0)
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
@@ -151,25 +188,47 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
 
 
 def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
-    """Fit polynomials to levels, of the highest degree that their number allows."""
-    (low, low_spread), (high, high_spread) = (_fit(frame, levels) for levels in (dark, light))
-    return Shading(frame, low, high, np.array([low_spread, high_spread]))
+    """Fit polynomials to levels, of the degree up to 2 that their number allows."""
+    around = _around(frame, np.concatenate([dark.place, light.place]))
+    (low, low_spread), (high, high_spread) = (_fit(around, levels) for levels in (dark, light))
+    return Shading(around, low, high, np.array([low_spread, high_spread]))
 
 
-def has_shadow(smooth: Shading, dark: Levels, light: Levels) -> bool:
-    """Whether the board is partly in a shadow, whose border polynomials cannot follow."""
-    if min(len(dark.level), len(light.level)) <= _NEAREST:
-        return False
-    mean, half = smooth.at(light.place)
-    off = np.abs(light.level - mean - half) > _OFF * 2 * half
-    if off.mean() < _SHADOWED:
-        return False
-    nearest = _nearby(dark.place, dark.level, light.place[off])
-    lighter = light.level[off] - nearest > _LIGHTER * 2 * half[off]
-    return bool(lighter.sum() >= _SHADOWED * len(off))
+def _around(frame: Frame, places: Array) -> Frame:
+    """Scale coordinates to [-1, 1] on the board, where high powers can be told apart."""
+    if not len(places):
+        return frame
+    low, high = places.min(axis=0), places.max(axis=0)
+    return replace(frame, centre=0.5 * (low + high), unit=max(0.5 * float((high - low).max()), 1.0))
+
+
+def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
+    """Raise the degree of polynomials as far as required, or follow nearby levels if these predict better.
+
+    They do where the board is partly in a shadow, whose border polynomials cannot follow.
+    """
+    both = dark, light
+    if min(len(levels.level) for levels in both) == 0:
+        return smooth
+    half = upper_median(smooth.at(light.place)[1])
+    off = np.abs(np.concatenate(smooth.off_levels(both)))
+    shadowed = np.mean(off > _OFF * 2 * half) >= _SHADOWED
+    if not shadowed and smooth.spread.max() < (_EVEN * half) ** 2:
+        return smooth
+    richer = _richer(smooth, dark, light)
+    local = LocalShading.of(smooth, dark, light) if shadowed else richer
+    if not isinstance(local, LocalShading):
+        return richer
+    by_local = [
+        above - _Nearby.of(near, near, itself=False).mean(above)
+        for near, above in zip(local.near, local.above, strict=True)
+    ]
+    errors = [np.abs(np.concatenate(left)).mean() for left in (richer.off_levels(both), by_local)]
+    return local if errors[1] < _CLEARLY * errors[0] else richer
 
 
 def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
+    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2]."""
     n = len(levels.level)
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
@@ -180,20 +239,62 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
-        # The median is robust against the outliers that the weights are to find.
-        scatter = upper_median(residual**2) / CHI2_MEDIAN * n / max(n - used, 1)
-        weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
-        root = np.sqrt(weight / (levels.variance + spread))
-        weighted = terms[:, :used].T * root
-        normal = weighted @ weighted.T
-        # Keeps the solution finite if terms cannot be separated.
-        normal.ravel()[:: used + 1] *= 1 + _RIDGE
-        coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
-        residual = levels.level - terms[:, :used] @ coefficients[:used]
-        # The spread of the squares is the part that the errors of the levels do not explain.
-        chance = 1 + 4 / np.sqrt(n)
-        spread = max(scatter - chance * upper_median(levels.variance), 0.0)
+        coefficients[:used], residual, spread = _refit(terms[:, :used], levels, residual, spread)
     return coefficients, spread + most / n * upper_median(levels.variance)
+
+
+def _richer(smooth: Shading, dark: Levels, light: Levels) -> Shading:
+    """Raise the degree of the polynomials where the levels scatter around them by more than their errors."""
+    results = []
+    for levels, coefficients, residual, spread in zip(
+        (dark, light),
+        (smooth.dark, smooth.light),
+        smooth.off_levels((dark, light)),
+        smooth.spread.tolist(),
+        strict=True,
+    ):
+        n, usual = len(levels.level), upper_median(levels.variance)
+        degrees = [m for m in _RICHER if 3 * m <= n]
+        if degrees and spread > _NOTABLE * usual:
+            terms = polynomial_terms(smooth.frame, levels.place, degrees[-1])
+            scatter = _scatter(residual, _TERMS[-1])
+            for used in degrees:
+                tried, rest, left = coefficients, residual, spread
+                for _ in range(_STEPS):
+                    tried, rest, left = _refit(terms[:, :used], levels, rest, left)
+                if _scatter(rest, used) < _GAIN * scatter:
+                    coefficients, residual, scatter = tried, rest, _scatter(rest, used)
+                    spread = left + used / n * usual
+        results.append((np.pad(coefficients, (0, _RICHER[-1] - len(coefficients))), spread))
+    (low, low_spread), (high, high_spread) = results
+    return Shading(smooth.frame, low, high, np.array([low_spread, high_spread]))
+
+
+def _refit(terms: Array, levels: Levels, residual: Array, spread: float) -> tuple[Array, Array, float]:
+    """Fit a polynomial once with Tukey's weights; the coefficients, residuals, and spread of the squares.
+
+    The weights come from the residuals of the last fit, and the spread known so far.
+    """
+    n, used = terms.shape
+    # The median is robust against the outliers that the weights are to find.
+    scatter = _scatter(residual, used)
+    weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
+    root = np.sqrt(weight / (levels.variance + spread))
+    weighted = terms.T * root
+    normal = weighted @ weighted.T
+    # Keeps the solution finite if terms cannot be separated.
+    normal.ravel()[:: used + 1] *= 1 + _RIDGE
+    coefficients: Array = np.linalg.solve(normal, weighted @ (levels.level * root)).astype(float)
+    # The spread of the squares is the part that the errors of the levels do not explain.
+    chance = 1 + 4 / np.sqrt(n)
+    spread = max(scatter - chance * upper_median(levels.variance), 0.0)
+    return coefficients, levels.level - terms @ coefficients, spread
+
+
+def _scatter(residual: Array, used: int) -> float:
+    """Robust variance of the residuals of a fit of so many coefficients."""
+    n = len(residual)
+    return upper_median(residual**2) / CHI2_MEDIAN * n / max(n - used, 1)
 
 
 def excess_variance(residual: Array, variance: Array) -> float:
@@ -205,3 +306,29 @@ def quadratic_terms(frame: Frame, place: Array) -> Array:
     """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, 6)."""
     x, y = ((place - frame.centre) / frame.unit).T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def polynomial_terms(frame: Frame, place: Array, count: int) -> Array:
+    """1, x, y, x^2, x y, y^2, x^3, ... of places (N, 2) [px], scaled by the frame; (N, count)."""
+    if count == _TERMS[-1]:
+        return quadratic_terms(frame, place)
+    x, y = ((place - frame.centre) / frame.unit).T
+    terms = power = [np.ones_like(x)]
+    while len(terms) < count:
+        power = [*(x * term for term in power), y * power[-1]]
+        terms = terms + power
+    return np.stack(terms[:count], axis=-1)
+
+
+def _polynomial_slopes(frame: Frame, place: Array, count: int) -> tuple[Array, Array]:
+    """Derivatives of `polynomial_terms` by u and by v [1/px]."""
+    x, y = ((place - frame.centre) / frame.unit).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    power, by_x, by_y = [one], [zero], [zero]
+    du, dv = [zero], [zero]
+    while len(du) < count:
+        by_x = [*(t + x * d for t, d in zip(power, by_x, strict=True)), y * by_x[-1]]
+        by_y = [*(x * d for d in by_y), power[-1] + y * by_y[-1]]
+        power = [*(x * t for t in power), y * power[-1]]
+        du, dv = du + by_x, dv + by_y
+    return np.stack(du[:count], axis=-1) / frame.unit, np.stack(dv[:count], axis=-1) / frame.unit

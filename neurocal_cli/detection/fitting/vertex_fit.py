@@ -12,10 +12,15 @@ pixels nearer to its own line.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    MEAN,
+    BatchFit,
     FitPixels,
     Linearised,
     ProfileShape,
@@ -24,9 +29,10 @@ from neurocal_cli.detection.fitting.batched_newton import (
 )
 from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
 from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response, sharp_profile
-from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -37,6 +43,8 @@ FIRST, SECOND = 0, 2
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
 # Number of terms of the series for crossings with a cosine below each limit, and for all others;
 # tests/test_fit_models.py compares them with a rendered cross.
+_RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
+_NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 
 
@@ -150,6 +158,48 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     residual[...] = (data.value - mean) * data.root - contrast * by[5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
     return Linearised(rows, z, x)
+
+
+def with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
+    """Continue the fits of vertices by a step that also fits gradients of the light, and of the blur.
+
+    Gradients that shading and blur of the board do not contain displace a vertex, because opposite squares
+    then differ. They are relative to light and blur, and have normal priors. The variance of a prior is what
+    the estimates scatter more than by their errors. In even light and focus this is nothing, and the fits
+    stay as they are.
+    """
+    data, rows, size = fit.pixels, fit.linear.rows, fit.values.shape[1]
+    assert isinstance(data, VertexPixels)
+    mean, contrast, sigma = fit.values[:, MEAN:].T.astype(np.float32)[:, :, None]
+    light = (mean + contrast * fit.linear.x) * data.root
+    changed = [light, rows[:, 1 + size + BLUR] * sigma][: 1 + of_blur]
+    patterns = np.stack([what * d for what in changed for d in (data.d1, data.d2)], axis=1)
+    # Products with the residual, with the derivatives by the values, and with each other.
+    both = (patterns @ rows.swapaxes(1, 2))[:, :, : size + 1].astype(float)
+    own = (patterns @ patterns.swapaxes(1, 2)).astype(float)
+    right, cross = both[:, :, :1], both[:, :, 1:]
+    back = fit.covariance @ cross.swapaxes(1, 2)
+    # At the minimum, the values need no step of their own: what is left determines the gradients.
+    left = own - cross @ back
+    diagonal = np.einsum("eii->ei", left)  # a view
+    diagonal *= 1 + _RIDGE
+    diagonal += _RIDGE
+    free = np.linalg.inv(left)
+    variance, found = np.einsum("eii->ei", free), (free @ right)[:, :, 0]
+    kinds = [np.array([2 * k, 2 * k + 1]) for k in range(len(changed))]
+    spread = [excess_variance(found[:, kind].ravel(), variance[:, kind].ravel()) for kind in kinds]
+    usual = [upper_median(variance[:, kind]) for kind in kinds]
+    notable = [k for k in range(len(kinds)) if spread[k] > _NOTABLE * usual[k]]
+    if not notable:
+        return fit
+    used = np.concatenate([kinds[k] for k in notable])
+    prior = np.diag(np.repeat([1 / spread[k] for k in notable], 2))
+    right, cross, back = right[:, used], cross[:, used], back[:, :, used]
+    gradients = np.linalg.solve(left[:, used[:, None], used] + prior, right)
+    step = -(back @ gradients)[:, :, 0]
+    lost = cross.swapaxes(1, 2) @ np.linalg.solve(own[:, used[:, None], used] + prior, cross)
+    chi2 = fit.chi2 - (right.swapaxes(1, 2) @ gradients)[:, 0, 0]
+    return replace(fit, values=fit.values + step, information=fit.information - lost, chi2=chi2)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # in fits that diverge, which are rejected

@@ -1,0 +1,87 @@
+"""Boards in uneven light and uneven focus are measured like others, and nothing false is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.measured import Points
+from support.slow_cases import slow_but
+from support.uneven_light import (
+    Effect,
+    Found,
+    beside_a_lamp,
+    board,
+    defocused,
+    half_in_shadow,
+    measured_under,
+    mottled,
+    vignetted,
+)
+
+# The numbers behind the bounds are those of polynomials of the second degree, one blur, and vertices without
+# gradients.
+
+
+def together(effect: Effect, points: Points, seeds: range, hidden: bool = False) -> Found:
+    found = [measured_under(effect, seed, points, board(seed, hidden)) for seed in seeds]
+    return Found(
+        float(np.mean([one.kept for one in found])),
+        sum(one.hidden for one in found),
+        np.concatenate([one.error for one in found]),
+        np.concatenate([one.normalised for one in found]),
+    )
+
+
+@pytest.mark.parametrize("ratio", slow_but((4.0,), (4.0, 6.0)))
+def test_vertices_are_measured_through_strong_vignetting(ratio: float) -> None:
+    found = together(vignetted(ratio), "vertices", range(3))
+    assert found.kept > 0.97  # 0.92 and 0.75
+    assert found.z < 1.4  # 2.3 and 2.6
+
+
+def test_vertices_are_measured_beside_a_lamp() -> None:
+    found = together(beside_a_lamp(8.0), "vertices", range(3))
+    assert found.kept > 0.85  # 0.76
+    assert found.z < 1.2  # 1.8
+    assert found.rms < 0.025  # 0.037
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("depth", slow_but((0.3,), (0.3, 0.5)))
+def test_both_sides_of_a_deep_shadow_are_measured(depth: float, points: Points) -> None:
+    found = together(half_in_shadow(depth, 4.0), points, range(3))
+    assert found.kept > 0.8  # 0.43: the whole dark side was lost, or measured wrongly
+    assert found.rms < 0.035  # 0.13
+    assert found.z < 1.6
+    assert np.abs(found.error).max() < 0.2
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_soft_borders_of_shadows_do_not_displace_points(points: Points) -> None:
+    found = together(half_in_shadow(0.4, 20.0), points, range(3))
+    assert found.kept > 0.82  # 0.76 and 0.74
+    assert found.rms < 0.03  # 0.025 and 0.061
+    assert found.z < 1.5  # 1.5 and 3.2
+
+
+@pytest.mark.parametrize("effect", [beside_a_lamp(4.0), half_in_shadow(0.4, 6.0)])
+def test_hidden_edges_are_left_out_in_uneven_light(effect: Effect) -> None:
+    found = together(effect, "midpoints", range(6), hidden=True)
+    assert found.kept > 0.84  # 0.74 in the shadow
+    assert found.hidden <= 3  # 5 in the shadow; the occluder only just touches the strip around them
+    assert np.abs(found.error).max() < 0.1  # 0.25
+
+
+def test_vertices_are_measured_on_mottled_paper() -> None:
+    found = together(mottled(15.0, 0.05), "vertices", range(3))
+    assert found.kept > 0.97  # 0.53
+    assert found.rms < 0.008  # 0.020
+    assert found.z < 1.2  # 2.9
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_a_board_partly_out_of_focus_is_measured(points: Points) -> None:
+    found = together(defocused(4.0), points, range(2))
+    assert found.kept > 0.98  # 0.84 and 0.70
+    assert found.rms < 0.01  # 0.012 and 0.015
+    assert found.z < 1.3  # 0.9 and 2.1
