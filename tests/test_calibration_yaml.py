@@ -424,6 +424,7 @@ def test_a_billion_laughs_are_not_laughed(path):
 def test_deep_nesting_is_refused(path):
     assert "nested too deeply" in complaint(path, "[" * 5000)
     assert "nested too deeply" in complaint(path, "{a: " * 5000)
+    assert "nested too deeply" in complaint(path, "[" * 50)
 
 
 def test_a_second_document_is_refused(path, good):

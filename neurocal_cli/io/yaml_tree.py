@@ -26,6 +26,7 @@ from neurocal_cli.io.tree_fields import Field
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
+_TOO_DEEP = "is nested too deeply to be a camera file; give another"
 
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
 # PyYAML's rule, so that names which it writes without quotes (1e5, 1.5e5, -.5) stay names.
@@ -123,7 +124,7 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
             if type(containers[-1]) is dict and keys[-1] is None:
                 _fail("a key must be a word, not a list or mapping; correct it", event, source)
             if len(containers) > _DEEPEST:
-                _fail("is nested too deeply to be a camera file; give another", event, source)
+                _fail(_TOO_DEEP, event, source)
             containers.append({} if kind is yaml.MappingStartEvent else [])
             keys.append(None)
             continue
@@ -163,6 +164,8 @@ def _syntax_error(error: yaml.YAMLError, text: str, source: str) -> FormatError:
     mark = getattr(error, "problem_mark", None)
     if mark is not None:
         problem = str(getattr(error, "problem", "")) or "it cannot be parsed"
+        if "nesting depth" in problem:  # libyaml has a limit of its own since 0.2.6, and looks ahead
+            return FormatError(_TOO_DEEP, source, mark.line + 1)
         return FormatError(f"is not valid YAML ({problem}); correct it", source, mark.line + 1)
     position = getattr(error, "position", None)  # a character that YAML does not allow
     line = None if position is None else text.count("\n", 0, position) + 1
