@@ -277,10 +277,18 @@ def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealF
     assert rms < 0.16  # 0.195 with cornerSubPix
 
 
-def test_a_grid_beside_the_board_gives_no_points_and_no_error(real_files: RealFiles) -> None:
+def test_squares_of_four_pixels_beside_the_board_are_as_accurate_as_stated(real_files: RealFiles) -> None:
     cv2 = pytest.importorskip("cv2")
     finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
     (path,) = real_files("opencv_stereo/right06.jpg")
     image = cv2.imread(str(path), 0)
-    kept = [len(measure(image, grid).kind) for grid in finding.find_grids(image)]
-    assert kept == [93, 0]
+    board, small = (measure(image, grid) for grid in finding.find_grids(image))
+    assert len(board.kind) == 93
+    assert len(small.kind) > 30
+    half = np.array([[0.5, 0], [0, 0.5]])[small.kind]
+    H = cv2.findHomography(small.index + half, small.pixels)[0]
+    off = cv2.perspectiveTransform((small.index + half)[None], H)[0] - small.pixels
+    a, b = small.across.T
+    variance = (small.covariance * np.column_stack([a**2, 2 * a * b, b**2])).sum(axis=1)
+    chi2 = (off * small.across).sum(axis=1) ** 2 / variance
+    assert 0.5 < chi2.mean() < 1.5
