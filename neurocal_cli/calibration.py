@@ -255,3 +255,19 @@ def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
     if isinstance(given, (np.ndarray, list, tuple)):
         return Camera(Intrinsics.from_matrix(np.asarray(given)))
     raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")
+
+
+def undistorted_before(points: Correspondences, given: Camera | Calibration) -> str:
+    """Why a camera with distortion does not belong to points that are undistorted already; "" if it may.
+
+    A camera that was calibrated from undistorted points has the distortion that these have left.
+    """
+    if not points.undistorted or camera_of(given).distortion.is_identity:
+        return ""
+    if isinstance(given, Calibration) and given.points.undistorted:
+        return ""
+    return (
+        f"{points.source}: the points are undistorted already, so the camera's distortion "
+        f"({camera_of(given).distortion.model}) is not theirs, unless the camera was calibrated from "
+        "undistorted points; give the points as they were measured, or a camera without distortion"
+    )

@@ -119,6 +119,8 @@ def evaluate_camera(
                 )
     elif points is None:
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
+    if isinstance(calibration, (Camera, Calibration)) and (why := undistorted_before(points, calibration)):
+        warnings.append(why)
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
         from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed

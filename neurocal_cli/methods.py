@@ -168,9 +168,13 @@ def calibrate(
             )
             _refuse_misfit(found)
             warnings = _about_target(found, solution, choice)
+        if isinstance(intrinsics, Calibration):
+            found = with_given_covariance(found, intrinsics)
+        if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
+            warnings = (*warnings, why)
         return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
     except DegenerateGeometryError as error:
-        text, copies = str(error), repeated_views(points)
+        text, copies = _true_cause(points, type) or str(error), repeated_views(points)
         if copies:
             text += (
                 f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "

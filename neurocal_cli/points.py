@@ -15,6 +15,9 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.given_values import checked_size, real_array
 
+UNDISTORTED = ("plane", "cylinder", "equirectangular")
+"""Shapes that undistorted pixels are projected on."""
+
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
 _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z, as a share of the target's size
@@ -57,6 +60,9 @@ class Correspondences:
         the same for a world point in all views. All zero is None.
     distances : tuple of Distance
         Distances measured on the points' board; they determine its scale.
+    undistorted : str
+        The shape, one of `UNDISTORTED`, that the pixels were projected on when they were undistorted. Empty:
+        they are those of the image, as far as is known.
 
     Attributes
     ----------
@@ -86,6 +92,7 @@ class Correspondences:
     sources: Mapping[str, str] | None = None
     world_std: Array | None = None
     distances: tuple[Distance, ...] = ()
+    undistorted: str = ""
     view_names: tuple[str, ...] = field(init=False)
     view_index: NDArray[np.int64] = field(init=False)
 
@@ -131,11 +138,16 @@ class Correspondences:
             if centre.shape != (2,) or not np.isfinite(centre).all():
                 raise InputError(f"{self.source}: image_center must be two finite numbers")
             self._set(image_center=tuple(centre.tolist()))
+        if self.undistorted and self.undistorted not in UNDISTORTED:
+            raise InputError(f"{self.source}: undistorted must be one of {', '.join(UNDISTORTED)}, or empty")
 
     @classmethod
-    def none(cls, image_size: tuple[int, int] | None = None, unit: str = "mm") -> Correspondences:
+    def none(
+        cls, image_size: tuple[int, int] | None = None, unit: str = "mm", undistorted: str = ""
+    ) -> Correspondences:
         """Empty correspondences, for a camera without points of its own."""
-        empty = cls(np.zeros((1, 3)), np.zeros((1, 2)), image_size=image_size, unit=unit)
+        known: dict[str, Any] = {"image_size": image_size, "unit": unit, "undistorted": undistorted}
+        empty = cls(np.zeros((1, 3)), np.zeros((1, 2)), **known)
         empty._set(world=_frozen(np.zeros((0, 3))), pixels=_frozen(np.zeros((0, 2))))
         empty._set(view_names=(), view_index=_frozen(np.zeros(0, dtype=np.int64)))
         return empty

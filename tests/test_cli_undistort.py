@@ -270,7 +270,8 @@ def test_columns_that_are_not_known_are_noted(camera: Path, tmp_path: Path) -> N
     result = undistort(camera, tmp_path / "p.csv")
     assert result.exit_code == 0
     assert "column not used: 'colour'" in result.stderr
-    assert result.stdout.startswith("# image_size: 400 300\n# unit: mm\nX,Y,Z,u,v\n0.0,0.0,0.0,")
+    header = "# image_size: 400 300\n# unit: mm\n# undistorted: plane\nX,Y,Z,u,v\n"
+    assert result.stdout.startswith(f"{header}0.0,0.0,0.0,")
 
 
 def test_a_calibration_takes_its_own_lens_off(tmp_path: Path) -> None:

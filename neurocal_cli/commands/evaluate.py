@@ -244,7 +244,7 @@ def _evaluate_stereo(
 
 def _with_poses(name: str, points: Correspondences) -> Calibration:
     """Read a calibration, or any camera file; poses that the file does not hold are fitted to the points."""
-    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.calibration import Calibration, undistorted_before
     from neurocal_cli.methods import calibrate
 
     camera, seen = preparation.calibration_or_camera(name, points, "; the poses are fitted")
@@ -253,4 +253,6 @@ def _with_poses(name: str, points: Correspondences) -> Calibration:
             return camera
         note(f"{name}: holds no poses; they are fitted")
     assert seen is not None
+    if why := undistorted_before(seen, camera):
+        warn(why)
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

@@ -85,7 +85,8 @@ def undistort(
     or PPM file. An image that cannot be undistorted, for example one of another size, is reported on
     standard error and left out. In a CSV file of points, u,v and their covariances are undistorted.
     A pixel that the distortion model cannot produce is an error; points that no plane can show are left
-    out, and a line says how many. Inputs are never overwritten.
+    out, and a line says how many. The file then says in a line that its points are undistorted, and other
+    commands warn of a camera with distortion for it. Inputs are never overwritten.
 
     \b
     Examples:

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from neurocal_cli.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.commands.streams import each_of, note, say, some_of
+from neurocal_cli.commands.streams import each_of, note, say, some_of, warn
 from neurocal_cli.distortion.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
@@ -155,6 +156,8 @@ class Undistorting:
                 f"{points.source}: the image_size is {_size(points.image_size)}, but the camera is for "
                 f"{_size(self.size)}; give a camera for this image size"
             )
+        if why := undistorted_before(points, self.camera):
+            warn(why)
         new = self.new()
         points = replace(points, image_size=self.size)
         kept = shown(points, self.camera, new)

@@ -29,9 +29,10 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.points import UNDISTORTED
 
-PANORAMAS = ("cylinder", "equirectangular")
-SHAPES = ("plane", *PANORAMAS)
+SHAPES = UNDISTORTED
+PANORAMAS = SHAPES[1:]
 
 _ALONG = 1001  # pixels along a row and a column
 _WIDEST_PLANE = 170.0  # degrees

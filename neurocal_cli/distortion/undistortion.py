@@ -241,9 +241,10 @@ def map_points(
 ) -> Correspondences:
     """Convert points to the pixels of another camera with the same centre, without distortion.
 
-    Their covariances and the image centre, where given, are transformed as well. R (3, 3) is from the
-    camera's frame to that of the new one, where it is turned as well. Raises InputError for a pixel that the
-    distortion does not reach, or that a plane cannot show, named by its file and line.
+    Their covariances and the image centre, where given, are transformed as well. If the camera has
+    distortion, `undistorted` of the result names the shape. R (3, 3) is from the camera's frame to that of
+    the new one, where it is turned as well. Raises InputError for a pixel that the distortion does not
+    reach, or that a plane cannot show, named by its file and line.
     """
     pixels = undistort_pixels(camera, new, points.pixels, R)
     lost = ~np.isfinite(pixels[:, 0])
@@ -261,6 +262,8 @@ def map_points(
         )
     size = points.image_size and new.image_size
     undistorted = replace(points, pixels=pixels, image_size=size)
+    if not camera.distortion.is_identity:
+        undistorted = replace(undistorted, undistorted="plane" if isinstance(new, Camera) else new.shape)
     if points.covariance is not None:
         # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
         M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels, R))

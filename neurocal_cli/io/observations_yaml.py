@@ -42,6 +42,8 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
     yield "observations:"
     yield f"  columns: [{', '.join(columns)}]"
+    if points.undistorted:
+        yield f"  undistorted: {points.undistorted}"
     if points.distances:
         yield "  distances:  # from, to, length, std"
         for one in points.distances:
@@ -138,6 +140,7 @@ def read_observations(
             point=labels.get("point"),
             **known,
             distances=_distances(observations.get("distances", [])),
+            undistorted=observations.get("undistorted", "").text(),
             image_size=image_size,
             image_center=image_center,
             unit=unit,

@@ -120,7 +120,8 @@ def _metadata_lines(points: Correspondences) -> list[str]:
     if points.distances:
         rows = [[one.start, one.end, one.length, one.std] for one in points.distances]
         lines.append(f"# distances: {json.dumps(rows)}")
-    return [*lines, f"# unit: {points.unit}"]
+    lines.append(f"# unit: {points.unit}")
+    return [*lines, f"# undistorted: {points.undistorted}"] if points.undistorted else lines
 
 
 def _quoted(label: str, name: str) -> str:
@@ -153,6 +154,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
         distances=_agreed("distances", tables) or () if points is not None or not several else (),
+        undistorted=_undistorted(tables, notes),
         unit=_agreed("unit", tables) or "mm",
         source=tables[0].source,
         lines=_joined([table.lines for table in tables]),
@@ -203,6 +205,18 @@ def _agreed(key: str, tables: list[Table]) -> Any:
                 source,
             )
     return given[0][0] if given else None
+
+
+def _undistorted(tables: list[Table], notes: list[str]) -> str:
+    """What all files say, or else some of them, with a note on those that do not."""
+    shape = str(_agreed("undistorted", tables) or "")
+    others = [table.source for table in tables if table.metadata.undistorted is None]
+    if shape and others:
+        notes.append(
+            f"{others[0]}: the points of other files are undistorted, and those of this file are taken for "
+            "undistorted, too; give the points of one camera as they were measured, or all undistorted"
+        )
+    return shape
 
 
 def _plain(value: Any) -> str:

@@ -14,6 +14,7 @@ from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import one_line, value_failures
+from neurocal_cli.points import UNDISTORTED
 
 # Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
@@ -21,7 +22,7 @@ is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 # 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
-_METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", re.DOTALL)
+_METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances|undistorted)\s*:(.*)", re.DOTALL)
 _KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
 _ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
 _COMMAS = 1.6  # values over those expected; u,v and most of X,Y,Z have decimals, labels have none
@@ -53,6 +54,7 @@ class Metadata:
     image_center: tuple[float, float] | None = None  # px
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
+    undistorted: str | None = None  # one of `UNDISTORTED`
     misspelt: list[str] = field(default_factory=list)  # numbers of lines that are nearly metadata, and hints
 
     def take(self, line: str, number: int) -> None:
@@ -109,6 +111,7 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
     "image_size": (_size, "two whole numbers as in `# image_size: 640 480`"),
     "image_center": (_centre, "two numbers as in `# image_center: 320 240`"),
     "distances": (_distances, 'a list as in `# distances: [["0:0", "8:5", 212.3, 0.05]]`'),
+    "undistorted": (lambda text: text if text in UNDISTORTED else None, f"one of {', '.join(UNDISTORTED)}"),
     "unit": (lambda text: text or None, "a name as in `# unit: mm`"),
 }
 

@@ -12,7 +12,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.evaluation import other_images, predict, refuse_another_size
@@ -130,6 +130,7 @@ class _Evaluator:
         if self.given:
             for camera, given in zip(cameras, self.points, strict=True):
                 _refuse_other(camera, given)
+                self.warnings += [why] if (why := undistorted_before(given, camera)) else []
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
         known = [

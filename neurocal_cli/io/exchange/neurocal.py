@@ -39,6 +39,18 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
     return camera_set(calibration_from_field(root))
 
 
+def without_points(root: Field, camera: CameraSet) -> Calibration:
+    """A calibration without its poses and points, from its file and the camera in it."""
+    block = neurocal_block(root)
+    own = covariance_from_field(block, "covariance")
+    names, covariance = own if own[0] else covariance_from_field(block, "given_covariance")
+    undistorted = block["observations"].get("undistorted", "").text() if "observations" in block else ""
+    with value_failures(root.source):
+        points = Correspondences.none(camera.cameras[0].image_size, _UNKNOWN, undistorted)
+    calibration = replace(_calibration(camera, 0), points=points)
+    return replace(calibration, covariance=covariance, covariance_names=names)
+
+
 def camera_set(result: Calibration | Rig) -> CameraSet:
     """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
     left = result if isinstance(result, Calibration) else result.left
