@@ -130,6 +130,9 @@ class Calibration:
     covariance : (n, n) array
         Of the free intrinsic parameters, in the order of `covariance_names`; `views` holds the standard
         deviations of the poses.
+    given_covariance : (n, n) array
+        Of a given camera's parameters (type 3), in the order of `given_names`, as far as it is known. The
+        standard deviations of the poses include it, and those of the given parameters themselves are 0.
     warnings : tuple of str
         Warnings, which the command prints.
     """
@@ -151,6 +154,8 @@ class Calibration:
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     covariance_names: tuple[str, ...] = ()
+    given_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    given_names: tuple[str, ...] = ()
     network: NetworkRecord | None = None
     straight_lines: StraightLines | None = None
     camera_name: str = "camera"
@@ -177,6 +182,19 @@ class Calibration:
         """The camera without poses and statistics."""
         distortion = Distortion(self.distortion_model, self.distortion)
         return Camera(self.intrinsics, distortion, self.image_size, self.camera_name)
+
+    @property
+    def known_covariance(self) -> tuple[tuple[str, ...], Array]:
+        """Names and covariance of the parameters whose uncertainty is known, whether estimated or given."""
+        if self.covariance_names:
+            return self.covariance_names, self.covariance
+        return self.given_names, self.given_covariance
+
+    @property
+    def std_of_given(self) -> dict[str, float]:
+        """Standard deviations that given parameters have in their own calibration, as far as it is known."""
+        std = np.sqrt(np.maximum(np.diagonal(self.given_covariance), 0.0)).tolist()
+        return dict(zip(self.given_names, std, strict=True))
 
     @property
     def K(self) -> Array:

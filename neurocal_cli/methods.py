@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.calibration import Calibration, Rejected, camera_of
+from neurocal_cli.calibration import Calibration, Rejected, camera_of, undistorted_before
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion
@@ -19,6 +19,7 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choic
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options, Progress, options_for
 from neurocal_cli.pipeline.fit import fit
+from neurocal_cli.pipeline.given_camera import with_given_covariance
 from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
@@ -75,7 +76,8 @@ def calibrate(
     image_center : (u0, v0), optional [px]
         For type 2. Default: that of the points, else the middle of their image size.
     intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
-        For type 3. A Camera or Calibration includes its distortion.
+        For type 3. A Camera or Calibration includes its distortion. The standard deviations of the poses
+        include the covariance of a Calibration; any other camera is taken as exact.
     extrinsics : dict of Pose by view name or Calibration, optional
         For type 4. Of a Calibration, the poses of its views.
     method : {"neuro", "linear", "nonlinear", "tsai"}
@@ -217,7 +219,8 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
     given = camera_of(camera)
     problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)
     solution = fit(problem, options_for("lm", _STARTS, seed))
-    return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+    found = calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+    return with_given_covariance(found, camera) if isinstance(camera, Calibration) else found
 
 
 def _distortion_of(method: str, distortion: str) -> str:

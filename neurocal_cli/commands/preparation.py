@@ -78,11 +78,14 @@ def given_points(names: str | Sequence[str]) -> Correspondences:
     return points
 
 
-def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
-    """Read a known camera of the points' image size; give the points its image size if they have none."""
-    from neurocal_cli.io.exchange.reading import read_intrinsics
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera | Calibration]:
+    """Read a known camera of the points' image size; give the points its image size if they have none.
 
-    camera = read_intrinsics(path)
+    Of a neurocal file it is a Calibration without poses and points, but with its covariance.
+    """
+    from neurocal_cli.io.exchange.reading import read_given_camera
+
+    camera = read_given_camera(path)
     if camera.image_size is not None:
         if points.image_size is None:
             points = replace(points, image_size=camera.image_size)
@@ -99,6 +102,7 @@ def calibration_or_camera(
     name: str, points: Correspondences | None, besides: str = ""
 ) -> tuple[Calibration | Camera, Correspondences | None]:
     """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
+    from neurocal_cli.calibration import camera_of
     from neurocal_cli.io.calibration_yaml import read_calibration
 
     try:
@@ -112,7 +116,7 @@ def calibration_or_camera(
             raise error from None
         why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
         note(f"only the intrinsic parameters and the distortion are used{besides}: {why}")
-    return camera, points
+    return camera_of(camera), points
 
 
 def warn_of_poor(rig: Rig, so: str = "") -> None:

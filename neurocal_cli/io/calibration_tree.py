@@ -44,10 +44,8 @@ def calibration_from_field(root: Field) -> Calibration:
     kind = block["type"].integer()
     if kind not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
-    stated = block.get("covariance", {"names": []})
-    names = tuple(stated["names"].texts())
-    size = len(names), len(names)
-    covariance = stated["data"].array(*size, unknown=True) if names else np.zeros(size)
+    names, covariance = covariance_from_field(block, "covariance")
+    given_names, given_covariance = covariance_from_field(block, "given_covariance")
     model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
     return Calibration(
@@ -68,6 +66,8 @@ def calibration_from_field(root: Field) -> Calibration:
         distortion=coefficients,
         covariance=covariance,
         covariance_names=names,
+        given_covariance=given_covariance,
+        given_names=given_names,
         network=block.read("network", _network),
         straight_lines=block.read("straight_lines", _straight_lines),
         camera_name=root.get("camera_name", "camera").text(),

@@ -125,6 +125,9 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
         yield f"  {name}: {mapping(**entry)}"
     names = f"[{', '.join(map(text, cal.covariance_names))}]"
     yield f"covariance: {mapping(names=names, data=flow(cal.covariance))}"
+    if cal.given_names:
+        names = f"[{', '.join(map(text, cal.given_names))}]"
+        yield f"given_covariance: {mapping(names=names, data=flow(cal.given_covariance))}"
     yield "fit: " + mapping(
         n_points=str(len(cal.points)),
         n_rejected=str(cal.n_rejected),

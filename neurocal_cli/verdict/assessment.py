@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
+from neurocal_cli.bundle_adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
@@ -164,6 +165,15 @@ class _AtMinimum:
         self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
         self.covariance, self.wide = known.found.entries, known.wide
         self.pose_covariance = known.found.poses
+        if calibration.given_names:
+            self.pose_covariance = self.pose_covariance + self._by_given_camera()
+
+    def _by_given_camera(self) -> Array:
+        """(V, 6, 6) covariance of the poses, normalised, that the given camera's covariance causes."""
+        c, model = self.calibration, self.state.model
+        scale = self.views.pixel_scale
+        entries = entry_covariance(c.intrinsics, model, c.given_names, c.given_covariance, scale)
+        return covariance_by_camera(self.views, self.state, entries)
 
     def _arranged(self, points: Correspondences) -> Views:
         """The points, at these or other world coordinates, with the weights that the residuals bear out."""
@@ -345,10 +355,12 @@ class _AtMinimum:
 
 def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
     """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
-    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
-    place = [names.index(name) for name in calibration.covariance_names]
-    to_entries = np.eye(len(names))
-    to_entries[:5, :5] = np.linalg.inv(calibration.intrinsics.entry_jacobian() * pixel_scale)
-    block = to_entries[:, place] @ calibration.covariance @ to_entries[:, place].T
+    block = entry_covariance(
+        calibration.intrinsics,
+        calibration.distortion_model,
+        calibration.covariance_names,
+        calibration.covariance,
+        pixel_scale,
+    )
     free = free_entries(calibration)
     return free, np.asarray(block[np.ix_(free, free)])

@@ -157,7 +157,8 @@ def given_parameters(
 
 def _given(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     """Findings about given parameters: those that the points contradict, and those that harm the poses."""
-    found = list(given_parameters(e.reestimated, calibration.intrinsics, calibration.std))
+    std = dict(calibration.std) | calibration.std_of_given
+    found = list(given_parameters(e.reestimated, calibration.intrinsics, std))
     doubt, grade = e.doubt, max((grade for grade, *_ in found), default=0)
     if doubt is None or (grade and doubt.what != "distortion"):
         yield from found

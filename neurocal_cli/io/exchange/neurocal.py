@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, ViewResult
@@ -11,12 +13,15 @@ from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.calibration_tree import (
     calibration_from_field,
+    covariance_from_field,
     distortion_from_field,
     intrinsics_from_field,
+    neurocal_block,
 )
 from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.rig_yaml import format_rig, rig_from_field
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
@@ -57,9 +58,24 @@ def read_intrinsics(path: str | Path) -> Camera:
     """Read a single camera without its poses, from any file of `read_cameras`."""
     found = read_cameras([path], whole=False)
     if len(found.cameras) > 1:
-        source = "<stdin>" if str(path) == "-" else one_line(path)
-        raise FormatError("is a stereo rig; give the file of one camera", source)
+        raise FormatError("is a stereo rig; give the file of one camera", _source(str(path)))
     return found.cameras[0]
+
+
+def read_given_camera(path: str | Path) -> Camera | Calibration:
+    """Read a single camera without its poses; of a neurocal file also the covariance of its parameters."""
+    name = str(path)
+    opened = _opened(name)
+    found = _cameras(opened, whole=False)
+    if len(found.cameras) > 1:
+        raise FormatError("is a stereo rig; give the file of one camera", _source(name))
+    if isinstance(opened, Field) and found.program == "neurocal":
+        return neurocal.without_points(opened, found)
+    return found.cameras[0]
+
+
+def _source(name: str) -> str:
+    return "<stdin>" if name == "-" else one_line(name)
 
 
 def _opened(name: str) -> CameraSet | Field:
