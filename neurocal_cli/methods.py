@@ -190,6 +190,14 @@ def calibrate(
         raise DegenerateGeometryError(text) from error
 
 
+def _true_cause(points: Correspondences, type: int) -> str:
+    """Why points are refused, if it is another cause than what the refusal says; else ""."""
+    from neurocal_cli.verdict.proportions import MEASURE_AXES, proportions, unlike_axes
+
+    found = proportions(points) if type in (1, 2) else None
+    return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
+
+
 def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
     """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
     if outliers == "reject":

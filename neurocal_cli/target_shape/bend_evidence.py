@@ -11,6 +11,7 @@ than the others, because a single odd view is no bending board, and the bends mu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -97,7 +98,10 @@ def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:
     for fold in range(n_folds):
         out = np.arange(sight.views.n_views) % n_folds == fold
         rest, own = of_views(sight, whole, ~out), [of_views(sight, half, out) for half in halves]
-        ratio += np.log(_lost(rest, own, precision) / _lost(rest, own, None))
+        bent, straight = _lost(rest, own, precision), _lost(rest, own, None)
+        if not min(bent, straight) > 0:  # rounding: a camera that fits nothing predicts nothing
+            return False
+        ratio += math.log(bent / straight)
     return bool(ratio < 0)
 
 

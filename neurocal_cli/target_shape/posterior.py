@@ -258,6 +258,8 @@ class _Parts:
         return self._solution(ratios, self.system.solve(ratios))
 
     def _solution(self, ratios: dict[str, float], solved: Solved) -> _Solution:
+        if not solved.cost > 0:  # rounding: without a camera that fits at all, the quadratic means nothing
+            raise np.linalg.LinAlgError("the least squared error is not positive")
         evidence = log_evidence(self.spare, solved.cost, solved.logdet - self.log_precision)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 

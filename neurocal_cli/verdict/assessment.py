@@ -8,6 +8,7 @@ Everything is computed from the calibration and its points, so a file can be jud
 * the difference between two halves of the data, in units of its reported uncertainty;
 * the correlation of neighbouring residuals (`residual_correlation`);
 * two cameras among the views, or a changing focal length (`view_groups`);
+* a board whose axes have different units (`proportions`);
 * coefficients that the chosen distortion model lacks (`missing_coefficients`);
 * given parameters that the points contradict (`given_parameters`);
 * the coverage of the image and of directions by the points (`coverage`);
@@ -36,7 +37,7 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, in_cameras
+from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
@@ -62,6 +63,7 @@ from neurocal_cli.verdict.projection_uncertainty import (
     image_grid,
     projection_uncertainty,
 )
+from neurocal_cli.verdict.proportions import Proportions, proportions
 from neurocal_cli.verdict.rules import reach_verdict
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
@@ -71,6 +73,7 @@ _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plan
 # Relative change of the focal length that bends of single views can mimic: 0.26 % in one of 18 sets of
 # photographs and their halves, and none in simulated boards that bend from view to view.
 _BY_FLEXING = 0.005
+_CONTRADICTED = 1.6  # error over the noise floor from which on the board's proportions are tested
 _EXACT = 1e-4  # of the spread of the pixels: negligible errors
 _DISTANT = 10.0  # times the distance of the farthest point
 
@@ -212,8 +215,10 @@ class _AtMinimum:
                 *stated_survey(self.calibration.target),
                 *noise_shape(self.points, residuals, alike),
             ),
+            stated=bool(stated),
             groups=None if stated else self._groups(),
             missing=self._missing(),
+            proportions=self._proportions(contradiction),
         )
 
     def _reestimated(self) -> tuple[Reestimated, ...]:
@@ -318,6 +323,12 @@ class _AtMinimum:
         std = np.zeros(len(self.free))
         std[self.free] = np.sqrt(np.diagonal(self.covariance))
         return missing_coefficients(self.minimum, std[:5])
+
+    def _proportions(self, contradiction: float) -> Proportions | None:
+        given = self.calibration.target is None and self.calibration.type in (1, 2)
+        if not given or self._is_exact() or not contradiction > _CONTRADICTED:
+            return None
+        return proportions(self.points)
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

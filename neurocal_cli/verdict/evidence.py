@@ -9,13 +9,14 @@ from neurocal_cli.verdict.findings import Finding
 from neurocal_cli.verdict.given_parameters import Doubt, Reestimated
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
+from neurocal_cli.verdict.proportions import Proportions
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """Measures of a calibration's quality; the last four are None if there is nothing of the kind."""
+    """Measures of a calibration's quality; the last five are None if there is nothing of the kind."""
 
     rmse_px: float  # rms reprojection error of the calibration
     held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
@@ -42,3 +43,4 @@ class Evidence:
     change: ViewChange | None  # of the camera between views
     board: BoardShape | None  # bend or stretch of a target that is given as flat
     missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks
+    proportions: Proportions | None  # of a board whose axes have different units

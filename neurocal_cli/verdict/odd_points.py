@@ -195,7 +195,7 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     for ratio in np.unique(np.round(np.log(step[off] / usual), 3)):
         names = np.array(points.view_names)[off & (np.abs(np.log(step / usual) - ratio) < _ROUND)]
         factor = float(np.exp(abs(ratio)))
-        unit = next((text for known, text in _UNITS.items() if abs(factor / known - 1) < _ROUND), "")
+        unit = units_mixed(factor)
         yield (
             1,
             f"{name_some(names)}: the points lie {float(f'{factor:.3g}'):g} times "
@@ -205,6 +205,11 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
             if unit
             else "check the unit of X,Y,Z and the size of the squares in these views",
         )
+
+
+def units_mixed(factor: float) -> str:
+    """The two units of length whose ratio this factor (above 1) is; "" for no known ones."""
+    return next((text for known, text in _UNITS.items() if abs(factor / known - 1) < _ROUND), "")
 
 
 def _steps(worlds: list[Array]) -> Array:

@@ -15,6 +15,7 @@ from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import Doubt, Reestimated, told_apart
 from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
+from neurocal_cli.verdict.proportions import MEASURE_AXES, unlike_axes
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
@@ -76,6 +77,10 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         return
     if _oblong(calibration):  # a target stretched in one direction makes views differ as well
         evidence = replace(evidence, groups=None)
+    axes = evidence.proportions
+    if axes is not None:  # the axes of the board explain what would be taken for another cause
+        evidence = replace(evidence, groups=None, change=None, board=None, missing=None)
+        yield 2, unlike_axes(axes), MEASURE_AXES
     if not calibration.converged:
         named = not calibration.lens_choice and calibration.distortion_model != "none"
         slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
@@ -123,7 +128,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             0 if flexes else _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            f"deviations{'' if e.groups or e.missing else _NO_SINGLE_CAMERA}",
+            f"deviations{'' if e.groups or e.missing or e.proportions or e.stated else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )

@@ -51,6 +51,17 @@ def poses(n: int, seed: int) -> list[Pose]:
     return found
 
 
+def turned_poses(n: int, seed: int, most: float = np.pi) -> list[Pose]:
+    """The board turned in its plane by any angle up to the largest, too."""
+    rng = np.random.default_rng(seed + 99)
+    centre = np.array([(COLS - 1) / 2, (ROWS - 1) / 2, 0.0]) * SQUARE
+    found = []
+    for pose in poses(n, seed):
+        R = pose.R @ Pose.from_euler(0, 0, rng.uniform(-most, most), np.zeros(3)).R
+        found.append(Pose(R, (pose.R @ centre + pose.t) * [0.5, 0.5, 1.2] - R @ centre))
+    return found
+
+
 def seen(
     world: np.ndarray, some: list[Pose], A: np.ndarray, seed: int, sigma: float = 0.2
 ) -> Correspondences:
@@ -247,6 +258,12 @@ FLAT: dict[str, Spoiler] = {
     "squares 10 % too long along X": lambda p, rng: scaled(p, [1.1, 1, 1], range(10)),
     "squares 5 % too long along Y": lambda p, rng: scaled(p, [1, 1.05, 1], range(10)),
     "X in mm, Y in cm": lambda p, rng: scaled(p, [1, 0.1, 1], range(10)),
+    "X in inches, Y in mm, the board turned": lambda p, rng: scaled(
+        seen(board(), turned_poses(10, 1), CAMERA.A, 1), [1 / 25.4, 1, 1], range(10)
+    ),
+    "squares 30 % too long along Y, the board turned": lambda p, rng: scaled(
+        seen(board(), turned_poses(10, 1), CAMERA.A, 1), [1, 1.3, 1], range(10)
+    ),
     "half of the views in inches": lambda p, rng: scaled(p, [1 / 25.4] * 3, range(5)),
     "one view with another square": lambda p, rng: scaled(p, [1.5] * 3, [2]),
     "two cameras mixed": lambda p, rng: of_cameras([600.0, 800.0]),
@@ -407,6 +424,8 @@ CAUSES: dict[str, str] = {
     "squares 10 % too long along X": "not square",
     "squares 5 % too long along Y": "not square",
     "X in mm, Y in cm": "not square",
+    "X in inches, Y in mm, the board turned": "X is 25.4 times as long as given",
+    "squares 30 % too long along Y, the board turned": "X is 1.3 times as long as given",
     "half of the views in inches": "inches and millimetres mixed",
     "one view with another square": "view02: the points lie 1.5 times",
     "two cameras mixed": "two cameras",
@@ -516,6 +535,7 @@ SLOW = frozenset(
         "half of the images through another lens",
         "two cameras mixed",
         "X in mm, Y in cm",
+        "squares 30 % too long along Y, the board turned",
         "Z full of noise",
         "a fifth of the pixels anywhere",
         "all views alike",
