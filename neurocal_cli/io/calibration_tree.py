@@ -82,6 +82,14 @@ def calibration_from_field(root: Field) -> Calibration:
     )
 
 
+def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Array]:
+    """Read the names and the covariance under a key of the neurocal block; none if it is not there."""
+    stated = block.get(key, {"names": []})
+    names = tuple(stated["names"].texts())
+    size = len(names), len(names)
+    return names, stated["data"].array(*size, unknown=True) if names else np.zeros(size)
+
+
 def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):

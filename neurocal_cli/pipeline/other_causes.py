@@ -11,6 +11,7 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.target_shape.find import Found, evidence_as_given
@@ -32,10 +33,8 @@ _ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
 def has_other_cause(solution: Solution, found: Found) -> bool:
     """Whether the errors on the given target have another cause than its shape."""
-    problem, points = solution.problem, solution.problem.points
-    place = np.array([problem.views.names.index(name) for name in points.view_names])
-    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
-    if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
+    problem = solution.problem
+    if contradicts_sigma(solution):
         return True
     named = solution.model_errors is None and solution.straight_lines is None
     if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
@@ -47,6 +46,17 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         or _are_two_cameras(solution, found)
         or _changes_between_views(solution, found)
     )
+
+
+def contradicts_sigma(solution: Solution) -> bool:
+    """Whether the residuals contradict the stated standard deviations of the pixels."""
+    problem, points = solution.problem, solution.problem.points
+    if points.covariance is None:
+        return False
+    place = np.array([problem.views.names.index(name) for name in points.view_names])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    alike = correlation(problem.views, point_residuals(problem.views, solution.state))
+    return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 
 
 def _given_is_wrong(solution: Solution, found: Found) -> bool:

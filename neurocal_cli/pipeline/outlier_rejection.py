@@ -31,6 +31,7 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.initialisation.radial_networks import middle_of_image
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
+from neurocal_cli.pipeline.other_causes import contradicts_sigma
 from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.points import Correspondences
 
@@ -251,7 +252,9 @@ class _Search:
         return Rejected(self.points.select(rows), known, dict(self.wrong_views))
 
     def _explain(self) -> None:
-        """Diagnose each view that was left out."""
+        """Diagnose each view that was left out, unless wrong sigmas may be why it was."""
+        if contradicts_sigma(self.solution):
+            return
         for name, reason in self.wrong_views.items():
             rows = self.points.view_index == self.points.view_names.index(name)
             plain = replace(self.points.select(rows), covariance=None, across=None)

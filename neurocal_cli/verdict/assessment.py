@@ -192,7 +192,7 @@ class _AtMinimum:
         found = self.calibration.target is not None
         noise = self.variance * (max(contradiction, 1.0) ** 2 if found else 1.0)
         alike, residuals = correlation(views, self.errors), self._residuals()
-        stated = tuple(stated_noise(self.points, residuals))
+        stated = tuple(stated_noise(self.points, residuals, alike))
         return Evidence(
             rmse_px=self.calibration.rmse_px,
             held_out_px=self._held_out(),
@@ -205,8 +205,9 @@ class _AtMinimum:
             projection=self.projection(),
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
-            change=self._change(noise),
-            board=self._board(),
+            # Sigmas that are wrong give single points the weight that all this is computed with.
+            change=None if stated else self._change(noise),
+            board=None if stated else self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
             doubt=self._doubt(),

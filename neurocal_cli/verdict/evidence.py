@@ -38,6 +38,7 @@ class Evidence:
     reestimated: tuple[Reestimated, ...]  # given parameters, estimated from the points
     doubt: Doubt | None  # another camera that explains the points better than a given one, with other poses
     noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
+    stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
     poses: int  # number of different poses among the views (`repeated_poses`)
     groups: ViewGroups | None  # two cameras among the views, or a changing focal length
     change: ViewChange | None  # of the camera between views

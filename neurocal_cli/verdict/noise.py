@@ -12,6 +12,8 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.common_noise import common_share, measured
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
+from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 from neurocal_cli.verdict.findings import Finding, name_some, pixel_spread
@@ -23,6 +25,9 @@ _SYSTEMATIC = 0.5  # correlation of neighbouring residuals above which the targe
 _FEWEST = 12  # fewest points; 12 determine a std to a fifth
 _ROUNDING = 1e-4  # of the pixels' spread
 _SHARE = 0.5  # common share of the noise from which on the stated sigmas are wrong
+# Points with a sigma below this share of the median one are compared with the others, from so many on.
+_FAR_BELOW, _FEWEST_SMALL = 0.5, 6
+_CHANCE = 4.75  # sigmas: one clean set in a million
 _FACTOR = 2.0  # between views whose sigma is too small and the others
 
 
@@ -57,15 +62,20 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
         )
 
 
-def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]:
-    """Findings about views whose sigma is too small, and about sigmas unrelated to the residuals (N, 2) [px].
+def stated_noise(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
+    """Findings about points or views whose sigma is too small, or unrelated to the residuals (N, 2) [px].
 
+    A few points with a small sigma have most of the weight, so all else that seems wrong may come from them.
+    If neighbouring residuals are correlated, it is the target or the lens that makes them larger than sigma.
     Covariances measured by a detector are not judged here, because `reweighting` handles them.
     """
     covariance = points.covariance
     if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:
         return
+    advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
     if common_share(covariance, residuals) < _SHARE:
+        if correlation <= _SYSTEMATIC:
+            yield from _too_small_at_some(np.sqrt(covariance[:, 0]), residuals, advice)
         return
     V = points.n_views
     counts = np.bincount(points.view_index, minlength=V)
@@ -74,13 +84,31 @@ def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]
     order = np.sort(level)
     step = int(np.argmax(order[1:] / order[:-1])) if V > 1 else 0  # the largest gap between two views
     small = (level > order[step]) & (counts >= _FEWEST)
-    advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
     if V > 1 and small.any() and order[step + 1] > _FACTOR * order[step]:
         names = np.array(points.view_names)[small]
         factor = float(np.median(level[small])) / float(np.median(level[~small]))
         yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
     else:
         yield 1, "the stated sigmas do not predict the residuals", advice
+
+
+def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[Finding]:
+    """Finding about the points of the smallest sigma (N,), if their residuals are not as small."""
+    usual = median(sigma)
+    few = sigma < _FAR_BELOW * usual
+    n = int(few.sum())
+    if n < _FEWEST_SMALL:
+        return
+    squared = (residuals**2).sum(axis=1) / sigma**2
+    ratio = float(squared[few].mean() / max(squared[~few].mean(), 1e-300))
+    if ratio > max(_FACTOR**2, float(exceeded_by_chance(2 * n, _CHANCE))):
+        yield (
+            1,
+            f"{n} points have a stated sigma of {median(sigma[few]):.2g} px, but their residuals are "
+            f"{np.sqrt(ratio):.2g} times as large for their sigma as those of the others, with {usual:.2g} "
+            "px",
+            advice,
+        )
 
 
 def stated_survey(target: Target | None) -> Iterator[Finding]:

@@ -333,6 +333,9 @@ FLAT: dict[str, Spoiler] = {
     "sigma of half of the views ten times too small": lambda p, rng: with_sigma(
         p, np.where(in_views(p, range(5)), 0.02, 0.2)
     ),
+    "sigma of 3 % of the points ten times too small": lambda p, rng: with_sigma(
+        p, np.where(rng.random(len(p)) < 0.03, 0.02, 0.2)
+    ),
     "sigmas at random": lambda p, rng: with_sigma(p, 0.2 * 10 ** rng.uniform(-1, 1, len(p))),
     "type 3 with a centre 15 px off": lambda p, rng: Input(
         p, {"type": 3, "intrinsics": Intrinsics(600.0, 600.0, 333.0, 243.0, np.pi / 2)}
@@ -469,6 +472,7 @@ CAUSES: dict[str, str] = {
     "one point far outside the image": "1 point lies outside",
     "sigma of one view ten times too small": "view03: the stated sigma is",
     "sigma of half of the views ten times too small": "the stated sigma is",
+    "sigma of 3 % of the points ten times too small": "points have a stated sigma of 0.02 px",
     "sigmas at random": "the stated sigmas",
     "type 3 with a centre 15 px off": "u0 = 333 is given",
     "type 3 with the camera of half the size": "alpha_u = 300 is given",

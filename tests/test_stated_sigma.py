@@ -1,0 +1,63 @@
+"""A few points whose stated sigma is far too small are named as the cause, and no other cause is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.slow_cases import slow_but
+from support.wrong_inputs import CAMERA, bent_board, board, flat, poses, seen, with_sigma
+
+from neurocal_cli import Correspondences, calibrate
+
+NAMED = "points have a stated sigma of 0.02 px, but their residuals are"
+FALSE = (
+    "repeat on the board",
+    "the focal length",
+    "the size of the image",
+    "target of another shape",
+    "zoom",
+)
+
+
+def few(n: int, share: float, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).random(n) < share
+
+
+def reasons(points: Correspondences) -> tuple[str, ...]:
+    verdict = calibrate(points).verdict
+    assert verdict is not None
+    return verdict.reasons
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.1])
+@pytest.mark.parametrize("seed", slow_but({0}, range(5)))
+def test_a_sigma_that_is_too_small_is_named_alone(share: float, seed: int) -> None:
+    points = flat(seed + 1)
+    told = reasons(with_sigma(points, np.where(few(len(points), share, seed), 0.02, 0.2)))
+    assert any(NAMED in reason or "sigmas do not predict" in reason for reason in told)
+    assert share > 0.02 or any(NAMED in reason for reason in told)
+    others = [reason for reason in told if "std of the focal length" not in reason]
+    assert not any(words in reason for reason in others for words in FALSE), told
+
+
+@pytest.mark.parametrize("share", slow_but({0.03}, [0.01, 0.03, 0.1, 0.4]))
+@pytest.mark.parametrize("seed", slow_but({0}, range(5)))
+def test_a_sigma_that_is_true_is_not_named(share: float, seed: int) -> None:
+    """Some points are measured ten times better, and say so."""
+    exact = seen(board(), poses(10, seed), CAMERA.A, seed)
+    clean = seen(board(), poses(10, seed), CAMERA.A, seed)
+    rng = np.random.default_rng(seed)
+    better = few(len(exact), share, seed)
+    noise = 0.2 * np.random.default_rng(seed).normal(size=(len(exact), 2))
+    pixels = clean.pixels - noise + np.where(better, 0.02, 0.2)[:, None] * rng.normal(size=noise.shape)
+    points = with_sigma(replace(exact, pixels=pixels), np.where(better, 0.02, 0.2))
+    assert not any("sigma" in reason for reason in reasons(points))
+
+
+def test_a_bent_board_is_no_wrong_sigma() -> None:
+    points = bent_board(flat(), 4.0)
+    told = calibrate(with_sigma(points, np.where(few(len(points), 0.03, 1), 0.1, 0.2))).verdict
+    assert told is not None
+    assert not any("stated sigma of" in reason for reason in told.reasons)
