@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.rigs import RigScene, random_rig
-from support.wrong_rigs import in_parts, jolted, loose, scene, seen, turned, zoomed
+from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
 from neurocal_cli import Correspondences, calibrate, fit_rig
 from neurocal_cli.geometry import rotation_step, rotation_vector
@@ -165,3 +165,18 @@ def test_three_pairs_of_cameras_that_are_poorly_known_are_not_blamed(seed: int) 
     some = random_rig(np.random.default_rng(seed), "verging", 3, lens="k1k2")
     points = seen(replace(some, names=("left{}", "right{}")), 0.7, seed)
     assert not odd_pairs(made(points, "k1k2", True)[1], np.ones(3, dtype=bool)).any()
+
+
+@pytest.mark.parametrize("at", [4, 6, 9])
+@pytest.mark.parametrize("factor", [1.005, 0.98, 1.1])
+def test_a_target_of_another_size_is_no_rig_that_moved(factor: float, at: int) -> None:
+    told = found(in_parts(scene(), enlarged(scene(), factor), at, right_only=False))
+    assert (told.kind, told.at) == ("size", at)
+    assert 1 + told.amount == pytest.approx(1 / factor, abs=0.0015)
+    assert told.rest < 1.5
+
+
+def test_a_rig_that_moved_is_no_target_of_another_size() -> None:
+    for degrees, shift in ((0.1, 0.0), (0.5, 1.0), (0.05, 2.0)):
+        told = found(in_parts(scene(), turned(scene(), degrees, shift), 6))
+        assert (told.kind, told.at) == ("moved", 6)

@@ -30,7 +30,14 @@ from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.sound_pairs import MOVED, UNSYNCHRONISED, describe_faults, describe_move, pair_name
+from neurocal_cli.stereo.sound_pairs import (
+    MOVED,
+    TWO_GEOMETRIES,
+    UNSYNCHRONISED,
+    describe_faults,
+    describe_move,
+    pair_name,
+)
 from neurocal_cli.stereo.triangulation import triangulate
 from neurocal_cli.verdict.assessment import assess
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
@@ -128,7 +135,7 @@ def _moved(
     either = np.array([reason == UNSYNCHRONISED or reason.startswith(MOVED) for reason in reasons])
     if either.any():
         found = contradiction(poses, used | either)
-    return found if found.kind == "moved" else None
+    return found if found.kind in TWO_GEOMETRIES else None
 
 
 def _displacement(poses: RelativePoses, used: NDArray[np.bool_]) -> float:
@@ -218,7 +225,7 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if found.kind in ("left focal", "right focal", "late", "early"):
         yield _changed(e, found)
         return
-    if found.kind == "moved":
+    if found.kind in TWO_GEOMETRIES:
         return
     poor = "the relative pose of the cameras differs from pair to pair"
     yield (
@@ -234,7 +241,7 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
 def _rig_moved(rig: Rig, e: _Evidence, found: Contradiction) -> Finding:
     used = set(rig.pairs)
     kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
-    text, advice = describe_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
+    text, advice = describe_move(e.names, e.size, found, kept[0] if len(kept) == 1 else ())
     return _CHANGE.grade(found.gain), text, advice
 
 

@@ -1,8 +1,10 @@
 """Test whether the pairs of views agree on one rig, and find the best explanation if they do not.
 
 With one rig for all pairs the sum of squares of `relative_poses` is a chi-squared variable of 6 (P - 1)
-degrees of freedom. Each explanation adds a few unknowns: a second rig or a second focal length from some pair
-on, or a share of the target's motion from pair to pair. The Bayesian information criterion compares them:
+degrees of freedom. Each explanation adds a few unknowns: a second rig, another size of the target or a
+second focal length from some pair on, or a share of the target's motion from pair to pair. Where the target
+is larger than its points say, both cameras seem nearer to it, and nothing but the baseline seems shorter. The
+Bayesian information criterion compares them:
 
     N log(s^2) + p log N,
 
@@ -49,13 +51,15 @@ class Contradiction:
     """How much the pairs contradict one rig, and why.
 
     The best explanation is one of: pairs that contradict the others ("odd"); the rig moved between two pairs;
-    the focal length of a camera changed between two pairs; the right images were taken later ("late"), or
-    earlier, than the left ones. It is empty where none is needed, or none is found.
+    from some pair on the target has another size, so that only the length of the baseline differs; the focal
+    length of a camera changed between two pairs; the right images were taken later ("late"), or earlier, than
+    the left ones. It is empty where none is needed, or none is found.
     """
 
-    kind: str  # "", "odd", "moved", "left focal", "right focal", "late", "early"
+    kind: str  # "", "odd", "moved", "size", "left focal", "right focal", "late", "early"
     at: int  # first pair after the change
-    amount: float  # relative change of the focal length, or share of the motion to the next (previous) pair
+    # Relative change of the focal length or the baseline, or share of the motion to the next (previous) pair.
+    amount: float
     degrees: int  # of freedom of the scatter
     odd: NDArray[np.bool_]  # (P,) pairs that contradict the others
     scatter: float  # rms of the relative poses of all but the odd pairs about one rig, over that of noise
@@ -125,6 +129,9 @@ def _as_contradiction(
     for side, kind in enumerate(("left focal", "right focal")):
         if found.kind == kind:
             amount = float(np.mean(found.values / poses.problem.cameras[side].entries[0, [0, 2]]))
+    if found.kind == "size":
+        before = poses.reference + (poses.solution(used) - found.shift[0])[poses.rig[3:]]
+        amount = float(found.values[0] * (poses.reference @ before) / max(before @ before, 1e-300))
     gain = float(np.sqrt(found.gain / len(found.values)))
     return Contradiction(
         found.kind, found.at, amount, n, odd, scatter, float(np.sqrt(left)), gain, growth, found.shift
@@ -174,7 +181,7 @@ def _explains(one: _Explanation, squares: float, n: int) -> bool:
 
 
 def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
-    """A second rig, or a second focal length, from some pair on: the best place of each kind."""
+    """A second rig, another size or a second focal length from some pair on: the best place of each kind."""
     places = np.flatnonzero(used)
     if len(places) < 2 * _LEAST_PAIRS:
         return
@@ -189,21 +196,23 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
     after_S = from_starts(np.where(used[:, None, None], poses.pairs.S, 0.0))
     after_g = from_starts(np.where(used[:, None], poses.pairs.g, 0.0))
     own_S, own_g = (from_starts(of[poses.frame]) for of in (poses.cameras.S, poses.cameras.g))
-    kinds = [("moved", poses.rig, after_S, after_g)]
+    unknowns = np.eye(len(S))
+    longer = np.zeros((len(S), 1))
+    longer[poses.rig[3:], 0] = poses.reference
+    kinds = [("moved", unknowns[:, poses.rig], after_S, after_g), ("size", longer, after_S, after_g)]
     for kind, columns in zip(("left focal", "right focal"), poses.focal, strict=True):
         if len(columns) == 2:
-            kinds.append((kind, columns, after_S + own_S, after_g + own_g))
-    for kind, columns, S2, g2 in kinds:
-        cross = S2[:, :, columns]
+            kinds.append((kind, unknowns[:, columns], after_S + own_S, after_g + own_g))
+    for kind, step, S2, g2 in kinds:
+        cross = S2 @ step
         follow = inverse @ cross
-        block = S2[:, columns[:, None], columns] - np.swapaxes(cross, 1, 2) @ follow
-        right = g2[:, columns] - np.swapaxes(cross, 1, 2) @ x
+        block = step.T @ cross - np.swapaxes(cross, 1, 2) @ follow
+        right = g2 @ step - np.swapaxes(cross, 1, 2) @ x
         values = solve_scaled(block, right[..., None], ROUNDING)[..., 0]
         gains = np.nan_to_num((values * right).sum(axis=1), nan=-np.inf)
         k = int(np.argmax(gains))
         before = follow[k] @ values[k]
-        after = before.copy()
-        after[columns] -= values[k]
+        after = before - step @ values[k]
         yield _Explanation(kind, int(starts[k]), float(gains[k]), values[k], np.stack([before, after]))
 
 

@@ -52,6 +52,7 @@ class RelativePoses:
     own: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of the left and the right camera's parameters
     rig: NDArray[np.intp]  # (6,) columns of the rig's step
     focal: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of alpha_u and alpha_v, if they are free
+    reference: Array  # (3,) translation of the reference [`unit`]
     offset: Array  # (P, 6) z
     design: Array  # (P, 6, F) of z by the unknowns
     covariance: Array  # (P, 6, 6) C
@@ -129,8 +130,8 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     counts = [observed.equations_by_view for observed in problem.observations]
     return RelativePoses(
         problem, tuple(names), _both(problem, sides, places, len(columns)), pairs, first, places, rig,
-        (places[0][sides[0].focal], places[1][sides[1].focal]), offset, design, covariance,
-        size, centre * scale[:, None],
+        (places[0][sides[0].focal], places[1][sides[1].focal]), reference.t / problem.unit,
+        offset, design, covariance, size, centre * scale[:, None],
         _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
         counts[0][first] + counts[1][second],
         sum(side.spare for side in sides),

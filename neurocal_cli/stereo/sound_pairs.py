@@ -21,7 +21,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_step
 from neurocal_cli.median import median
 from neurocal_cli.stereo.adjust import RigProblem
-from neurocal_cli.stereo.contradiction import contradiction
+from neurocal_cli.stereo.contradiction import Contradiction, contradiction
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
@@ -40,6 +40,7 @@ _OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they
 _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
 
 UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
+TWO_GEOMETRIES = ("moved", "size")  # kinds of contradiction after which one part of the pairs is used
 MOVED = "taken"  # first word of the reason for pairs taken before or after the rig moved
 
 Pair = tuple[str, str]
@@ -108,34 +109,42 @@ def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs)
     """Leave out the pairs that contradict most others, or the smaller part if the rig moved."""
     why = contradiction(poses, used)
     odd = {pair: UNSYNCHRONISED for pair, is_odd in zip(poses.names, why.odd, strict=True) if is_odd}
-    if why.kind == "moved":
+    if why.kind in TWO_GEOMETRIES:
         found = replace(found, left_out={**found.left_out, **odd})
-        return _larger_part(poses, used & ~why.odd, why.at, found)
+        return _larger_part(poses, used & ~why.odd, why, found)
     return replace(found, left_out={**odd, **found.left_out}, by_chance=not why.is_significant)
 
 
-def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: SoundPairs) -> SoundPairs:
+def _larger_part(
+    poses: RelativePoses, used: NDArray[np.bool_], why: Contradiction, found: SoundPairs
+) -> SoundPairs:
     """The pairs before or after the rig moved; those after it, as the rig is now, if both are as many."""
+    at = why.at
     later = np.arange(len(poses)) >= at
     sides = used & ~later, used & later
     kept = int(sides[1].sum() >= sides[0].sum())
     members = {pair for pair, is_in in zip(poses.names, sides[kept], strict=True) if is_in}
     others = [pair for pair, is_in in zip(poses.names, sides[1 - kept], strict=True) if is_in]
     between = f"between {pair_name(poses.names[at - 1])} and {pair_name(poses.names[at])}"
-    reason = f"{MOVED} {('after', 'before')[kept]} the rig moved {between}"
+    what = "the size of the target changed" if why.kind == "size" else "the rig moved"
+    reason = f"{MOVED} {('after', 'before')[kept]} {what} {between}"
     left_out = {pair: why for pair, why in found.left_out.items() if pair not in members}
     left_out |= dict.fromkeys(others, reason)
     start = poses.solution(sides[kept])[-6:]
     rig = Pose(rotation_step(start[:3]) @ found.rig.R, found.rig.t + start[3:] * poses.unit)
-    text, advice = describe_move(poses.names, poses.size, at, poses.names[at:] if kept else poses.names[:at])
+    own = poses.names[at:] if kept else poses.names[:at]
+    text, advice = describe_move(poses.names, poses.size, why, own)
     return SoundPairs(found.problem, rig, left_out, f"{text}; {advice}")
 
 
-def describe_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
-    """Describe a rig that has two geometries, the second from pair `at` on, with advice.
+def describe_move(
+    names: Sequence[Pair], size: Array, why: Contradiction, kept: Sequence[Pair] = ()
+) -> tuple[str, str]:
+    """Describe a rig that has two geometries, the second from some pair on, with advice.
 
     `size` (P,) is that of each target, and `kept` the part that determines the rig; empty if both do.
     """
+    at = why.at
     this = f"; this is that of {span(kept)}" if kept else ""
     (large, larger), (small, smaller) = sorted(
         ((float(median(size[part])), span(names[part])) for part in (slice(at), slice(at, None))),
@@ -146,6 +155,15 @@ def describe_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pa
             f"the targets in {larger} are {large / small:.3g} times as large as in {smaller}, so the rig has "
             f"two sizes{this}",
             "check the unit of X,Y,Z and the size of the squares",
+        )
+    if why.kind == "size":
+        larger = np.expm1(-np.log1p(why.amount))  # of the later targets, for which the baseline is shorter
+        than = f"{'larger' if larger > 0 else 'smaller'} than in {span(names[:at])}, compared with X,Y,Z"
+        return (
+            f"from {pair_name(names[at])} on nothing but the length of the baseline differs, by "
+            f"{100 * why.amount:+.2g} %: the target in {span(names[at:])} is {100 * abs(larger):.2g} % "
+            f"{than} (or the cameras slid along the line between them){this.replace('this', 'the rig')}",
+            "measure the squares of both targets, and give each target its own X,Y,Z",
         )
     return (
         f"the rig moved between {pair_name(names[at - 1])} and {pair_name(names[at])}: it has two "

@@ -66,6 +66,11 @@ def zoomed(given: RigScene, side: int, factor: float) -> RigScene:
     return replace(given, cameras=(cameras[0], cameras[1]))
 
 
+def enlarged(given: RigScene, factor: float) -> RigScene:
+    """The same with a larger target, whose points have the coordinates of the first one."""
+    return replace(given, world=given.world * factor)
+
+
 def of_targets_moved(given: RigScene, step: Callable[[str, Pose], Pose]) -> Points:
     """The right images show each target where it is after a step."""
     later = replace(given, poses={name: step(name, pose) for name, pose in given.poses.items()})
@@ -186,6 +191,10 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: in_parts(scene(), turned(scene(), 0.5), 4), "moved between left04/right04"),
     "rig knocked by 5 degrees after eight pairs": (
         lambda: in_parts(scene(), turned(scene(), 5.0), 8), "moved between left08/right08"),
+    "squares of another board, 0.3 % larger, half way": (
+        lambda: in_parts(scene(), enlarged(scene(), 1.003), 6, right_only=False), "% larger than in left01"),
+    "squares of another board, 2 % larger, after four pairs": (
+        lambda: in_parts(scene(), enlarged(scene(), 1.02), 4, right_only=False), "2 % larger than in left01"),
     "right camera loose by 0.1 degrees": (
         lambda: loose(scene(), 0.1), "not fixed to each other"),
     "right camera refocused by 0.7 % half way": (
