@@ -15,6 +15,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, Verdict, ViewResult
 from neurocal_cli.camera import rich_lens
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.target import Target, scale_of
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.evaluation import CameraEvaluation
 
 _MOST_VIEWS = 20  # rows of a table that fit on a screen
+_TIED = 1.009  # ratio of cross-validation errors that the choice of the model takes for equal
 _MOST_DECIMALS = 9  # further digits are rounding errors
 _GIVEN = {
     1: "nothing given",
@@ -301,12 +303,24 @@ def _training_lines(calibration: Calibration) -> list[str]:
             f"after; centre of distortion ({u:.1f}, {v:.1f})",
         )
     if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
-        chosen = (
-            f"{calibration.distortion_model}, chosen by cross-validation error and number of coefficients"
-        )
         errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
-        training += [f"distortion model: {chosen}:", f"  {', '.join(errors)} px"]
+        how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
+        training += [
+            f"distortion model: {calibration.distortion_model}, {how}:",
+            f"  {', '.join(errors)} px",
+        ]
     return [fit, *training, calibration.stop_reason]
+
+
+def _among(calibration: Calibration) -> str:
+    """From which models the distortion model was chosen, if one that was excluded has a lower error."""
+    choice, chosen = calibration.lens_choice, calibration.distortion_model
+    error = choice.get(chosen, 0.0)
+    if chosen not in WIDE and any(name in WIDE and other < error for name, other in choice.items()):
+        return " among ordinary lenses, because the points do not decidedly favour a fisheye"
+    if error > _TIED * min(choice.values()):
+        return " among the models that the points support"
+    return ""
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.made_calibration import made_calibration, pose_of
+from support.wrong_inputs import corner
 
-from neurocal_cli import Correspondences, evaluate_camera
+from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, evaluate_camera
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.report import align, calibration_report, evaluation_json, evaluation_tables, rounded
 
 
@@ -117,3 +119,45 @@ def test_names_cannot_break_the_table() -> None:
 def test_starts_of_several_views_are_told_apart() -> None:
     text = calibration_report(made_calibration(2))
     assert "networks: 3 random starts for 2 views, at least 2 agreed in each view, 33 iterations" in text
+
+
+@pytest.mark.parametrize(
+    ("model", "errors", "told"),
+    [
+        ("k1", {"none": 1.0, "k1": 0.2, "fisheye": 0.3}, "coefficients:"),
+        ("k1", {"none": 1.0, "k1": 0.2, "k1k2": 0.199}, "coefficients:"),
+        ("fisheye", {"none": 1.0, "k1": 0.2, "fisheye": 0.199}, "coefficients:"),
+        (
+            "k1",
+            {"none": 1.0, "k1": 0.2, "fisheye": 0.199},
+            "coefficients among ordinary lenses, because the points do not decidedly favour a fisheye:",
+        ),
+        ("none", {"none": 0.6, "k1": 0.4}, "coefficients among the models that the points support:"),
+    ],
+)
+def test_the_summary_says_among_which_models_the_lens_was_chosen(
+    model: str, errors: dict[str, float], told: str
+) -> None:
+    calibration = replace(made_calibration(3), lens_choice=errors, distortion_model=model)
+    calibration = replace(calibration, distortion=np.zeros(len(coefficient_names(model))), judgement=None)
+    std = dict(calibration.std) | dict.fromkeys(coefficient_names(model), 1.0)
+    line = f"distortion model: {model}, chosen by cross-validation error and number of {told}"
+    assert line in calibration_report(replace(calibration, std=std)).splitlines()
+
+
+def test_a_fisheye_that_predicts_better_but_not_decidedly_is_told_of() -> None:
+    """One wide view with the centre given: the fisheye was excluded before errors were compared."""
+    lens = Distortion("fisheye", np.array([0.02, -0.01, 0.004, -0.001]))
+    camera = Camera(Intrinsics(150.0, 150.0, 318.0, 243.0), lens, (640, 480))
+    rng = np.random.default_rng(0)
+    pose = Pose.from_euler(
+        0.75 + 0.1 * rng.normal(), 0.3 * rng.normal() - 0.5, 0.05, np.array([-90, -60, 120.0])
+    )
+    world = corner()
+    pixels, seen = camera.project(world @ pose.R.T + pose.t)
+    rows = seen & (pixels > 0).all(axis=1) & (pixels < [639, 479]).all(axis=1)
+    noisy = pixels[rows] + 0.3 * rng.normal(size=(rows.sum(), 2))
+    points = Correspondences(world[rows], noisy, image_size=(640, 480))
+    found = calibrate(points, type=2, image_center=(318, 243), skew=False)
+    assert found.lens_choice["fisheye"] < found.lens_choice[found.distortion_model]
+    assert "among ordinary lenses" in calibration_report(found)
