@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.distorted import through
+from support.scenes import random_flat_set
 from support.slow_cases import slow_but
 from support.wrong_inputs import (
     CAMERA,
@@ -92,6 +94,13 @@ def test_a_lens_does_not_hide_it() -> None:
     found = proportions(moved(points, pixels=bent))
     assert found is not None
     assert found.factor == pytest.approx(10, rel=0.01)
+
+
+def test_a_lens_that_folds_the_image_is_not_taken_for_it() -> None:
+    """Some points are seen beyond the radius at which the distortion turns back."""
+    scene = random_flat_set(np.random.default_rng(28), 13, False, cols=9, rows=6)
+    folded_back = through(scene, "plumb_bob", [-0.28, 0.12, 1e-3, -8e-4, -0.02])
+    assert proportions(folded_back.points(0.3, np.random.default_rng(1))) is None
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such
 _LEFT, _FLOOR = 0.25, 2.0  # squared error over that as given, and variance over that of separate cameras
 _PINHOLE_STEPS, _LENS, _STEPS_WITH_LENS = 30, "k1k2", 60
 _REFINED = (0.03, 0.005, 0.001)  # distances in log s of three errors, for the minimum of their parabola
+_FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 # Rows and columns of omega's entries, and the weights of their products.
@@ -71,9 +72,11 @@ def proportions(points: Correspondences) -> Proportions | None:
     squares = board.squares(found)
     if not (abs(np.log(s)) > _AWAY and squares < _LEFT * given < np.inf and _is_noise(found)):
         return None
+    rms, given_px = (float(np.sqrt(one / len(board.points))) for one in (squares, given))
+    if rms > _FITS * board.points.pixels.std():
+        return None
     first, second = ("XYZ"[axis] for axis in axes)
     axis, other, factor = (first, second, s) if s > 1 else (second, first, 1 / s)
-    rms, given_px = (float(np.sqrt(one / len(board.points))) for one in (squares, given))
     return Proportions(axis, other, factor, rms, given_px)
 
 
