@@ -90,7 +90,7 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     there are tangential terms. Pixels outside the image circle of a lens that covers 90 degrees or more from
     its axis do not count.
     """
-    if distortion.model == "none":
+    if distortion.model == "none" or _reaches_all(distortion, A, points):
         return None
     # The farthest points suffice.
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
@@ -108,6 +108,16 @@ def folds_back(problem: Problem, state: CameraState) -> str | None:
     return where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
 
 
+def _reaches_all(distortion: Distortion, A: Array, points: Correspondences) -> bool:
+    """Whether the distortion is certainly monotonic in the rectangle of the image and all points."""
+    low, high = points.pixels.min(axis=0), points.pixels.max(axis=0)
+    if points.image_size is not None:
+        low, high = np.minimum(low, 0), np.maximum(high, np.array(points.image_size) - 1)
+    corners = np.array([low[0], low[0], high[0], high[0]]), np.array([low[1], high[1], low[1], high[1]])
+    farthest = np.hypot(*normalised_points(A[ENTRIES].tolist(), *corners)).max()
+    return reaches(distortion, float(farthest))
+
+
 def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
     tangential = "p1" in coefficient_names(distortion.model)
@@ -122,8 +132,6 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
     x, y = normalised_points(A[ENTRIES].tolist(), *pixels.T)
     if distortion.wide:
         return bool(np.isfinite(unproject_directions(distortion, x, y)[0]).all())
-    if reaches(distortion, float(np.hypot(x, y).max(initial=0.0))):
-        return True
     return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
 
 
