@@ -103,9 +103,10 @@ class LocalShading(Shading):
     # Two arrays (N, 2) [px]: places at which the dark and the light levels were measured
     near: tuple[Array, Array]
     above: tuple[Array, Array]  # two arrays (N,) [DN]: their differences from the polynomials
+    has_border: bool  # of a shadow; the levels at it are uncertain
 
     @classmethod
-    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> Shading:
+    def of(cls, smooth: Shading, dark: Levels, light: Levels, has_border: bool = False) -> Shading:
         """Add the levels to which polynomials were fitted; with few levels, return the polynomials."""
         if min(len(dark.level), len(light.level)) <= _NEAREST:
             return smooth
@@ -118,7 +119,7 @@ class LocalShading(Shading):
             for x, rest, before in zip((dark, light), above, smooth.spread, strict=True)
         ]
         near = dark.place, light.place
-        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above)
+        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above, has_border)
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
@@ -131,6 +132,8 @@ class LocalShading(Shading):
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
+        if not self.has_border:
+            return super().spread_at(place)
         return np.stack(
             [
                 base + _Nearby.of(near, place).variance(above)
@@ -216,7 +219,7 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     if not shadowed and smooth.spread.max() < (_EVEN * half) ** 2:
         return smooth
     richer = _richer(smooth, dark, light)
-    local = LocalShading.of(smooth, dark, light) if shadowed else richer
+    local = LocalShading.of(smooth, dark, light, has_border=True) if shadowed else richer
     if not isinstance(local, LocalShading):
         return richer
     by_local = [
