@@ -43,8 +43,8 @@ from neurocal_cli.verdict.assessment import assess
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
 
 # Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,
-# in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 3.5 times as
-# much as noise explains.
+# in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 3.5 times
+# as much as noise explains.
 _SCATTER = Limit(4.0, 10.0)
 _GROWTH = Limit(1.6, 2.3)
 _CHANGE = Limit(0.0, 10.0)  # standard deviations for each unknown of the explanation
