@@ -22,12 +22,13 @@ if TYPE_CHECKING:
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.board_yaml import read_board
-    from neurocal_cli.io.calibration_yaml import read_calibration, write_calibration
+    from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.io.images import read_image
     from neurocal_cli.io.lens_points import read_lens_data, read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens, write_lens
     from neurocal_cli.io.points_csv import read_points, write_points
-    from neurocal_cli.io.rig_yaml import read_rig, write_rig
+    from neurocal_cli.io.result_files import write_calibration, write_rig
+    from neurocal_cli.io.rig_yaml import read_rig
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
@@ -65,7 +66,7 @@ _HOMES = {
     "fit_lens_cameras": "zoom_lens.fit_cameras",
     "fit_rig": "stereo.fit_rig",
     "read_board": "io.board_yaml",
-    "read_calibration": "io.calibration_yaml",
+    "read_calibration": "io.calibration_tree",
     "read_image": "io.images",
     "read_lens": "io.lens_yaml",
     "read_lens_data": "io.lens_points",
@@ -75,10 +76,10 @@ _HOMES = {
     "triangulate": "stereo.triangulation",
     "undistort_image": "distortion.remapping",
     "undistort_points": "distortion.undistortion",
-    "write_calibration": "io.calibration_yaml",
+    "write_calibration": "io.result_files",
     "write_lens": "io.lens_yaml",
     "write_points": "io.points_csv",
-    "write_rig": "io.rig_yaml",
+    "write_rig": "io.result_files",
 }
 
 __all__ = [

@@ -22,7 +22,9 @@ from neurocal_cli.detection.detect import detect_points, gather
 from neurocal_cli.errors import FormatError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import rotation_step
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.pipeline.common_target import _fit as fit_of
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.report import calibration_report

@@ -17,12 +17,9 @@ from support.made_calibration import made_calibration
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.calibration_yaml import (
-    calibration_lines,
-    format_calibration,
-    read_calibration,
-    write_calibration,
-)
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import calibration_lines, format_calibration
+from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.io.yaml_text import number, quoted, text
 from neurocal_cli.io.yaml_tree import parse_yaml
 from neurocal_cli.points import Correspondences

@@ -15,7 +15,8 @@ from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.lens_points import read_lens_data, read_lens_points, write_lens_points
 from neurocal_cli.io.lens_yaml import format_lens, read_lens, write_lens
 from neurocal_cli.zoom_lens.camera_at import camera_at

@@ -16,7 +16,8 @@ from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.rig_yaml import read_rig, write_rig
+from neurocal_cli.io.result_files import write_rig
+from neurocal_cli.io.rig_yaml import read_rig
 from neurocal_cli.io.table import stream_table
 from neurocal_cli.io.table_header import Schema
 from neurocal_cli.stereo.fit_rig import fit_rig

@@ -19,7 +19,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.calibration_yaml import write_calibration
+from neurocal_cli.io.result_files import write_calibration
 
 LENSES = {
     "k1": [-0.25],

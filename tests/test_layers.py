@@ -93,6 +93,12 @@ def imported(tree: ast.Module) -> Iterator[str]:
             yield node.module or ""
 
 
+def modules_of(tree: ast.Module) -> set[str]:
+    """What is imported, with each name that may be a module itself."""
+    named = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    return {*imported(tree), *(f"{node.module}.{alias.name}" for node in named for alias in node.names)}
+
+
 def calls(tree: ast.Module) -> Iterator[tuple[str, str]]:
     """Object (``""`` for a plain name) and name of everything that is called."""
     for node in ast.walk(tree):
@@ -128,6 +134,17 @@ def test_the_architecture_page_lists_all_rooms_in_this_order() -> None:
         for used in {m.split(".")[1] for m in imports(name) if m.startswith("neurocal_cli.")} & rooms:
             assert place[used] <= place[room(name)], (room(name), used)
             assert height[used] <= height[room(name)]
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Neither at once nor in functions: each module can be understood before those that use it."""
+    rest = {name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): name for name in NAMES}
+    rest = {f"neurocal_cli.{module}": name for module, name in rest.items() if module != "__init__"}
+    used = {module: modules_of(tree_of(name)) & rest.keys() - {module} for module, name in rest.items()}
+    while ends := [module for module in used if not used[module] & used.keys()]:
+        for module in ends:
+            del used[module]
+    assert used == {}
 
 
 @pytest.mark.parametrize("package", HOMES)

@@ -30,8 +30,8 @@ from neurocal_cli.distortion.plumb_line import PlumbLine, fit_plumb_line, lines_
 from neurocal_cli.distortion.straightness import distorted_lines
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.io.points_csv import write_points
+from neurocal_cli.io.result_files import write_calibration
 
 SIZE = (1000, 800)
 

@@ -19,7 +19,8 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import REACHES
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.methods import calibrate, fit_poses
 from neurocal_cli.pipeline import rich_choice
 from neurocal_cli.points import Correspondences

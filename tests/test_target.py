@@ -19,8 +19,10 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.io.board_yaml import format_board, parse_board
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.points_csv import read_points
+from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.io.rig_yaml import read_rig
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo

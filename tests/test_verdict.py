@@ -15,7 +15,9 @@ from support.targets import board, views_of
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.io.calibration_tree import read_calibration
+from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.verdict.assessment import assess, gather_evidence
 from neurocal_cli.verdict.rules import reach_verdict
 

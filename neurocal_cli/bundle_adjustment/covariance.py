@@ -7,6 +7,8 @@ the intrinsics.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,25 @@ class Covariance:
     entries: Array  # (f, f) of A's free entries and the free distortion coefficients
     poses: Array  # (V, 6, 6) of omega and tau of each view; zero if the poses are given
     smallest: float  # smallest eigenvalue of the normal matrices scaled to a unit diagonal; 0 if singular
+
+
+@frozen_dataclass(eq=False)
+class CovarianceBasis:
+    """Input of a camera's covariance (`covariance`, `counting_views`)."""
+
+    # (V, 12 + K, 12 + K) as from `reprojection.normal_blocks`; if the target was estimated, with the
+    # efficient scores of the free camera parameters.
+    normal: Array
+    # (f, f) covariance of A's free entries and the free distortion coefficients, normalised, if it does not
+    # follow from the normal matrices.
+    shared: Array | None
+    n_equations: float  # number of equations minus the effective number of estimated unknowns of the target
+    # (P, f) moves of the free parameters when the views of each pose are left out and the target is estimated
+    # again, given the pose (V,) of each view. None if there are many poses: then the efficient scores give
+    # the same.
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+    # (V, 6, 6) covariance of the poses, if it does not follow from the normal matrices.
+    poses: Array | None = None
 
 
 def covariance(

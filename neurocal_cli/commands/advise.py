@@ -36,7 +36,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     """  # noqa: D301 - as in the group
     options.check_plot(plot, "-")
     preparation.check_outputs((plot,), (calibration,))
-    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.planning.advice import advise as weigh
     from neurocal_cli.planning.report import advice_json, advice_lines
 

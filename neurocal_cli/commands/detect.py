@@ -27,9 +27,10 @@ from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
-    from neurocal_cli.detection.batch import DetectionOptions, Outcome
+    from neurocal_cli.detection.batch import DetectionOptions
     from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.measuring import Points
+    from neurocal_cli.detection.outcome import Outcome
 
 _SECOND = 2  # images of another size that are no longer a single stray one
 

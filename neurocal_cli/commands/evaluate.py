@@ -233,7 +233,7 @@ def _evaluate_stereo(
 
         rig = read_rig(cameras[0])
         return evaluate_rig(rig, points, method=method), rig
-    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.io.calibration_tree import read_calibration
 
     if points is None:
         left, right = (read_calibration(name) for name in cameras)

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from neurocal_cli.detection.batch import DetectionOptions, Outcome
+    from neurocal_cli.detection.batch import DetectionOptions
+    from neurocal_cli.detection.outcome import Outcome
 
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
 

@@ -207,8 +207,8 @@ def camera(
     options.check_camera_name(camera_name)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), (lens_file,))
-    from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
+    from neurocal_cli.io.result_files import write_calibration
     from neurocal_cli.zoom_lens.camera_at import camera_at
 
     learnt = read_lens(lens_file)

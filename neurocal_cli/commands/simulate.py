@@ -217,7 +217,7 @@ def _scene(
 
         board = read_board(board_file)
     if camera_file is not None:
-        from neurocal_cli.io.calibration_yaml import read_calibration
+        from neurocal_cli.io.calibration_tree import read_calibration
         from neurocal_cli.io.exchange.reading import read_intrinsics
 
         if board_file is None and views is None and camera_file != "-":
@@ -252,8 +252,8 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     import numpy as np
 
     from neurocal_cli.io.board_yaml import write_board
-    from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.points_csv import write_points
+    from neurocal_cli.io.result_files import write_calibration
     from neurocal_cli.io.writing import make_folder, write_whole
     from neurocal_cli.simulation.scenes import true_calibration
 

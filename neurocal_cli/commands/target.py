@@ -40,7 +40,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     preparation.check_outputs((output, plot), (camera,))
 
     from neurocal_cli.io.board_yaml import write_board
-    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.report import target_json, target_lines
     from neurocal_cli.target import board_of
 

@@ -116,7 +116,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
         rig = read_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
-    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.stereo.fit_rig import fit_rig
 
     left, right = (read_calibration(name) for name in names)

@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from neurocal_cli.board import Board
+from neurocal_cli.detection.cache import DetectionCache
 from neurocal_cli.detection.detect import Detection, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import Points
+from neurocal_cli.detection.outcome import Outcome
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
-
-if TYPE_CHECKING:
-    from neurocal_cli.detection.cache import DetectionCache
 
 _WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
 _KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold
@@ -39,19 +37,6 @@ class DetectionOptions:
     overlay: bool = False  # whether to draw the detection
     strict: bool = False  # raise unexpected errors instead of reporting them as the problem of one image
     cache: DetectionCache | None = None  # outcomes of earlier runs; new ones are added
-
-
-@frozen_dataclass(eq=False)
-class Outcome:
-    """Result of one image file: a detection, or a problem in one line."""
-
-    path: str
-    detection: Detection | None = None
-    problem: str = ""  # empty if there is a detection
-    notes: tuple[str, ...] = ()  # remarks for the user on the image and its detection
-    overlay: bytes | None = None  # a PNG; images without the board have one, too
-    # (cols, rows): number of inner vertices of another board in the image
-    shown: tuple[int, int] | None = None
 
 
 def default_jobs(images: int) -> int:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli import __version__
-from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import Detection
+from neurocal_cli.detection.outcome import Outcome
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes

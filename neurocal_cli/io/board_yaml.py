@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.distances import Distance
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text

@@ -16,7 +16,7 @@ from neurocal_cli.calibration import Rejected, Verdict, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.io import text_columns
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.text_columns import numbers_of, read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import block, boolean, flows, indented, mapping, number, quoted, text

@@ -1,4 +1,4 @@
-"""Read a calibration from the tree of a YAML file, checking every key."""
+"""Read a calibration file, or the tree of its YAML, checking every key."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from neurocal_cli.io.calibration_blocks import read_rejected, read_target, read_
 from neurocal_cli.io.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
 from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.file_storage import read_tree
-from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.observations_yaml import read_observations
 from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
@@ -24,6 +24,17 @@ from neurocal_cli.points import Correspondences
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
 _SAME = 1e-6
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration file that neurocal wrote; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is not YAML, or a key is missing or wrong.
+    """
+    return calibration_from_field(read_tree(path))
 
 
 def calibration_from_field(root: Field) -> Calibration:

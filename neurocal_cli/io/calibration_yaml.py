@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 
@@ -41,31 +40,6 @@ _MOST_POINTS = 5000
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
     """Text of a calibration file, without dates and paths; if `by_rows`, long tables have rows, too."""
     return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
-
-
-def write_calibration(cal: Calibration, path: str | Path) -> None:
-    """Write a calibration file, whole or not at all; ``-`` is stdout.
-
-    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `result_files`.
-    """
-    from neurocal_cli.io.result_files import write_result
-
-    write_result(cal, path)
-
-
-def read_calibration(path: str | Path) -> Calibration:
-    """Read a calibration file that neurocal wrote; ``-`` is stdin.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read, is not YAML, or a key is missing or wrong.
-    """
-    # Importing the parser takes 20 ms, which commands that only write save.
-    from neurocal_cli.io.calibration_tree import calibration_from_field
-    from neurocal_cli.io.file_storage import read_tree
-
-    return calibration_from_field(read_tree(path))
 
 
 def calibration_lines(

@@ -16,7 +16,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.given_values import checked_size
 from neurocal_cli.io.camera_info import from_ros
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.tree_fields import Field
 
 # The keys of neurocal and ROS come first; in stereo files of OpenCV's sample the left camera has M1, D1.

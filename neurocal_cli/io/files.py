@@ -11,7 +11,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import IO
 
-from neurocal_cli.errors import FormatError, InputError, NeurocalError
+from neurocal_cli.errors import FormatError, NeurocalError
+from neurocal_cli.io.failures import one_line, reading_failures
 from neurocal_cli.io.outputs import held_back
 
 _WIDE_MARKS = (
@@ -96,30 +97,6 @@ def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
         yield b"".join(rest)
 
 
-@contextmanager
-def reading_failures(source: str) -> Iterator[None]:
-    """Turn errors of reading a file into one-line messages."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file; check the path", source) from error
-    except IsADirectoryError as error:
-        raise FormatError("is a folder; give a file in it", source) from error
-    except PermissionError as error:
-        raise FormatError("may not be read; change its permissions", source) from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise FormatError(f"cannot be read ({reason(error)}); check the path", source) from error
-
-
-@contextmanager
-def value_failures(source: str, where: str = "", line: int | None = None) -> Iterator[None]:
-    """Turn errors about values into messages that name the file and the place in it."""
-    try:
-        yield
-    except InputError as error:
-        raise FormatError(f"{where}{error}", source, line) from error
-
-
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
     """Read a whole UTF-8 file; see `read_bytes` and `decode`."""
     data, source = read_bytes(path)
@@ -157,14 +134,3 @@ def _stdin_failures() -> Iterator[None]:
         raise
     except (AttributeError, ValueError, OSError) as error:  # stdin is absent or closed
         raise FormatError("stdin cannot be read; give a file", "<stdin>") from error
-
-
-def reason(error: BaseException) -> str:
-    """The system's text about a failure."""
-    return (getattr(error, "strerror", None) or str(error)).lower()
-
-
-def one_line(path: str | Path) -> str:
-    """Make a path, or any text, printable on one line."""
-    text = str(path)
-    return text if text.isprintable() else repr(text)[1:-1]

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.files import one_line
+from neurocal_cli.io.failures import one_line
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
 

@@ -13,7 +13,7 @@ from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_blocks import read_target, target_lines
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole

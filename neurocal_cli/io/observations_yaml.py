@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.distances import Distance
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
 from neurocal_cli.io.text_columns import (
     LONGEST,

@@ -19,7 +19,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import NeurocalError, UsageError
+from neurocal_cli.io.failures import reason
 
 _Identity = tuple[int, int]  # device and inode
 _NAME = r"\.neurocal-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{16}\.tmp"
@@ -145,14 +146,30 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _finish(outputs: Outputs) -> None:
-    from neurocal_cli.io.writing import write_stdout
-
     try:
         for data in outputs.commit():
             write_stdout(data)
     except BaseException:
         outputs.discard()
         raise
+
+
+def write_stdout(data: bytes) -> None:
+    """Write to stdout, after flushing earlier output."""
+    if sys.stdout is None:  # the shell closed it: >&-
+        raise NeurocalError("stdout is closed; give a file")
+    try:
+        buffer = getattr(sys.stdout, "buffer", None)
+        if buffer is None:  # stdout was replaced by a text-only stream
+            sys.stdout.write(data.decode("utf-8"))
+        else:
+            sys.stdout.flush()
+            buffer.write(data)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except (AttributeError, ValueError, OSError) as error:
+        raise NeurocalError(f"stdout cannot be written ({reason(error)}); give a file") from error
 
 
 def temporary_name() -> str:

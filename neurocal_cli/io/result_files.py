@@ -22,6 +22,22 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rig import Rig
 
 
+def write_calibration(cal: Calibration, path: str | Path) -> None:
+    """Write a calibration file, whole or not at all; ``-`` is stdout.
+
+    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `write_result`.
+    """
+    write_result(cal, path)
+
+
+def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
+    """Write a rig file, whole or not at all; ``-`` is stdout.
+
+    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `write_result`.
+    """
+    write_result(rig, path, alpha=alpha)
+
+
 def write_result(
     result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:

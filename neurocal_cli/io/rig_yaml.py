@@ -42,16 +42,6 @@ def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> s
     return "\n".join([*HEADER, *lines, ""])
 
 
-def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
-    """Write a rig file, whole or not at all; ``-`` is stdout.
-
-    The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `result_files`.
-    """
-    from neurocal_cli.io.result_files import write_result
-
-    write_result(rig, path, alpha=alpha)
-
-
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
     if rig.unit not in METRES:

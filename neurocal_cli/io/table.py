@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.files import decode, one_line, read_blocks, read_bytes
+from neurocal_cli.io.failures import one_line
+from neurocal_cli.io.files import decode, read_blocks, read_bytes
 from neurocal_cli.io.table_header import (
     Layout,
     Metadata,

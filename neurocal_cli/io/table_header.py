@@ -13,7 +13,7 @@ from typing import Any
 from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.io.files import one_line, value_failures
+from neurocal_cli.io.failures import one_line, value_failures
 from neurocal_cli.points import UNDISTORTED
 
 # Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.files import one_line, reading_failures
+from neurocal_cli.io.failures import one_line, reading_failures
 from neurocal_cli.io.image_headers import is_video_header
 from neurocal_cli.io.images import captured_stderr, encode_png
 from neurocal_cli.io.writing import write_whole

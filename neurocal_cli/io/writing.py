@@ -8,15 +8,14 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
-from neurocal_cli.io.files import one_line, reason
-from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_name
+from neurocal_cli.io.failures import one_line, reason
+from neurocal_cli.io.outputs import Outputs, held_back, remove_stale, temporary_name, write_stdout
 
 # Opening these would truncate a file that the shell appends to, so they are written like stdout.
 STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
@@ -144,24 +143,6 @@ def _open_unlike_a_file(path: str | Path, status: os.stat_result) -> IO[bytes]:
         raise
     os.set_blocking(descriptor, True)
     return os.fdopen(descriptor, "wb")
-
-
-def write_stdout(data: bytes) -> None:
-    """Write to stdout, after flushing earlier output."""
-    if sys.stdout is None:  # the shell closed it: >&-
-        raise NeurocalError("stdout is closed; give a file")
-    try:
-        buffer = getattr(sys.stdout, "buffer", None)
-        if buffer is None:  # stdout was replaced by a text-only stream
-            sys.stdout.write(data.decode("utf-8"))
-        else:
-            sys.stdout.flush()
-            buffer.write(data)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except (AttributeError, ValueError, OSError) as error:
-        raise NeurocalError(f"stdout cannot be written ({reason(error)}); give a file") from error
 
 
 def _encode(content: str | bytes) -> bytes:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
+from neurocal_cli.bundle_adjustment.covariance import Covariance, CovarianceBasis, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
@@ -30,25 +30,6 @@ from neurocal_cli.target import Target
 
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.open_coefficients import OpenCoefficients
-
-
-@frozen_dataclass(eq=False)
-class CovarianceBasis:
-    """Input of a camera's covariance (`covariance`, `counting_views`)."""
-
-    # (V, 12 + K, 12 + K) as from `reprojection.normal_blocks`; if the target was estimated, with the
-    # efficient scores of the free camera parameters.
-    normal: Array
-    # (f, f) covariance of A's free entries and the free distortion coefficients, normalised, if it does not
-    # follow from the normal matrices.
-    shared: Array | None
-    n_equations: float  # number of equations minus the effective number of estimated unknowns of the target
-    # (P, f) moves of the free parameters when the views of each pose are left out and the target is estimated
-    # again, given the pose (V,) of each view. None if there are many poses: then the efficient scores give
-    # the same.
-    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
-    # (V, 6, 6) covariance of the poses, if it does not follow from the normal matrices.
-    poses: Array | None = None
 
 
 @frozen_dataclass(eq=False)

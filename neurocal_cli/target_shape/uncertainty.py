@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bends import N_SHAPES, surface_of
+from neurocal_cli.bundle_adjustment.covariance import CovarianceBasis
 from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns
 from neurocal_cli.bundle_adjustment.solution import TargetPosterior
@@ -25,7 +26,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.camera_covariance import CovarianceBasis
 from neurocal_cli.target_shape.information import (
     Information,
     Sight,

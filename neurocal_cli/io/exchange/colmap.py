@@ -18,7 +18,8 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
-from neurocal_cli.io.files import read_text, value_failures
+from neurocal_cli.io.failures import value_failures
+from neurocal_cli.io.files import read_text
 from neurocal_cli.io.yaml_text import number
 
 _HALF = 0.5  # px; COLMAP's pixel coordinates minus ours

@@ -26,8 +26,9 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.exchange.dictionary import arrays_of
 from neurocal_cli.io.exchange.matlab import FIRST_PIXEL, unit_of
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes, value_failures
+from neurocal_cli.io.files import decode, read_bytes
 from neurocal_cli.io.mat_file import read_variables
 from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.tree_fields import Field

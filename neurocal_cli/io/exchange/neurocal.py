@@ -21,7 +21,7 @@ from neurocal_cli.io.calibration_tree import (
 from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
-from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.rig_yaml import format_rig, rig_from_field
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences

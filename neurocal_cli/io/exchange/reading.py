@@ -13,8 +13,9 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, inverse
+from neurocal_cli.io.failures import one_line, value_failures
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, one_line, read_bytes, value_failures
+from neurocal_cli.io.files import decode, read_bytes
 from neurocal_cli.io.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
