@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.rigs import RigScene, random_rig, sides
 from support.wrong_inputs import CAMERA, board, flat, poses, turned_poses
 
 from neurocal_cli import (
@@ -18,6 +19,7 @@ from neurocal_cli import (
     Pose,
     calibrate,
     evaluate_camera,
+    fit_rig,
     read_calibration,
     write_calibration,
     write_points,
@@ -26,6 +28,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.reading import read_given_camera
+from neurocal_cli.stereo.triangulation import triangulate
 
 SIZE = (640, 480)
 TRUE = {
@@ -142,3 +145,67 @@ def test_poses_of_new_views_in_an_evaluation_have_it_too() -> None:
     fits = [evaluate_camera(camera, points).fit for camera in (own, own.camera)]
     known, exact = (fit.views["new0"].std["t_z"] for fit in fits if fit is not None)
     assert known > 2 * exact
+
+
+def two_cameras() -> tuple[RigScene, tuple[Calibration, Calibration]]:
+    """A rig, and calibrations of its cameras from other views."""
+    scene = random_rig(np.random.default_rng(6), "verging", 8, "k1k2")
+    before = replace(scene, poses=random_rig(np.random.default_rng(50), "verging", 10, "k1k2").poses)
+    left, right = (
+        calibrate(points, distortion="k1k2", skew=False, target="given") for points in sides(before, 0.15)
+    )
+    return scene, (left, right)
+
+
+@pytest.mark.parametrize("trials", [16, pytest.param(200, marks=pytest.mark.slow)])
+def test_errors_of_a_rig_are_as_large_as_stated_if_its_cameras_are_uncertain(trials: int) -> None:
+    """Without the covariance of the given cameras, rotations are 15 to 25 standard deviations off."""
+    scene, own = two_cameras()
+    true = [scene.camera(side) for side in (0, 1)]
+    roots = [np.linalg.cholesky(camera.covariance) for camera in own]
+    seen_by_both = scene.points(0), scene.points(1)
+    depth = (scene.poses["01"].R @ scene.world.T).T[:, 2] + scene.poses["01"].t[2]
+    errors, of_poses, alone, depths = [], [], [], []
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, 7])
+        drawn = []
+        for camera, one, root in zip(own, true, roots, strict=True):
+            free = [(*INTRINSIC_NAMES, "k1", "k2").index(name) for name in camera.covariance_names]
+            values = parameters(one)
+            values[free] += root @ rng.normal(size=len(root))
+            drawn.append(with_parameters(camera, values))
+        points = [scene.points(side, 0.15, rng) for side in (0, 1)]
+        options = {"type": 3, "target": "given", "outliers": "keep"}
+        for result, exact in ((errors, False), (alone, True)):
+            cameras = [
+                calibrate(some, intrinsics=given.camera if exact else given, **options)
+                for some, given in zip(points, drawn, strict=True)
+            ]
+            rig = fit_rig(cameras[0], cameras[1])
+            error = np.concatenate([rig.pose.euler - scene.rig.euler, rig.t - scene.rig.t])
+            std = [rig.std[name] for name in (*POSE_NAMES, "baseline")]
+            result.append(np.append(error, rig.baseline - np.linalg.norm(scene.rig.t)) / std)
+            if exact:
+                continue
+            view = rig.right.views["01"]
+            off = np.concatenate(
+                [view.pose.euler - scene.pose(1, "01").euler, view.pose.t - scene.pose(1, "01").t]
+            )
+            of_poses.append(off / [view.std[name] for name in POSE_NAMES])
+            pixels = (side.pixels[: len(scene.world)] for side in seen_by_both)
+            space = triangulate(rig.left, rig.right, rig.pose, *pixels).points
+            assert rig.verdict is not None
+            depths.append(np.median(space[:, 2] / depth - 1) / rig.verdict.measures["depth_share"])
+    slack = 0.1 if trials > 100 else 0.4
+    for found in (errors, of_poses, depths):
+        rms = np.sqrt((np.array(found) ** 2).mean(axis=0))
+        assert np.abs(rms - 1).max() < slack, rms
+    assert np.sqrt((np.array(alone) ** 2).mean(axis=0)).max() > 10
+
+
+def test_the_std_of_predicted_pixels_includes_the_given_camera() -> None:
+    own, points = calibrated(TRUE["k1k2"]), seen(TRUE["k1k2"], poses(3, 5), 0.2, np.random.default_rng(2))
+    known, exact = (calibrate(points, type=3, intrinsics=one).verdict for one in (own, own.camera))
+    assert known is not None
+    assert exact is not None
+    assert known.measures["projection_px"] > 3 * exact.measures["projection_px"]
