@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -201,6 +204,40 @@ def test_errors_of_a_rig_are_as_large_as_stated_if_its_cameras_are_uncertain(tri
         rms = np.sqrt((np.array(found) ** 2).mean(axis=0))
         assert np.abs(rms - 1).max() < slack, rms
     assert np.sqrt((np.array(alone) ** 2).mean(axis=0)).max() > 10
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda block: block["covariance"]["names"].__setitem__(0, "focal"), "names must be different names"),
+        (lambda block: block["covariance"]["data"][0].__setitem__(0, -1.0), "negative eigenvalues"),
+        (lambda block: block["covariance"]["data"][0].__setitem__(1, 0.0), "must be symmetric"),
+        (lambda block: block["covariance"].update(data=(np.eye(7) * 1e-9).tolist()), "the std of alpha_u is"),
+    ],
+)
+def test_a_covariance_that_was_edited_is_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    write_calibration(calibrated(TRUE["k1k2"]), tmp_path / "camera.json")
+    tree = json.loads((tmp_path / "camera.json").read_text())
+    change(tree["neurocal"])
+    (tmp_path / "edited.json").write_text(json.dumps(tree))
+    write_points(flat(), tmp_path / "points.csv")
+    result = run("calibrate", tmp_path / "points.csv", "--type", 3, "--intrinsics", tmp_path / "edited.json")
+    assert result.exit_code == 1
+    assert message in result.stderr
+
+
+def test_what_is_taken_as_exact_is_said(tmp_path: Path) -> None:
+    own, points = calibrated(TRUE["k1k2"]), seen(TRUE["k1k2"], poses(3, 5), 0.2, np.random.default_rng(2))
+    write_calibration(own, tmp_path / "camera.yaml")
+    write_points(points, tmp_path / "points.csv")
+    run("convert", tmp_path / "camera.yaml", "--to", "ros", "-o", tmp_path / "ros.yaml")
+    given = ("calibrate", tmp_path / "points.csv", "--type")
+    known, unknown = (run(*given, 3, "--intrinsics", tmp_path / f"{name}.yaml") for name in ("camera", "ros"))
+    write_calibration(calibrate(points, type=3, intrinsics=own), tmp_path / "poses.yaml")
+    placed = run(*given, 4, "--extrinsics", tmp_path / "poses.yaml", "--distortion", "k1k2")
+    assert ["taken as exact" in one.stderr for one in (known, unknown, placed)] == [False, True, True]
 
 
 def test_the_std_of_predicted_pixels_includes_the_given_camera() -> None:
