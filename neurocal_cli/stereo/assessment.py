@@ -24,7 +24,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
-from neurocal_cli.stereo.contradiction import Contradiction, contradiction
+from neurocal_cli.stereo.contradiction import FOCAL, Contradiction, contradiction
 from neurocal_cli.stereo.covariance import rig_covariance
 from neurocal_cli.stereo.given_cameras import covariance_by_given
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
@@ -203,8 +203,16 @@ def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
 def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
+    cameras = list(_cameras(e))
+    # A camera that is poor by itself spoils the pairs, so it is named before them.
+    yield from (finding for finding in cameras if finding[0] == WORDS.index("poor"))
     yield from _pairs(rig, e)
     yield from _precision(rig, e)
+    yield from cameras
+
+
+def _cameras(e: _Evidence) -> Iterator[Finding]:
+    """Findings about both cameras by their own points."""
     for side, verdict in zip(("left", "right"), e.cameras, strict=True):
         if verdict is not None:
             # Reasons and advice come the worst first.
@@ -232,7 +240,7 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     found = e.contradiction
     if found is None:
         return
-    if found.kind in ("left focal", "right focal", "late", "early"):
+    if found.kind in (*FOCAL, "late", "early"):
         yield _changed(e, found)
         return
     if found.kind in TWO_GEOMETRIES:
@@ -268,10 +276,10 @@ def _changed(e: _Evidence, found: Contradiction) -> Finding:
             f"they show the target {100 * found.amount:.2g} % of the way {way} pair's place",
             _MOMENT,
         )
-    side = found.kind.partition(" ")[0]
+    sides = " and the ".join(("left", "right")[side] for side in FOCAL[found.kind])
     return (
         grade,
-        f"the focal length of the {side} camera changed by {100 * found.amount:+.2g} % between "
+        f"the focal length of the {sides} camera changed by {100 * found.amount:+.2g} % between "
         f"{pair_name(e.names[found.at - 1])} and {pair_name(e.names[found.at])}",
         "calibrate each part by itself, and lock zoom and focus",
     )

@@ -1,9 +1,9 @@
 """Select the pairs of views that determine the rig, and diagnose the others.
 
 Each pair of views gives the pose of the right camera relative to the left one. Pairs that disagree with most
-others are tested for three faults: the target is turned in one image (its points have another order), the two
-images are exchanged, or they were not taken at the same moment. `contradiction` then compares the relative
-poses with their covariances, and tells whether the rig moved.
+others are tested for four faults: the target is turned in one image (its points have another order), one
+image is mirrored, the two images are exchanged, or they were not taken at the same moment. `contradiction`
+then compares the relative poses with their covariances, and tells whether the rig moved.
 """
 
 from __future__ import annotations
@@ -35,7 +35,16 @@ _SIGMAS = 30.0
 _MOST_HYPOTHESES = 40
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
-_TURNS = (90, 270, 180)
+_TURNED = "the target is turned by {} degrees in one of the images"
+_MIRRORED = "one of the two images is mirrored, or its u and v are exchanged"
+# Faults of the images of flat targets: how the target's axes (the longest first, the normal last) and those
+# of the right camera are exchanged. A mirrored image of a flat target is one of its back; programs that
+# number the points in each image by themselves then begin at another corner.
+_IMAGE_MIRRORED = np.diag([-1.0, 1.0, 1.0])
+_FAULTS = (
+    *((_TURNED.format(d), euler_to_rotation(0.0, 0.0, np.radians(d)), np.eye(3)) for d in (90, 270, 180)),
+    *((_MIRRORED, np.diag(of_target), _IMAGE_MIRRORED) for of_target in np.where(np.eye(3)[::-1], -1.0, 1.0)),
+)
 _OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
 _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
 
@@ -64,6 +73,8 @@ class SoundPairs:
         found = describe_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
+        if UNSYNCHRONISED not in self.left_out.values():
+            return f"{found}; correct these images, or the order of their points"
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
@@ -100,8 +111,10 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
         used = np.array([pair not in named for pair in poses.names])
         found = _explained(poses, used, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
-        shifted = _shifted(left, right, views)
-        raise DegenerateGeometryError(shifted or found.contradiction())
+        why = _shifted(left, right, views)
+        if not why and UNSYNCHRONISED in found.left_out.values():
+            why = _poor_camera(left, right, found)
+        raise DegenerateGeometryError(why or found.contradiction())
     return found
 
 
@@ -162,7 +175,8 @@ def describe_move(
         return (
             f"from {pair_name(names[at])} on nothing but the length of the baseline differs, by "
             f"{100 * why.amount:+.2g} %: the target in {span(names[at:])} is {100 * abs(larger):.2g} % "
-            f"{than} (or the cameras slid along the line between them){this.replace('this', 'the rig')}",
+            f"{than} (or the cameras slid along the line between them, or both changed their focal length)"
+            f"{this.replace('this', 'the rig')}",
             "measure the squares of both targets, and give each target its own X,Y,Z",
         )
     return (
@@ -186,6 +200,18 @@ def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
                 "not that of its own; one image of one camera is missing or was taken twice; name the views "
                 "that were taken at the same moment alike"
+            )
+    return ""
+
+
+def _poor_camera(left: Calibration, right: Calibration, found: SoundPairs) -> str:
+    """Message if the pairs contradict each other, and a camera is poor by itself; otherwise empty."""
+    for side, camera in (("left", left), ("right", right)):
+        verdict = camera.verdict
+        if verdict is not None and verdict.word == "poor":
+            return (
+                f"{len(found.left_out)} of {len(found.problem.paired)} pairs of views contradict the rig, "
+                f"and the {side} camera is poor by itself: {verdict.reasons[0]}; {verdict.advice[0]}"
             )
     return ""
 
@@ -257,13 +283,13 @@ def _distance(problem: RigProblem, poses: _Poses, R: Array, t: Array) -> Array:
 def _common_fault(
     problem: RigProblem, poses: _Poses, found: tuple[Array, Array, NDArray[np.bool_]]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The rig and the pairs that agree with it, if most targets are turned alike in one camera."""
+    """The rig and the pairs that agree with it, if most pairs have one fault."""
     most = int(found[2].sum())
-    for degrees in _TURNS:
-        turned = _turned(problem, poses, degrees)
-        R, t = turned.rigs()
+    for _, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        R, t = mended.rigs()
         sound = _distance(problem, poses, R, t) < 1
-        faulty = (_distance(problem, turned, R, t) < 1) & problem.flat
+        faulty = (_distance(problem, mended, R, t) < 1) & problem.flat
         counts = (sound | faulty).sum(axis=1)
         if counts.max() > most:
             best, most = int(np.argmax(counts)), int(counts.max())
@@ -283,16 +309,17 @@ def _reasons(
         "the left and the right image are exchanged",
         UNSYNCHRONISED,
     )
-    for degrees in _TURNS:
-        fits = problem.flat & (_distance(problem, _turned(problem, poses, degrees), R[None], t[None])[0] < 1)
-        reasons = np.where(fits, f"the target is turned by {degrees} degrees in one of the images", reasons)
+    for reason, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        fits = problem.flat & (_distance(problem, mended, R[None], t[None])[0] < 1)
+        reasons = np.where(fits, reason, reasons)
     return tuple(np.where(sound, "", reasons).tolist())
 
 
-def _turned(problem: RigProblem, poses: _Poses, degrees: int) -> _Poses:
-    """The poses if the targets of the right camera were turned in their planes."""
-    turn = euler_to_rotation(0.0, 0.0, np.radians(degrees))
-    return _Poses((poses.R[0], poses.R[1] @ problem.axes @ turn @ np.swapaxes(problem.axes, 1, 2)), poses.m)
+def _mended(problem: RigProblem, poses: _Poses, of_target: Array, of_image: Array) -> _Poses:
+    """The poses if the axes of the targets and of the image of the right camera were exchanged."""
+    turn = problem.axes @ of_target @ np.swapaxes(problem.axes, 1, 2)
+    return _Poses((poses.R[0], of_image @ poses.R[1] @ turn), (poses.m[0], poses.m[1] @ of_image.T))
 
 
 def _mean_rig(poses: _Poses, agree: NDArray[np.bool_]) -> Pose:
