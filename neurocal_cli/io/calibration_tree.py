@@ -128,6 +128,8 @@ def neurocal_block(root: Field) -> Field:
                 "has no neurocal block, so the poses and points are missing; it can serve as --intrinsics, "
                 "here give a file that calibrate wrote"
             )
+        if "neurocal_lens" in root:
+            root.refuse("is a zoom lens; give its camera at one setting, from neurocal lens camera")
         root.refuse("has no neurocal block; give a file that calibrate wrote")
     block = root["neurocal"]
     form = block["format"].integer()
@@ -176,6 +178,15 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     coefficients = root["distortion_coefficients"]["data"].array(-1)
     if len(coefficients) < length:
         root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")
+    path = f"{block.path}.parameters"
+    if coefficients[length:].any():
+        root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
+    for name, value in zip(coefficient_names(model), coefficients, strict=False):
+        stated = block["parameters"].get(name, {}).get("value", value).number()
+        if abs(stated - value) > _SAME * abs(value):
+            root.refuse(
+                f"distortion_coefficients and {path}.{name} disagree; correct the one that was edited"
+            )
     return model, coefficients[:length]
 
 
