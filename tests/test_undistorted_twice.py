@@ -152,3 +152,15 @@ def test_evaluating_a_rig_warns_once_of_each_file(tmp_path: Path) -> None:
     left, right = (undistort_points(read_points(path), rig.left) for path in stereo)
     found = evaluate_rig(rig, (left, right))
     assert sum(BEFORE in text for text in found.warnings) == 2
+
+
+def test_triangulate_says_that_a_rig_of_undistorted_points_needs_such_pixels(tmp_path: Path) -> None:
+    stereo = [SAMPLES / f"stereo_{side}.csv" for side in ("left", "right")]
+    run("stereo", *stereo, "--no-skew", "--distortion", "k1", "-o", tmp_path / "rig.yaml")
+    rig, straight = read_rig(tmp_path / "rig.yaml"), tmp_path / "straight.csv"
+    write_points(undistort_points(read_points(stereo[0]), rig.left), straight)
+    run("stereo", straight, stereo[1], "--no-skew", "-o", tmp_path / "straight.yaml")
+    for name, said in (("rig", False), ("straight", True)):
+        result = run("triangulate", tmp_path / f"{name}.yaml", SAMPLES / "matches.csv")
+        assert ("left camera was calibrated from undistorted points" in result.stderr) == said
+        assert "right camera was calibrated from undistorted points" not in result.stderr

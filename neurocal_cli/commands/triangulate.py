@@ -89,6 +89,9 @@ def triangulate(
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        if camera.points.undistorted:
+            note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
