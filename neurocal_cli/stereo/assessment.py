@@ -203,23 +203,26 @@ def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
 def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
-    cameras = list(_cameras(e))
-    # A camera that is poor by itself spoils the pairs, so it is named before them.
-    yield from (finding for finding in cameras if finding[0] == WORDS.index("poor"))
+    # A camera that is poor by itself, or was given wrong, spoils the pairs, so it is named before them.
+    for given, verdict, side in _cameras(rig, e):
+        if verdict.reasons and (given or verdict.word == "poor"):
+            advice = verdict.advice[0] if verdict.advice else ""
+            yield WORDS.index(verdict.word), f"{side} camera: {verdict.reasons[0]}", advice
     yield from _pairs(rig, e)
     yield from _precision(rig, e)
-    yield from cameras
+    for _, verdict, side in _cameras(rig, e):
+        # Reasons and advice come the worst first.
+        for k, reason in enumerate(verdict.reasons):
+            yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
+        for k, advice in enumerate(verdict.advice):
+            yield (1 if k else WORDS.index(verdict.word)), "", advice
 
 
-def _cameras(e: _Evidence) -> Iterator[Finding]:
-    """Findings about both cameras by their own points."""
-    for side, verdict in zip(("left", "right"), e.cameras, strict=True):
+def _cameras(rig: Rig, e: _Evidence) -> Iterator[tuple[bool, Verdict, str]]:
+    """Whether something of each camera was given, its verdict by its own points, and its side."""
+    for camera, verdict, side in zip((rig.left, rig.right), e.cameras, ("left", "right"), strict=True):
         if verdict is not None:
-            # Reasons and advice come the worst first.
-            for k, reason in enumerate(verdict.reasons):
-                yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
-            for k, advice in enumerate(verdict.advice):
-                yield (1 if k else WORDS.index(verdict.word)), "", advice
+            yield camera.type != 1, verdict, side
 
 
 def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
