@@ -33,11 +33,13 @@ from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import (
     MOVED,
+    PAIR_ANEW,
     TWO_GEOMETRIES,
     UNSYNCHRONISED,
     describe_faults,
     describe_move,
     pair_name,
+    shifted,
 )
 from neurocal_cli.stereo.triangulation import triangulate
 from neurocal_cli.verdict.assessment import assess
@@ -238,7 +240,7 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         yield (
             _LEFT_OUT.grade(len(odd) / len(e.names)),
             f"{describe_faults(odd, len(e.names))} and were left out",
-            "look at the views of these pairs, and take them again",
+            PAIR_ANEW if shifted(odd) else "look at the views of these pairs, and take them again",
         )
     found = e.contradiction
     if found is None:

@@ -50,6 +50,11 @@ _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that mu
 
 UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
 TWO_GEOMETRIES = ("moved", "size")  # kinds of contradiction after which one part of the pairs is used
+PAIR_ANEW = (
+    "one image of one camera is missing or was taken twice; name the views that were taken at the same "
+    "moment alike"
+)
+SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in ("next", "previous")}
 MOVED = "taken"  # first word of the reason for pairs taken before or after the rig moved
 
 Pair = tuple[str, str]
@@ -73,18 +78,26 @@ class SoundPairs:
         found = describe_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
+        if shifted(self.left_out):
+            return f"{found}; {PAIR_ANEW}"
         if UNSYNCHRONISED not in self.left_out.values():
             return f"{found}; correct these images, or the order of their points"
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
 def describe_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
-    """Describe pairs that are left out: their number, and the faults with the pairs of each."""
+    """Describe pairs that are left out: their number, and the faults with the pairs of each, most first."""
     by_reason: dict[str, list[str]] = {}
     for pair, reason in left_out.items():
         by_reason.setdefault(reason, []).append(pair_name(pair))
-    parts = [f"{name_some(names)}: {reason}" for reason, names in by_reason.items()]
+    most_first = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+    parts = [f"{name_some(names)}: {reason}" for reason, names in most_first]
     return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
+
+
+def shifted(left_out: Mapping[Pair, str]) -> bool:
+    """Whether left views fit the right views of other pairs than their own."""
+    return any(reason in SHIFTED.values() for reason in left_out.values())
 
 
 def pair_name(pair: Pair) -> str:
@@ -110,8 +123,9 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     if poses is not None:
         used = np.array([pair not in named for pair in poses.names])
         found = _explained(poses, used, found)
+    found = _with_shifted(left, right, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
-        why = _shifted(left, right, views)
+        why = "" if shifted(found.left_out) else _shifted(left, right, views)
         if not why and UNSYNCHRONISED in found.left_out.values():
             why = _poor_camera(left, right, found)
         raise DegenerateGeometryError(why or found.contradiction())
@@ -190,18 +204,41 @@ def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
     """Message if the pairs agree on a rig once the right views are shifted by one; otherwise empty."""
     if len(views.both) < 2 * _LEAST_AGREED:
         return ""
-    for word, by in (("next", 1), ("previous", -1)):
-        pairs = in_order(views.both)
-        first, second = (pairs[:-1], pairs[1:]) if by > 0 else (pairs[1:], pairs[:-1])
-        moved = tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
+    for word in SHIFTED:
+        moved = _neighbours(views.both, word)
         agree = find_consensus(rig_problem(left, right, ViewPairs(moved))).agree
         if agree.mean() > _AGREED:
             return (
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
-                "not that of its own; one image of one camera is missing or was taken twice; name the views "
-                "that were taken at the same moment alike"
+                f"not that of its own; {PAIR_ANEW}"
             )
     return ""
+
+
+def _with_shifted(left: Calibration, right: Calibration, found: SoundPairs) -> SoundPairs:
+    """Name pairs whose left views fit the right views of the next pairs, or of the previous ones.
+
+    From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
+    """
+    odd = {a: b for (a, b), reason in found.left_out.items() if reason == UNSYNCHRONISED}
+    for word in SHIFTED:
+        moved = tuple(pair for pair in _neighbours(found.problem.pairs, word) if pair[0] in odd)
+        if len(moved) < _LEAST_AGREED:
+            continue
+        problem = rig_problem(left, right, ViewPairs(moved))
+        fits = _distance(problem, _poses(problem), found.rig.R[None], found.rig.t[None])[0] < 1
+        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
+            names = [a for (a, _), one in zip(problem.pairs, fits, strict=True) if one]
+            reasons = {(a, odd[a]): SHIFTED[word] for a in names}
+            return replace(found, left_out={**found.left_out, **reasons})
+    return found
+
+
+def _neighbours(pairs: Sequence[Pair], word: str) -> tuple[Pair, ...]:
+    """Each left view with the right view of the next, or of the previous, pair."""
+    ordered = in_order(pairs)
+    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
+    return tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
 
 
 def _poor_camera(left: Calibration, right: Calibration, found: SoundPairs) -> str:

@@ -148,6 +148,14 @@ def with_right_pixels(points: Points, change: Callable[[Array], Array]) -> Point
     return points[0], replace(points[1], pixels=change(points[1].pixels))
 
 
+def one_image_lost(points: Points, after: int) -> Points:
+    """Without the right image number `after`, so that all later ones have the names of their neighbours."""
+    order = np.arange(12)
+    order[after:-1] += 1
+    right = with_views(points[1], order, SAME)
+    return points[0].select(points[0].view_index < 11), right.select(right.view_index < 11)
+
+
 def half_turned(points: Points, which: list[int]) -> Points:
     turned_right = with_views(points[1], ALL, BACKWARDS).pixels
     rows = np.isin(points[1].view_index, which)[:, None]
@@ -186,6 +194,10 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: right_rows(seen(scene()), np.roll(ALL, -1), SAME), "right view of the previous"),
     "right images of the previous pair": (
         lambda: right_rows(seen(scene()), np.roll(ALL, 1), SAME), "right view of the next"),
+    "one right image missing after six pairs": (
+        lambda: one_image_lost(seen(scene()), 6), "left image fits the right one of the previous"),
+    "one right image missing after three pairs": (
+        lambda: one_image_lost(seen(scene()), 3), "left image fits the right one of the previous"),
     "one pair of different moments": (
         lambda: in_parts(scene(), turned(scene(), 0.0, 3.0), 11), "left12/right12: .*same moment"),
     "rig bumped by 0.1 degrees half way": (
@@ -255,6 +267,7 @@ SLOW = frozenset(
         "board turned round in every right image",
         "half of the pairs in inches",
         "images of every other pair exchanged",
+        "one right image missing after three pairs",
         "right images early by 10 % of the time to the next pair",
         "right images late while the target moves by 0.5 mm",
         "right images mirrored, and their points numbered as in a true image",
