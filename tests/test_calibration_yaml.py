@@ -168,7 +168,7 @@ def calibrations(draw):
         distortion_model=model,
         distortion=np.array([draw(st.floats(0.1, 1)) for _ in range(size)]),
         covariance=np.array([[1e-5, -0.0], [float("nan"), 0.1]]),
-        covariance_names=("alpha_u", "k1"),
+        covariance_names=("alpha_u", "v0"),
         network=draw(st.none() | st.just(network)),
         camera_name=draw(NAMES),
         warnings=tuple(draw(st.lists(NAMES, max_size=2))),

@@ -210,3 +210,25 @@ def test_lean_files_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> No
     write_rig(lean_rig(fit_rig(*calibrated(made))), rig)
     one_line_error(evaluate(rig), "the rig has no points of its own; give the points to evaluate it on")
     assert evaluate(rig, "--points", *points).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("factor", "reason"),
+    [
+        (1 / 25.4, "0.0394 times that of the rig: X,Y,Z have another unit, as with inches and millimetres"),
+        (1.2, "1.2 times that of the rig: X,Y,Z have another unit, the squares another size"),
+    ],
+)
+def test_given_points_of_a_target_of_another_size_are_named(factor: float, reason: str) -> None:
+    left, right = calibrated(scene())
+    new = replace(scene(), poses=random_rig(np.random.default_rng(8), "verging", 3).poses)
+    points = [new.points(side, 0.2, np.random.default_rng(9)) for side in (0, 1)]
+    larger = [replace(one, world=factor * one.world) for one in points]
+    rig = fit_rig(left, right)
+    for verdict in (evaluate_stereo(left, right, larger).verdict, evaluate_rig(rig, larger).verdict):
+        assert verdict is not None
+        assert verdict.word == "poor"
+        assert reason in verdict.reasons[0]
+    same = evaluate_rig(rig, (points[0], points[1])).verdict
+    assert same is not None
+    assert not any("times that of the rig" in text for text in same.reasons)

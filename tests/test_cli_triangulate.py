@@ -143,7 +143,12 @@ def test_mostly_wrong_matches_are_warned_of(folder: Path, tmp_path: Path) -> Non
     write_matches(tmp_path / "m.csv", rows)
     result = run("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
     assert result.exit_code == 0
-    assert "warning: most points are flagged off or behind; check that uL,vL are pixels" in result.stderr
+    assert (
+        "most points are flagged off or behind; the left and the right pixels are exchanged" in result.stderr
+    )
+    write_matches(tmp_path / "m.csv", np.hstack([rows[:, 2:], rows[::-1, :2]]))
+    result = run("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
+    assert "most points are flagged off or behind; check that uL,vL are pixels" in result.stderr
 
 
 def one_line_error(result: Result, *parts: str) -> None:

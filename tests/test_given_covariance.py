@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support.command_line import run
+from support.rigs import RigScene, random_rig, sides
 from support.wrong_inputs import CAMERA, board, flat, poses, turned_poses
 
 from neurocal_cli import (
@@ -18,6 +22,7 @@ from neurocal_cli import (
     Pose,
     calibrate,
     evaluate_camera,
+    fit_rig,
     read_calibration,
     write_calibration,
     write_points,
@@ -26,6 +31,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.reading import read_given_camera
+from neurocal_cli.stereo.triangulation import triangulate
 
 SIZE = (640, 480)
 TRUE = {
@@ -142,3 +148,101 @@ def test_poses_of_new_views_in_an_evaluation_have_it_too() -> None:
     fits = [evaluate_camera(camera, points).fit for camera in (own, own.camera)]
     known, exact = (fit.views["new0"].std["t_z"] for fit in fits if fit is not None)
     assert known > 2 * exact
+
+
+def two_cameras() -> tuple[RigScene, tuple[Calibration, Calibration]]:
+    """A rig, and calibrations of its cameras from other views."""
+    scene = random_rig(np.random.default_rng(6), "verging", 8, "k1k2")
+    before = replace(scene, poses=random_rig(np.random.default_rng(50), "verging", 10, "k1k2").poses)
+    left, right = (
+        calibrate(points, distortion="k1k2", skew=False, target="given") for points in sides(before, 0.15)
+    )
+    return scene, (left, right)
+
+
+@pytest.mark.parametrize("trials", [16, pytest.param(200, marks=pytest.mark.slow)])
+def test_errors_of_a_rig_are_as_large_as_stated_if_its_cameras_are_uncertain(trials: int) -> None:
+    """Without the covariance of the given cameras, rotations are 15 to 25 standard deviations off."""
+    scene, own = two_cameras()
+    true = [scene.camera(side) for side in (0, 1)]
+    roots = [np.linalg.cholesky(camera.covariance) for camera in own]
+    seen_by_both = scene.points(0), scene.points(1)
+    depth = (scene.poses["01"].R @ scene.world.T).T[:, 2] + scene.poses["01"].t[2]
+    errors, of_poses, alone, depths = [], [], [], []
+    for trial in range(trials):
+        rng = np.random.default_rng([trial, 7])
+        drawn = []
+        for camera, one, root in zip(own, true, roots, strict=True):
+            free = [(*INTRINSIC_NAMES, "k1", "k2").index(name) for name in camera.covariance_names]
+            values = parameters(one)
+            values[free] += root @ rng.normal(size=len(root))
+            drawn.append(with_parameters(camera, values))
+        points = [scene.points(side, 0.15, rng) for side in (0, 1)]
+        options = {"type": 3, "target": "given", "outliers": "keep"}
+        for result, exact in ((errors, False), (alone, True)):
+            cameras = [
+                calibrate(some, intrinsics=given.camera if exact else given, **options)
+                for some, given in zip(points, drawn, strict=True)
+            ]
+            rig = fit_rig(cameras[0], cameras[1])
+            error = np.concatenate([rig.pose.euler - scene.rig.euler, rig.t - scene.rig.t])
+            std = [rig.std[name] for name in (*POSE_NAMES, "baseline")]
+            result.append(np.append(error, rig.baseline - np.linalg.norm(scene.rig.t)) / std)
+            if exact:
+                continue
+            view = rig.right.views["01"]
+            off = np.concatenate(
+                [view.pose.euler - scene.pose(1, "01").euler, view.pose.t - scene.pose(1, "01").t]
+            )
+            of_poses.append(off / [view.std[name] for name in POSE_NAMES])
+            pixels = (side.pixels[: len(scene.world)] for side in seen_by_both)
+            space = triangulate(rig.left, rig.right, rig.pose, *pixels).points
+            assert rig.verdict is not None
+            depths.append(np.median(space[:, 2] / depth - 1) / rig.verdict.measures["depth_share"])
+    slack = 0.1 if trials > 100 else 0.4
+    for found in (errors, of_poses, depths):
+        rms = np.sqrt((np.array(found) ** 2).mean(axis=0))
+        assert np.abs(rms - 1).max() < slack, rms
+    assert np.sqrt((np.array(alone) ** 2).mean(axis=0)).max() > 10
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda block: block["covariance"]["names"].__setitem__(0, "focal"), "names must be different names"),
+        (lambda block: block["covariance"]["data"][0].__setitem__(0, -1.0), "negative eigenvalues"),
+        (lambda block: block["covariance"]["data"][0].__setitem__(1, 0.0), "must be symmetric"),
+        (lambda block: block["covariance"].update(data=(np.eye(7) * 1e-9).tolist()), "the std of alpha_u is"),
+    ],
+)
+def test_a_covariance_that_was_edited_is_refused(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    write_calibration(calibrated(TRUE["k1k2"]), tmp_path / "camera.json")
+    tree = json.loads((tmp_path / "camera.json").read_text())
+    change(tree["neurocal"])
+    (tmp_path / "edited.json").write_text(json.dumps(tree))
+    write_points(flat(), tmp_path / "points.csv")
+    result = run("calibrate", tmp_path / "points.csv", "--type", 3, "--intrinsics", tmp_path / "edited.json")
+    assert result.exit_code == 1
+    assert message in result.stderr
+
+
+def test_what_is_taken_as_exact_is_said(tmp_path: Path) -> None:
+    own, points = calibrated(TRUE["k1k2"]), seen(TRUE["k1k2"], poses(3, 5), 0.2, np.random.default_rng(2))
+    write_calibration(own, tmp_path / "camera.yaml")
+    write_points(points, tmp_path / "points.csv")
+    run("convert", tmp_path / "camera.yaml", "--to", "ros", "-o", tmp_path / "ros.yaml")
+    given = ("calibrate", tmp_path / "points.csv", "--type")
+    known, unknown = (run(*given, 3, "--intrinsics", tmp_path / f"{name}.yaml") for name in ("camera", "ros"))
+    write_calibration(calibrate(points, type=3, intrinsics=own), tmp_path / "poses.yaml")
+    placed = run(*given, 4, "--extrinsics", tmp_path / "poses.yaml", "--distortion", "k1k2")
+    assert ["taken as exact" in one.stderr for one in (known, unknown, placed)] == [False, True, True]
+
+
+def test_the_std_of_predicted_pixels_includes_the_given_camera() -> None:
+    own, points = calibrated(TRUE["k1k2"]), seen(TRUE["k1k2"], poses(3, 5), 0.2, np.random.default_rng(2))
+    known, exact = (calibrate(points, type=3, intrinsics=one).verdict for one in (own, own.camera))
+    assert known is not None
+    assert exact is not None
+    assert known.measures["projection_px"] > 3 * exact.measures["projection_px"]

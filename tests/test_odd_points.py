@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.wrong_inputs import flat, moved, scaled
+from support.wrong_rigs import scene, seen
 
 from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.verdict.odd_points import odd_pixels, points_given_twice, views_of_another_scale
@@ -83,3 +84,13 @@ def test_outliers_are_named_by_what_they_have_in_common() -> None:
     assert verdict is not None
     assert verdict.word == "usable"
     assert verdict.reasons == ("10 of 930 points are outliers and were left out: point p40 in most views",)
+
+
+def test_a_view_that_is_left_out_with_its_cause_lies_outside_nothing() -> None:
+    points = seen(scene())[1]
+    swapped = np.where((points.view_index == 3)[:, None], points.pixels[:, ::-1], points.pixels)
+    verdict = calibrate(replace(points, pixels=swapped), distortion="none", skew=False).verdict
+    assert verdict is not None
+    assert verdict.word == "usable"
+    assert len(verdict.reasons) == 1
+    assert "right04 (its u and v are exchanged)" in verdict.reasons[0]

@@ -77,6 +77,12 @@ def test_a_focal_length_that_changed_is_told_from_a_rig_that_moved() -> None:
     assert told.amount == pytest.approx(0.007, rel=0.1)
 
 
+def test_a_zoom_of_both_cameras_is_told_from_a_rig_that_moved() -> None:
+    told = found(in_parts(scene(), zoomed(zoomed(scene(), 0, 1.02), 1, 1.01), 5, right_only=False))
+    assert (told.kind, told.at) == ("both focal", 5)
+    assert told.amount == pytest.approx(0.015, rel=0.1)
+
+
 def test_scatter_is_not_taken_for_a_change() -> None:
     for seed in range(8):
         assert found(jolted(scene(8, seed), 2.0, seed)).kind in ("", "odd")

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.real_data import RealFiles
-from support.rigs import random_rig
+from support.rigs import random_rig, sides
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 
-from neurocal_cli import calibrate, calibrate_stereo, read_points, triangulate
+from neurocal_cli import calibrate, calibrate_stereo, fit_rig, read_points, triangulate
 from neurocal_cli.io.rig_yaml import read_rig
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
@@ -197,3 +197,18 @@ def test_no_rig_is_good_where_something_changed_that_matters() -> None:
             assert found.rig is not None
             off = abs(found.rig.baseline - float(np.linalg.norm(some.rig.t)))
             assert off < max(4 * found.rig.std["baseline"], 0.01 * found.rig.baseline)
+
+
+def test_given_cameras_that_are_exchanged_are_named_before_what_follows_from_it() -> None:
+    given = random_rig(np.random.default_rng(6), "verging", 12, "k1k2")
+    other = random_rig(np.random.default_rng(50), "verging", 12, "k1k2")
+    points = sides(given, 0.15), sides(replace(given, poses=other.poses), 0.15, 2)
+    own = [calibrate(side, distortion="k1k2", skew=False) for side in points[0]]
+    exchanged = [
+        calibrate(side, type=3, intrinsics=one) for side, one in zip(points[1], own[::-1], strict=True)
+    ]
+    verdict = fit_rig(*exchanged).verdict
+    assert verdict is not None
+    assert verdict.word != "good"
+    assert "left camera: alpha_u" in verdict.reasons[0]
+    assert any("relative pose of the cameras differs" in reason for reason in verdict.reasons[1:])

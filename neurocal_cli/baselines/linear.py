@@ -175,7 +175,7 @@ def _camera_of_given_poses(problem: Problem) -> CameraState:
         name = views.names[int(views.index[np.argmax(behind)])]
         raise DegenerateGeometryError(
             f"the given pose of view {name!r} puts points behind the camera; it must map world to camera, "
-            "Xc = R M + t, z forward"
+            "Xc = R M + t, z forward, with t in the unit of X,Y,Z"
         )
     x, y, w, one = X / Z, Y / Z, np.sqrt(views.weights), np.ones_like(Z)
     zero = np.zeros_like(Z)

@@ -99,11 +99,15 @@ class Estimation:
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
-            points, arguments["intrinsics"] = preparation.given_camera(self.intrinsics, points)
+            points, camera = preparation.given_camera(self.intrinsics, points)
+            arguments["intrinsics"] = camera
+            if not getattr(camera, "known_covariance", ((), None))[0]:
+                _note_exact(f"{self.intrinsics} does not say how accurate its camera is, so it")
         elif self.extrinsics is not None:
             from neurocal_cli.io.calibration_tree import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
+            _note_exact("each given pose")
         return points, arguments
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
@@ -124,6 +128,10 @@ class Estimation:
             f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
         )
         return center
+
+
+def _note_exact(what: str) -> None:
+    note(f"{what} is taken as exact: the standard deviations do not include its errors")
 
 
 def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

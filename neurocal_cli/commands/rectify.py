@@ -183,6 +183,7 @@ class _Work:
 
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify the points of both cameras and write them."""
+        from neurocal_cli.calibration import undistorted_before
         from neurocal_cli.io.points_csv import format_points, read_points
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import rectify_points, row_error
@@ -193,6 +194,8 @@ class _Work:
         for side, (path,) in enumerate(sides):
             notes: list[str] = []
             points = read_points(path, notes=notes)
+            if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
+                warn(why)
             moved.append(rectify_points(self.pair, side, points))
             if len(moved[-1]) < len(points):
                 notes.append(

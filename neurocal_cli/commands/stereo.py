@@ -69,7 +69,8 @@ def stereo(
     Two views are a pair if their names are equal, or equal without left, l, cam0 and right, r, cam1 (such
     as left01 and right01, but not leftnew01: the word must not touch other letters). Points are paired by
     their ids, else by X, Y, Z. Pairs of views that contradict the others are named with the likely reason:
-    the board is turned in one image, the images are exchanged, or they were not taken at the same moment.
+    the board is turned in one image, one image is mirrored, the images are exchanged, an image is missing so
+    that all later pairs are shifted, or they were not taken at the same moment.
 
     The command writes the rig as a YAML file: both calibrations, R, t, E, F, the baseline, and the
     rectification as OpenCV defines it. It prints a summary with standard deviations on standard error.

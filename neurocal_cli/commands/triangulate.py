@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
+_SAMPLE = 1000  # points whose fault is looked for
 _MANY_OFF = 0.5  # share of the points that chance does not explain
 
 
@@ -88,6 +89,9 @@ def triangulate(
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        if camera.points.undistorted:
+            note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
@@ -135,6 +139,7 @@ class _Tally:
     def __init__(self, rig: Rig, limit: float) -> None:
         self.rig, self.limit = rig, limit
         self.points = self.behind = self.off = self.outside = 0
+        self.first: Matches | None = None  # the first batch, a sample for the cause of what is wrong
 
     def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
         """The points of each batch of matches, and their names."""
@@ -142,6 +147,7 @@ class _Tally:
 
         rig = self.rig
         for batch in batches:
+            self.first = self.first or batch
             found = solve(rig.left, rig.right, rig.pose, batch.left, batch.right)
             self.points += len(batch)
             self.behind += int(found.behind.sum())
@@ -171,7 +177,15 @@ class _Tally:
         if self.outside:
             warn(f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras")
         if self.off + self.behind > _MANY_OFF * self.points:
-            warn(
-                "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
-                "and that the pixels are neither undistorted nor rectified"
-            )
+            warn(f"most points are flagged off or behind; {self._fault()}")
+
+    def _fault(self) -> str:
+        """Why most points do not fit the rig, or what to check."""
+        from neurocal_cli.stereo.match_faults import fault_of_matches
+
+        assert self.first is not None
+        left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]
+        return fault_of_matches(self.rig, left, right, self.limit) or (
+            "check that uL,vL are pixels of the left camera, that the pixels are neither undistorted nor "
+            "rectified, and the order of the matches"
+        )

@@ -80,8 +80,8 @@ def _check_in_front(views: Views, R: Array, t: Array) -> None:
     if behind.any():
         raise DegenerateGeometryError(
             f"the given pose of view {views.names[int(np.argmax(behind))]!r} puts points behind the camera; "
-            "it must map world to camera, Xc = R M + t, z forward; a lens that sees 90 degrees from its axis "
-            "and more needs --distortion fisheye"
+            "it must map world to camera, Xc = R M + t, z forward, with t in the unit of X,Y,Z; a lens that "
+            "sees 90 degrees from its axis and more needs --distortion fisheye"
         )
 
 

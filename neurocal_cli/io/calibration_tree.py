@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
@@ -20,6 +22,7 @@ from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.observations_yaml import read_observations
 from neurocal_cli.io.text_columns import read_named, read_numbers
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.points import Correspondences
 
 # camera_matrix repeats the parameters for ROS; a larger relative difference means that one was edited.
@@ -55,9 +58,9 @@ def calibration_from_field(root: Field) -> Calibration:
     kind = block["type"].integer()
     if kind not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
+    model, coefficients = distortion_from_field(root)
     names, covariance = covariance_from_field(block, "covariance")
     given_names, given_covariance = covariance_from_field(block, "given_covariance")
-    model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
     return Calibration(
         intrinsics=intrinsics,
@@ -94,11 +97,34 @@ def calibration_from_field(root: Field) -> Calibration:
 
 
 def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Array]:
-    """Read the names and the covariance under a key of the neurocal block; none if it is not there."""
+    """Read the names and the covariance under a key of the neurocal block; none if it is not there.
+
+    Names of other parameters, values that no covariance has, and standard deviations that differ from those
+    of the parameters are errors.
+    """
     stated = block.get(key, {"names": []})
     names = tuple(stated["names"].texts())
-    size = len(names), len(names)
-    return names, stated["data"].array(*size, unknown=True) if names else np.zeros(size)
+    if not names:
+        return names, np.zeros((0, 0))
+    model = block.get("distortion", "none").text()
+    known = (*INTRINSIC_NAMES, *coefficient_names(model))
+    if not set(names) <= set(known) or len(set(names)) < len(names):
+        stated["names"].fail(f"different names among {', '.join(known)}")
+    covariance = stated["data"].array(len(names), len(names), unknown=True)
+    if not np.isfinite(covariance).all():
+        return names, covariance
+    scaled, _ = unit_diagonal(covariance)
+    symmetric = np.abs(scaled - scaled.T).max() < _SAME
+    if not symmetric or np.linalg.eigvalsh(scaled).min() < -_SAME:
+        stated["data"].fail("symmetric, without negative eigenvalues")
+    for name, variance in zip(names, np.diagonal(covariance), strict=True):
+        std = block["parameters"].get(name, {}).get("std").number_or_nan()
+        if key == "covariance" and abs(variance - std**2) > _SAME * std**2:
+            block.refuse(
+                f"the std of {name} is {std:.4g} in {block.path}.parameters, but {math.sqrt(variance):.4g} "
+                f"in {stated.path}; correct the one that was edited"
+            )
+    return names, covariance
 
 
 def neurocal_block(root: Field) -> Field:
@@ -113,6 +139,8 @@ def neurocal_block(root: Field) -> Field:
                 "has no neurocal block, so the poses and points are missing; it can serve as --intrinsics, "
                 "here give a file that calibrate wrote"
             )
+        if "neurocal_lens" in root:
+            root.refuse("is a zoom lens; give its camera at one setting, from neurocal lens camera")
         root.refuse("has no neurocal block; give a file that calibrate wrote")
     block = root["neurocal"]
     form = block["format"].integer()
@@ -161,6 +189,15 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     coefficients = root["distortion_coefficients"]["data"].array(-1)
     if len(coefficients) < length:
         root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")
+    path = f"{block.path}.parameters"
+    if coefficients[length:].any():
+        root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
+    for name, value in zip(coefficient_names(model), coefficients, strict=False):
+        stated = block["parameters"].get(name, {}).get("value", value).number()
+        if abs(stated - value) > _SAME * abs(value):
+            root.refuse(
+                f"distortion_coefficients and {path}.{name} disagree; correct the one that was edited"
+            )
     return model, coefficients[:length]
 
 

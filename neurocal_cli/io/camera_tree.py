@@ -116,6 +116,8 @@ def _find(root: Field, keys: tuple[str, ...], side: str) -> Field | None:
 
 def _intrinsics(root: Field, side: str) -> Intrinsics:
     field = _find(root, _MATRIX_KEYS, side)
+    if field is None and "neurocal_lens" in root:
+        raise InputError("is a zoom lens; give its camera at one setting, from neurocal lens camera")
     if field is None:
         raise InputError(
             f"holds no camera matrix; give a file with the key {', '.join(_MATRIX_KEYS[:2])} or K"

@@ -114,6 +114,8 @@ def rig_from_field(root: Field) -> Rig:
     left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
     if left.unit != right.unit:
         root.refuse("left and right have different units; correct one")
+    if (unit := block["unit"].text()) != left.unit:
+        root.refuse(f"stereo.unit is {unit}, but left and right are in {left.unit}; correct the one edited")
     try:
         pose = Pose(block["R"].array(3, 3), block["t"].array(3))
     except InputError as error:

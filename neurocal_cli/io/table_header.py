@@ -248,6 +248,9 @@ def _check_names(names: list[str], schema: Schema) -> None:
     missing = [name for name in schema.required if name not in names]
     if not missing:
         return
+    if names[0].startswith(("%YAML", "{", "<?xml")):
+        what = "a file of a camera, a rig or a lens"
+        raise InputError(f"is not a table of {schema.kind}, but {what}; give {schema.kind}")
     lower = {name.lower(): name for name in names}
     similar = [f"{lower[name.lower()]} as {name}" for name in missing if name.lower() in lower]
     hint = f"write {', '.join(similar)}" if similar else f"name the columns {','.join(schema.required)}"

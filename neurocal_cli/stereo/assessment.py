@@ -24,19 +24,22 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
-from neurocal_cli.stereo.contradiction import Contradiction, contradiction
+from neurocal_cli.stereo.contradiction import FOCAL, Contradiction, contradiction
 from neurocal_cli.stereo.covariance import rig_covariance
+from neurocal_cli.stereo.given_cameras import covariance_by_given
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import (
     MOVED,
+    PAIR_ANEW,
     TWO_GEOMETRIES,
     UNSYNCHRONISED,
     describe_faults,
     describe_move,
     pair_name,
+    shifted,
 )
 from neurocal_cli.stereo.triangulation import triangulate
 from neurocal_cli.verdict.assessment import assess
@@ -160,32 +163,41 @@ def _held_out(rig: Rig, poses: RelativePoses, used: NDArray[np.bool_]) -> float:
 def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array, Array]:
     """Depths of some points in the left camera [world unit], and their standard deviations for exact pixels.
 
-    `covariance` (F, F) is that of the unknowns of the relative poses. The points are evenly spaced over the
-    pairs; nan for points that are behind a camera.
+    `covariance` (F, F) is that of the unknowns of the relative poses. That of given cameras is added. The
+    points are evenly spaced over the pairs; nan for points that are behind a camera.
     """
+    estimated = np.append(np.concatenate(poses.problem.estimated), np.ones(6, dtype=bool))
+    state = poses.problem.start(rig.pose)
+    given = covariance_by_given(poses.problem, state, poses.problem.normal(state)[0], estimated)
+    shared = np.zeros((len(estimated), len(estimated)))
+    shared[np.ix_(estimated, estimated)] = covariance
+    covariance = shared if given is None else shared + given.shared
+    columns = state.columns
     sides = rig.left.points, rig.right.points
     rows = pair_points(*sides, ViewPairs(rig.pairs))
     step = max(1, len(rows.left) // _MOST_POINTS)
     pixels = sides[0].pixels[rows.left[::step]], sides[1].pixels[rows.right[::step]]
 
     def depths(step: Array) -> Array:
-        left, right = (_moved_camera(poses, side, step) for side in (0, 1))
-        w, tau = np.split(step[poses.rig], 2)
+        left, right = (_moved_camera(poses, side, step[columns.cameras[side]]) for side in (0, 1))
+        w, tau = np.split(step[columns.rig], 2)
         pose = Pose(rotation_step(w) @ rig.R, rig.t + tau * poses.unit)
         found = triangulate(left, right, pose, *pixels)
         return np.where(found.behind, np.nan, found.points[:, 2])
 
-    depth = depths(np.zeros(len(covariance)))
+    depth = depths(np.zeros(columns.n_shared))
+    moving = np.flatnonzero(np.diagonal(covariance))
+    covariance = covariance[np.ix_(moving, moving)]
     steps = np.maximum(_STEP * np.sqrt(np.abs(np.diagonal(covariance))), _LEAST_STEP)
-    J = np.stack([(depths(row) - depth) / row.max() for row in np.diag(steps)], axis=1)
+    unit = np.eye(columns.n_shared)[moving]
+    J = np.stack([(depths(h * one) - depth) / h for h, one in zip(steps, unit, strict=True)], axis=1)
     return depth, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, covariance, J), 0.0))
 
 
 def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
-    """One camera after a step of the unknowns."""
+    """One camera after a step of A's entries and the distortion coefficients."""
     state, seen = poses.problem.cameras[side], poses.problem.observations[side]
-    values = np.concatenate([state.entries[0], state.k])
-    values[poses.problem.estimated[side]] += step[poses.own[side]]
+    values = np.concatenate([state.entries[0], state.k]) + step
     A = intrinsic_matrix(seen.in_pixels(values[:5]))
     return Camera(Intrinsics.from_matrix(A), Distortion(state.model, values[5:]))
 
@@ -193,15 +205,26 @@ def _moved_camera(poses: RelativePoses, side: int, step: Array) -> Camera:
 def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
+    # A camera that is poor by itself, or was given wrong, spoils the pairs, so it is named before them.
+    for given, verdict, side in _cameras(rig, e):
+        if verdict.reasons and (given or verdict.word == "poor"):
+            advice = verdict.advice[0] if verdict.advice else ""
+            yield WORDS.index(verdict.word), f"{side} camera: {verdict.reasons[0]}", advice
     yield from _pairs(rig, e)
     yield from _precision(rig, e)
-    for side, verdict in zip(("left", "right"), e.cameras, strict=True):
+    for _, verdict, side in _cameras(rig, e):
+        # Reasons and advice come the worst first.
+        for k, reason in enumerate(verdict.reasons):
+            yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
+        for k, advice in enumerate(verdict.advice):
+            yield (1 if k else WORDS.index(verdict.word)), "", advice
+
+
+def _cameras(rig: Rig, e: _Evidence) -> Iterator[tuple[bool, Verdict, str]]:
+    """Whether something of each camera was given, its verdict by its own points, and its side."""
+    for camera, verdict, side in zip((rig.left, rig.right), e.cameras, ("left", "right"), strict=True):
         if verdict is not None:
-            # Reasons and advice come the worst first.
-            for k, reason in enumerate(verdict.reasons):
-                yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
-            for k, advice in enumerate(verdict.advice):
-                yield (1 if k else WORDS.index(verdict.word)), "", advice
+            yield camera.type != 1, verdict, side
 
 
 def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
@@ -217,12 +240,12 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         yield (
             _LEFT_OUT.grade(len(odd) / len(e.names)),
             f"{describe_faults(odd, len(e.names))} and were left out",
-            "look at the views of these pairs, and take them again",
+            PAIR_ANEW if shifted(odd) else "look at the views of these pairs, and take them again",
         )
     found = e.contradiction
     if found is None:
         return
-    if found.kind in ("left focal", "right focal", "late", "early"):
+    if found.kind in (*FOCAL, "late", "early"):
         yield _changed(e, found)
         return
     if found.kind in TWO_GEOMETRIES:
@@ -258,10 +281,10 @@ def _changed(e: _Evidence, found: Contradiction) -> Finding:
             f"they show the target {100 * found.amount:.2g} % of the way {way} pair's place",
             _MOMENT,
         )
-    side = found.kind.partition(" ")[0]
+    sides = " and the ".join(("left", "right")[side] for side in FOCAL[found.kind])
     return (
         grade,
-        f"the focal length of the {side} camera changed by {100 * found.amount:+.2g} % between "
+        f"the focal length of the {sides} camera changed by {100 * found.amount:+.2g} % between "
         f"{pair_name(e.names[found.at - 1])} and {pair_name(e.names[found.at])}",
         "calibrate each part by itself, and lock zoom and focus",
     )

@@ -44,6 +44,11 @@ _SUSPECT = 60.0
 _OWN_SHARE = 3.0
 _MOST_STARTS = 40
 _STEPS = 10  # most concentration steps; fewer suffice
+FOCAL = {
+    "left focal": (0,),
+    "right focal": (1,),
+    "both focal": (0, 1),
+}  # the cameras whose focal length changed
 
 
 @frozen_dataclass(eq=False)
@@ -52,11 +57,11 @@ class Contradiction:
 
     The best explanation is one of: pairs that contradict the others ("odd"); the rig moved between two pairs;
     from some pair on the target has another size, so that only the length of the baseline differs; the focal
-    length of a camera changed between two pairs; the right images were taken later ("late"), or earlier, than
-    the left ones. It is empty where none is needed, or none is found.
+    length of a camera, or of both, changed between two pairs; the right images were taken later ("late"), or
+    earlier, than the left ones. It is empty where none is needed, or none is found.
     """
 
-    kind: str  # "", "odd", "moved", "size", "left focal", "right focal", "late", "early"
+    kind: str  # "", "odd", "moved", "size", one of FOCAL, "late", "early"
     at: int  # first pair after the change
     # Relative change of the focal length or the baseline, or share of the motion to the next (previous) pair.
     amount: float
@@ -83,6 +88,11 @@ class _Explanation:
     gain: float
     values: Array
     shift: Array
+
+    @property
+    def unknowns(self) -> int:
+        """Unknowns that it costs. Both focal lengths mimic a small turn of the rig, so they cost as much."""
+        return 6 if self.kind == "both focal" else len(self.values)
 
 
 def is_significant(squares: float, degrees: int) -> bool:
@@ -128,10 +138,12 @@ def _as_contradiction(
     amount = float(found.values[0]) if found.kind in ("late", "early") else 0.0
     for side, kind in enumerate(("left focal", "right focal")):
         if found.kind == kind:
-            amount = float(np.mean(found.values / poses.problem.cameras[side].entries[0, [0, 2]]))
+            amount = float(np.mean(found.values / _focal(poses, side)))
+    if found.kind == "both focal":
+        amount = float(np.mean(found.values))
     if found.kind == "size":
-        before = poses.reference + (poses.solution(used) - found.shift[0])[poses.rig[3:]]
-        amount = float(found.values[0] * (poses.reference @ before) / max(before @ before, 1e-300))
+        baseline = poses.reference + (poses.solution(used) - found.shift[0])[poses.rig[3:]]
+        amount = float(found.values[0] * (poses.reference @ baseline) / max(baseline @ baseline, 1e-300))
     gain = float(np.sqrt(found.gain / len(found.values)))
     return Contradiction(
         found.kind, found.at, amount, n, odd, scatter, float(np.sqrt(left)), gain, growth, found.shift
@@ -154,7 +166,7 @@ def _squares(poses: RelativePoses, used: NDArray[np.bool_]) -> float:
 def _score(poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | None, more: int = 0) -> float:
     """The criterion of one rig for the used pairs, with an explanation or `more` unknowns."""
     n = 6 * len(poses)
-    gain, unknowns = (0.0, more) if found is None else (found.gain, len(found.values))
+    gain, unknowns = (0.0, more) if found is None else (found.gain, found.unknowns)
     spare = _degrees(used) - (0 if found is None else unknowns)
     rest = (_squares(poses, used) - gain) / spare if spare > 0 else np.inf
     return float(n * np.log(max(rest, 1.0)) + unknowns * np.log(n))
@@ -200,9 +212,13 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
     longer = np.zeros((len(S), 1))
     longer[poses.rig[3:], 0] = poses.reference
     kinds = [("moved", unknowns[:, poses.rig], after_S, after_g), ("size", longer, after_S, after_g)]
-    for kind, columns in zip(("left focal", "right focal"), poses.focal, strict=True):
+    zooms = np.zeros((len(S), 2))
+    for side, (kind, columns) in enumerate(zip(("left focal", "right focal"), poses.focal, strict=True)):
         if len(columns) == 2:
             kinds.append((kind, unknowns[:, columns], after_S + own_S, after_g + own_g))
+            zooms[columns, side] = _focal(poses, side)
+    if zooms.any(axis=0).all():
+        kinds.append(("both focal", zooms, after_S + own_S, after_g + own_g))
     for kind, step, S2, g2 in kinds:
         cross = S2 @ step
         follow = inverse @ cross
@@ -214,6 +230,11 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
         before = follow[k] @ values[k]
         after = before - step @ values[k]
         yield _Explanation(kind, int(starts[k]), float(gains[k]), values[k], np.stack([before, after]))
+
+
+def _focal(poses: RelativePoses, side: int) -> Array:
+    """(2,) alpha_u and alpha_v of one camera, normalised."""
+    return np.asarray(poses.problem.cameras[side].entries[0, [0, 2]])
 
 
 def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:

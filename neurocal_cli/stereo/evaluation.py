@@ -6,7 +6,7 @@ All errors are in that frame, with z along the optical axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 
 import numpy as np
@@ -17,7 +17,8 @@ from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.evaluation import other_images, predict, refuse_another_size
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, rotation_vector
+from neurocal_cli.median import median
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
@@ -26,7 +27,13 @@ from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_view
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError, space_error
 from neurocal_cli.stereo.triangulation import triangulate
+from neurocal_cli.verdict.findings import Finding
 from neurocal_cli.verdict.given_points import GivenPoints, given_camera, given_error, with_findings
+from neurocal_cli.verdict.odd_points import units_mixed
+
+# Given points show a target of another size if the baseline differs by more than this share while the views'
+# relative poses agree with the rig within this angle [rad]; noise turns that of a view by a few thousandths.
+_OTHER_SIZE, _SAME_DIRECTION = 0.05, 0.02
 
 
 @frozen_dataclass(eq=False)
@@ -186,7 +193,8 @@ class _Evaluator:
             rows = np.array([name in names for name in points.view_names])[points.view_index]
             new, seed = points.select(rows), camera.seed
             fit = calibrate(new, type=3, intrinsics=camera, seed=seed, outliers="keep", target="given")
-            self.warnings += [f"fitting the poses of new views: {text}" for text in fit.warnings]
+            new_warnings = [text for text in fit.warnings if text not in self.warnings]
+            self.warnings += [f"fitting the poses of new views: {text}" for text in new_warnings]
             if not fit.converged:
                 self.warnings.append(f"the poses of new views did not converge: {fit.stop_reason}")
             fits.append(fit)
@@ -194,14 +202,18 @@ class _Evaluator:
 
     def _by_view(self) -> SpaceError:
         """Errors with the two poses of each view."""
+        return self._error(*self._own_poses(self.views.both), np.ones(len(self.views.both), dtype=bool))
+
+    def _own_poses(self, pairs: Sequence[tuple[str, str]]) -> tuple[list[Pose], list[Pose]]:
+        """Poses of views in the left camera, and the relative pose of the cameras by each of them."""
         first, rigs, new = [], [], set(self.new)
-        for pair in self.views.both:
+        for pair in pairs:
             source = self.fitted if self.fitted is not None and pair in new else self.cameras
             left, right = (source[side].views[pair[side]].pose for side in (0, 1))
             R = right.R @ left.R.T
             first.append(left)
             rigs.append(Pose.exact(R, right.t - R @ left.t))
-        return self._error(first, rigs, np.ones(len(first), dtype=bool))
+        return first, rigs
 
     def _poses_on(self, rig: Rig) -> list[Pose]:
         """The pose of each view in the left camera that fits both cameras best."""
@@ -225,12 +237,40 @@ class _Evaluator:
         given = GivenPoints(rmse_px, len(residuals), len(residuals) - seen.size)
         same = "rig, with both cameras as they were"
         findings = [given_error(verdict, rig.rmse_px, rig.left.points, given, same)]
+        if findings[0][0]:
+            findings = [*self._other_size(rig, findings[0][0]), *findings]
         fits = self.fitted or (None, None)
         for side, camera, fit in zip(("left", "right"), self.cameras, fits, strict=True):
             findings += [
                 (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(camera, fit)
             ]
         return with_findings(verdict, findings)
+
+    def _other_size(self, rig: Rig, grade: int) -> Iterator[Finding]:
+        """The finding about given points of a target of another size or unit, if that is what is wrong.
+
+        The views' relative poses then have the rotation and the direction of the rig, but another baseline.
+        """
+        poses = self._own_poses(self.new)[1]
+        t = np.array([pose.t for pose in poses]).reshape(-1, 3)
+        length = np.linalg.norm(t, axis=1)
+        if not poses or not (length > 0).all():
+            return
+        turned = [np.linalg.norm(rotation_vector(pose.R @ rig.R.T)) for pose in poses]
+        aside = np.arccos(np.clip(t @ rig.t / (length * rig.baseline), -1.0, 1.0))
+        ratio = float(median(length)) / rig.baseline
+        if (
+            max(median(np.array(turned)), median(aside)) < _SAME_DIRECTION
+            and abs(np.log(ratio)) > _OTHER_SIZE
+        ):
+            units = units_mixed(max(ratio, 1 / ratio))
+            mixed = f", as with {units} mixed" if units else ""
+            yield (
+                grade,
+                f"with the given points the baseline is {ratio:.3g} times that of the rig: X,Y,Z have "
+                f"another unit{mixed}, the squares another size, or a camera slid along the baseline",
+                "check the unit of X,Y,Z and the size of the squares",
+            )
 
     def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
         """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""

@@ -12,6 +12,7 @@ from neurocal_cli.report import align, calibration_json, number_or_none, plural,
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
+from neurocal_cli.verdict.findings import two_digits
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
@@ -100,7 +101,7 @@ def _figure(value: float) -> str:
 
 
 def _share(value: float) -> str:
-    return f"{100 * value:.2g} %" if math.isfinite(value) else "-"
+    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
 
 
 def rig_report(rig: Rig) -> str:

@@ -28,6 +28,7 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import Observations, RigFit
 from neurocal_cli.stereo.covariance import covariance_of_choice, not_smaller
+from neurocal_cli.stereo.given_cameras import covariance_by_given
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
 
@@ -78,6 +79,14 @@ class _RigAssembly:
         for more in (covariance_of_choice(fit), stretched):
             if more is not None:
                 covariance = _widened(covariance, covariance.shared + more)
+        given = covariance_by_given(self.problem, self.state, fit.normal, fit.free)
+        if given is not None:
+            covariance = replace(
+                covariance,
+                shared=covariance.shared + given.shared[np.ix_(self.shared, self.shared)],
+                own=covariance.own + given.own,
+                cross=covariance.cross + given.cross[:, self.shared],
+            )
         self.covariance = covariance
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:

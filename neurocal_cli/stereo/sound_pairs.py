@@ -1,9 +1,9 @@
 """Select the pairs of views that determine the rig, and diagnose the others.
 
 Each pair of views gives the pose of the right camera relative to the left one. Pairs that disagree with most
-others are tested for three faults: the target is turned in one image (its points have another order), the two
-images are exchanged, or they were not taken at the same moment. `contradiction` then compares the relative
-poses with their covariances, and tells whether the rig moved.
+others are tested for four faults: the target is turned in one image (its points have another order), one
+image is mirrored, the two images are exchanged, or they were not taken at the same moment. `contradiction`
+then compares the relative poses with their covariances, and tells whether the rig moved.
 """
 
 from __future__ import annotations
@@ -35,12 +35,26 @@ _SIGMAS = 30.0
 _MOST_HYPOTHESES = 40
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
-_TURNS = (90, 270, 180)
+_TURNED = "the target is turned by {} degrees in one of the images"
+_MIRRORED = "one of the two images is mirrored, or its u and v are exchanged"
+# Faults of the images of flat targets: how the target's axes (the longest first, the normal last) and those
+# of the right camera are exchanged. A mirrored image of a flat target is one of its back; programs that
+# number the points in each image by themselves then begin at another corner.
+_IMAGE_MIRRORED = np.diag([-1.0, 1.0, 1.0])
+_FAULTS = (
+    *((_TURNED.format(d), euler_to_rotation(0.0, 0.0, np.radians(d)), np.eye(3)) for d in (90, 270, 180)),
+    *((_MIRRORED, np.diag(of_target), _IMAGE_MIRRORED) for of_target in np.where(np.eye(3)[::-1], -1.0, 1.0)),
+)
 _OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
 _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
 
 UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
 TWO_GEOMETRIES = ("moved", "size")  # kinds of contradiction after which one part of the pairs is used
+PAIR_ANEW = (
+    "one image of one camera is missing or was taken twice; name the views that were taken at the same "
+    "moment alike"
+)
+SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in ("next", "previous")}
 MOVED = "taken"  # first word of the reason for pairs taken before or after the rig moved
 
 Pair = tuple[str, str]
@@ -64,16 +78,26 @@ class SoundPairs:
         found = describe_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
+        if shifted(self.left_out):
+            return f"{found}; {PAIR_ANEW}"
+        if UNSYNCHRONISED not in self.left_out.values():
+            return f"{found}; correct these images, or the order of their points"
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
 def describe_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
-    """Describe pairs that are left out: their number, and the faults with the pairs of each."""
+    """Describe pairs that are left out: their number, and the faults with the pairs of each, most first."""
     by_reason: dict[str, list[str]] = {}
     for pair, reason in left_out.items():
         by_reason.setdefault(reason, []).append(pair_name(pair))
-    parts = [f"{name_some(names)}: {reason}" for reason, names in by_reason.items()]
+    most_first = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+    parts = [f"{name_some(names)}: {reason}" for reason, names in most_first]
     return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
+
+
+def shifted(left_out: Mapping[Pair, str]) -> bool:
+    """Whether left views fit the right views of other pairs than their own."""
+    return any(reason in SHIFTED.values() for reason in left_out.values())
 
 
 def pair_name(pair: Pair) -> str:
@@ -99,9 +123,12 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     if poses is not None:
         used = np.array([pair not in named for pair in poses.names])
         found = _explained(poses, used, found)
+    found = _with_shifted(left, right, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
-        shifted = _shifted(left, right, views)
-        raise DegenerateGeometryError(shifted or found.contradiction())
+        why = "" if shifted(found.left_out) else _shifted(left, right, views)
+        if not why and UNSYNCHRONISED in found.left_out.values():
+            why = _poor_camera(left, right, found)
+        raise DegenerateGeometryError(why or found.contradiction())
     return found
 
 
@@ -162,7 +189,8 @@ def describe_move(
         return (
             f"from {pair_name(names[at])} on nothing but the length of the baseline differs, by "
             f"{100 * why.amount:+.2g} %: the target in {span(names[at:])} is {100 * abs(larger):.2g} % "
-            f"{than} (or the cameras slid along the line between them){this.replace('this', 'the rig')}",
+            f"{than} (or the cameras slid along the line between them, or both changed their focal length)"
+            f"{this.replace('this', 'the rig')}",
             "measure the squares of both targets, and give each target its own X,Y,Z",
         )
     return (
@@ -176,16 +204,51 @@ def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
     """Message if the pairs agree on a rig once the right views are shifted by one; otherwise empty."""
     if len(views.both) < 2 * _LEAST_AGREED:
         return ""
-    for word, by in (("next", 1), ("previous", -1)):
-        pairs = in_order(views.both)
-        first, second = (pairs[:-1], pairs[1:]) if by > 0 else (pairs[1:], pairs[:-1])
-        moved = tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
+    for word in SHIFTED:
+        moved = _neighbours(views.both, word)
         agree = find_consensus(rig_problem(left, right, ViewPairs(moved))).agree
         if agree.mean() > _AGREED:
             return (
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
-                "not that of its own; one image of one camera is missing or was taken twice; name the views "
-                "that were taken at the same moment alike"
+                f"not that of its own; {PAIR_ANEW}"
+            )
+    return ""
+
+
+def _with_shifted(left: Calibration, right: Calibration, found: SoundPairs) -> SoundPairs:
+    """Name pairs whose left views fit the right views of the next pairs, or of the previous ones.
+
+    From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
+    """
+    odd = {a: b for (a, b), reason in found.left_out.items() if reason == UNSYNCHRONISED}
+    for word in SHIFTED:
+        moved = tuple(pair for pair in _neighbours(found.problem.pairs, word) if pair[0] in odd)
+        if len(moved) < _LEAST_AGREED:
+            continue
+        problem = rig_problem(left, right, ViewPairs(moved))
+        fits = _distance(problem, _poses(problem), found.rig.R[None], found.rig.t[None])[0] < 1
+        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
+            names = [a for (a, _), one in zip(problem.pairs, fits, strict=True) if one]
+            reasons = {(a, odd[a]): SHIFTED[word] for a in names}
+            return replace(found, left_out={**found.left_out, **reasons})
+    return found
+
+
+def _neighbours(pairs: Sequence[Pair], word: str) -> tuple[Pair, ...]:
+    """Each left view with the right view of the next, or of the previous, pair."""
+    ordered = in_order(pairs)
+    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
+    return tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
+
+
+def _poor_camera(left: Calibration, right: Calibration, found: SoundPairs) -> str:
+    """Message if the pairs contradict each other, and a camera is poor by itself; otherwise empty."""
+    for side, camera in (("left", left), ("right", right)):
+        verdict = camera.verdict
+        if verdict is not None and verdict.word == "poor":
+            return (
+                f"{len(found.left_out)} of {len(found.problem.paired)} pairs of views contradict the rig, "
+                f"and the {side} camera is poor by itself: {verdict.reasons[0]}; {verdict.advice[0]}"
             )
     return ""
 
@@ -257,13 +320,13 @@ def _distance(problem: RigProblem, poses: _Poses, R: Array, t: Array) -> Array:
 def _common_fault(
     problem: RigProblem, poses: _Poses, found: tuple[Array, Array, NDArray[np.bool_]]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The rig and the pairs that agree with it, if most targets are turned alike in one camera."""
+    """The rig and the pairs that agree with it, if most pairs have one fault."""
     most = int(found[2].sum())
-    for degrees in _TURNS:
-        turned = _turned(problem, poses, degrees)
-        R, t = turned.rigs()
+    for _, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        R, t = mended.rigs()
         sound = _distance(problem, poses, R, t) < 1
-        faulty = (_distance(problem, turned, R, t) < 1) & problem.flat
+        faulty = (_distance(problem, mended, R, t) < 1) & problem.flat
         counts = (sound | faulty).sum(axis=1)
         if counts.max() > most:
             best, most = int(np.argmax(counts)), int(counts.max())
@@ -283,16 +346,17 @@ def _reasons(
         "the left and the right image are exchanged",
         UNSYNCHRONISED,
     )
-    for degrees in _TURNS:
-        fits = problem.flat & (_distance(problem, _turned(problem, poses, degrees), R[None], t[None])[0] < 1)
-        reasons = np.where(fits, f"the target is turned by {degrees} degrees in one of the images", reasons)
+    for reason, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        fits = problem.flat & (_distance(problem, mended, R[None], t[None])[0] < 1)
+        reasons = np.where(fits, reason, reasons)
     return tuple(np.where(sound, "", reasons).tolist())
 
 
-def _turned(problem: RigProblem, poses: _Poses, degrees: int) -> _Poses:
-    """The poses if the targets of the right camera were turned in their planes."""
-    turn = euler_to_rotation(0.0, 0.0, np.radians(degrees))
-    return _Poses((poses.R[0], poses.R[1] @ problem.axes @ turn @ np.swapaxes(problem.axes, 1, 2)), poses.m)
+def _mended(problem: RigProblem, poses: _Poses, of_target: Array, of_image: Array) -> _Poses:
+    """The poses if the axes of the targets and of the image of the right camera were exchanged."""
+    turn = problem.axes @ of_target @ np.swapaxes(problem.axes, 1, 2)
+    return _Poses((poses.R[0], of_image @ poses.R[1] @ turn), (poses.m[0], poses.m[1] @ of_image.T))
 
 
 def _mean_rig(poses: _Poses, agree: NDArray[np.bool_]) -> Pose:

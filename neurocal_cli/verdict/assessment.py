@@ -169,14 +169,15 @@ class _AtMinimum:
         self.covariance, self.wide = known.found.entries, known.wide
         self.pose_covariance = known.found.poses
         if calibration.given_names:
-            self.pose_covariance = self.pose_covariance + self._by_given_camera()
+            by_camera = covariance_by_camera(self.views, self.state, self._covariance_of_given())
+            self.pose_covariance = self.pose_covariance + by_camera
 
-    def _by_given_camera(self) -> Array:
-        """(V, 6, 6) covariance of the poses, normalised, that the given camera's covariance causes."""
+    def _covariance_of_given(self) -> Array:
+        """(5 + K, 5 + K) covariance of a given camera, normalised."""
         c, model = self.calibration, self.state.model
-        scale = self.views.pixel_scale
-        entries = entry_covariance(c.intrinsics, model, c.given_names, c.given_covariance, scale)
-        return covariance_by_camera(self.views, self.state, entries)
+        return entry_covariance(
+            c.intrinsics, model, c.given_names, c.given_covariance, self.views.pixel_scale
+        )
 
     def _arranged(self, points: Correspondences) -> Views:
         """The points, at these or other world coordinates, with the weights that the residuals bear out."""
@@ -361,6 +362,10 @@ class _AtMinimum:
         if camera.distortion.model == "rich":
             free, shared = _stored(self.calibration, self.views.pixel_scale)
             m = replace(m, free=free)
+        if self.calibration.given_names:
+            given = self._covariance_of_given()
+            free = np.diagonal(given) > 0
+            m, shared = replace(m, free=free), given[np.ix_(free, free)]
         pixels = image_grid(self.points.image_size)
         return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
 

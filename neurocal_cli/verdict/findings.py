@@ -42,6 +42,17 @@ def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Ve
     )
 
 
+def two_digits(value: float) -> str:
+    """Write a number with two significant digits, a large one without an exponent.
+
+    Examples
+    --------
+    >>> two_digits(0.123), two_digits(234.5)
+    ('0.12', '230')
+    """
+    return f"{float(f'{value:.2g}'):.15g}"
+
+
 def name_some(names: Iterable[object]) -> str:
     """List the first names, and the number of further ones."""
     some = [str(name) for name in names]

@@ -11,7 +11,15 @@ from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread, verdict_of
+from neurocal_cli.verdict.findings import (
+    WORDS,
+    Finding,
+    Limit,
+    image_diagonal,
+    pixel_spread,
+    two_digits,
+    verdict_of,
+)
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
 # Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
@@ -83,7 +91,7 @@ def given_error(
     grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
     return (
         grade,
-        f"the rms error of {error:.3g} px on the given points is {float(f'{error / own:.2g}'):g} times the "
+        f"the rms error of {error:.3g} px on the given points is {two_digits(error / own)} times the "
         f"{own:.3g} px of the calibration",
         f"check that the given points are of the same {same}; look at the views with the largest errors",
     )

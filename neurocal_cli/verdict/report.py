@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.verdict.findings import two_digits
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
@@ -32,12 +33,11 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
 def facts(verdict: Verdict) -> str:
     """The main measures of a verdict in one line."""
     m = verdict.measures
-    texts = (
-        ("held_out_px", "cross-validation error {:.3g} px"),
-        ("precision_px", "noise floor {:.3g} px"),
-        ("projection_px", "std of predicted pixels {:.2g} px at most"),
-    )
-    found = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
+    texts = (("held_out_px", "cross-validation error"), ("precision_px", "noise floor"))
+    found = [f"{text} {m[name]:.3g} px" for name, text in texts if math.isfinite(m.get(name, math.nan))]
+    predicted = m.get("projection_px", math.nan)
+    if math.isfinite(predicted):
+        found.append(f"std of predicted pixels {two_digits(predicted)} px at most")
     depth = m.get("depth_share", math.nan)
     if math.isfinite(depth):
         found.append(f"std of triangulated depth {100 * depth:.2g} % of the depth")

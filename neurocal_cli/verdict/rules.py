@@ -12,7 +12,15 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.target import Target, is_flat
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
+from neurocal_cli.verdict.findings import (
+    Finding,
+    Limit,
+    image_diagonal,
+    name_some,
+    pixel_spread,
+    two_digits,
+    verdict_of,
+)
 from neurocal_cli.verdict.given_parameters import Doubt, Reestimated, told_apart
 from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
 from neurocal_cli.verdict.proportions import MEASURE_AXES, unlike_axes
@@ -251,13 +259,17 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         )
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
-        yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
+        yield (
+            _CENTRE.grade(centre / A.alpha_u),
+            f"the std of the image centre is {two_digits(centre)} px",
+            more,
+        )
     if e.projection is not None and calibration.type != 3:
         worst = e.projection.worst
         diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
         yield (
             _PROJECTION.grade(worst / diagonal),
-            f"the std of predicted pixels is up to {worst:.2g} px",
+            f"the std of predicted pixels is up to {two_digits(worst)} px",
             more,
         )
     if calibration.type == 3:

@@ -60,7 +60,8 @@ def _elsewhere(lens: ZoomLens, px: float) -> Finding:
     return (
         _BETWEEN.grade(px / max(floor, 1e-9)),
         f"the error at the given points is {px:.3g} px, but the noise floor {floor:.3g} px",
-        "check that target and camera are where they were, or add settings where the parameters change most",
+        "check that target and camera are where they were, the unit of X,Y,Z and the names of the settings, "
+        "or add settings where the parameters change most",
     )
 
 

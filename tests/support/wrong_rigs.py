@@ -144,6 +144,18 @@ def right_rows(points: Points, order: Array, rows: Array) -> Points:
     return points[0], with_views(points[1], order, rows)
 
 
+def with_right_pixels(points: Points, change: Callable[[Array], Array]) -> Points:
+    return points[0], replace(points[1], pixels=change(points[1].pixels))
+
+
+def one_image_lost(points: Points, after: int) -> Points:
+    """Without the right image number `after`, so that all later ones have the names of their neighbours."""
+    order = np.arange(12)
+    order[after:-1] += 1
+    right = with_views(points[1], order, SAME)
+    return points[0].select(points[0].view_index < 11), right.select(right.view_index < 11)
+
+
 def half_turned(points: Points, which: list[int]) -> Points:
     turned_right = with_views(points[1], ALL, BACKWARDS).pixels
     rows = np.isin(points[1].view_index, which)[:, None]
@@ -165,6 +177,7 @@ def without_ids(points: Points) -> Points:
 
 ALL = np.arange(12)
 SAME, BACKWARDS = np.arange(54), np.arange(54)[::-1]
+UPSIDE_DOWN = SAME.reshape(6, 9)[::-1].ravel()
 Spoiler = Callable[[], Points]
 
 # What is wrong, how to make it, and what one of the reasons must say.
@@ -181,6 +194,10 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: right_rows(seen(scene()), np.roll(ALL, -1), SAME), "right view of the previous"),
     "right images of the previous pair": (
         lambda: right_rows(seen(scene()), np.roll(ALL, 1), SAME), "right view of the next"),
+    "one right image missing after six pairs": (
+        lambda: one_image_lost(seen(scene()), 6), "left image fits the right one of the previous"),
+    "one right image missing after three pairs": (
+        lambda: one_image_lost(seen(scene()), 3), "left image fits the right one of the previous"),
     "one pair of different moments": (
         lambda: in_parts(scene(), turned(scene(), 0.0, 3.0), 11), "left12/right12: .*same moment"),
     "rig bumped by 0.1 degrees half way": (
@@ -202,6 +219,11 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
     "left camera zoomed by 2 % after eight pairs": (
         lambda: in_parts(scene(), zoomed(scene(), 0, 1.02), 8, right_only=False),
         "focal length of the left"),
+    "both cameras refocused by 2 % half way": (
+        lambda: in_parts(scene(), zoomed(zoomed(scene(), 0, 1.02), 1, 1.02), 6, right_only=False),
+        "focal length of the left and the right"),
+    "left camera zoomed by 10 % half way": (
+        lambda: in_parts(scene(), zoomed(scene(), 0, 1.1), 6, right_only=False), "two zooms"),
     "images of one pair exchanged": (
         lambda: exchanged(seen(scene()), [3]), "left04/right04: the left and the right image are exchanged"),
     "images of every other pair exchanged": (
@@ -210,6 +232,14 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: half_turned(seen(scene()), [5]), "left06/right06: the target is turned by 180"),
     "board turned round in every right image": (
         lambda: half_turned(seen(scene()), list(range(12))), "turned by 180 degrees"),
+    "right images mirrored": (
+        lambda: with_right_pixels(seen(scene()), lambda pixels: [639, 0] + pixels * [-1, 1]), "mirrored"),
+    "right images mirrored, and their points numbered as in a true image": (
+        lambda: right_rows(
+            with_right_pixels(seen(scene()), lambda pixels: [639, 0] + pixels * [-1, 1]), ALL, UPSIDE_DOWN
+        ), "mirrored"),
+    "u and v swapped in the right images": (
+        lambda: with_right_pixels(seen(scene()), lambda pixels: pixels[:, ::-1]), "u and v are exchanged"),
     "right views in another order": (
         lambda: right_rows(seen(scene()), np.random.default_rng(2).permutation(12), SAME), "contradict"),
     "right points in inches": (
@@ -237,12 +267,15 @@ SLOW = frozenset(
         "board turned round in every right image",
         "half of the pairs in inches",
         "images of every other pair exchanged",
+        "one right image missing after three pairs",
         "right images early by 10 % of the time to the next pair",
         "right images late while the target moves by 0.5 mm",
+        "right images mirrored, and their points numbered as in a true image",
         "right images of the previous pair",
         "rig bumped by 0.1 degrees half way",
         "rig bumped by 0.5 degrees after four pairs",
         "rig knocked by 5 degrees after eight pairs",
+        "u and v swapped in the right images",
     }
 )
 

@@ -62,7 +62,9 @@ def read_folder(folder: str) -> CameraSet:
             raise FormatError(
                 "is a binary model; convert it with colmap model_converter --output_type TXT", folder
             )
-        raise FormatError("is a folder without COLMAP's cameras.txt; give a camera file", folder)
+        raise FormatError(
+            "is a folder without COLMAP's cameras.txt; give a camera file, or the two of a rig", folder
+        )
     text, source = read_text(path)
     with value_failures(source):
         cameras = _cameras(text, source)
