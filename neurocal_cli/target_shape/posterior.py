@@ -83,15 +83,22 @@ class Posterior:
         return joint().poses(gauge)
 
 
-_OUT_OF_PLANE = ("bend", "height")
+_OUT_OF_PLANE = ("curl", "bend", "height")
+_SWITCHED = ("stretch", "lean")
 _START = {
     "fold": 3e-3,
+    "curl": 3e-3,
     "bend": 3e-3,
     "stretch": STRETCH,
+    "lean": STRETCH,
     "warp": 5e-4,
     "place": 3e-4,
     "height": 3e-4,
 }  # of the target's size
+# Prior odds against a stretch or a lean. XX
+_LOG_ODDS = math.log(5.0)
+_CERTAIN = 500.0  # largest log odds: more overflows
+_LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 _MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
 _NOTHING = 1e-7  # size of an absent part over the target's size
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.002 standard deviations rms
@@ -179,9 +186,8 @@ def posterior(
     else:
         start = np.array([_START[name] for name in prior.names]) * prior.size / noise
     now = climb.climbed(climb.at(np.minimum(start, climb.most / noise)))
-    if with_stretch and climb.stretch is not None:
-        other = climb.climbed(climb.with_stretch_changed(now), now.evidence)
-        now = other if other.evidence > now.evidence else now
+    for part in climb.switched if with_stretch else ():
+        now = climb.on_or_off(now, part)
     return climb.posterior(now)
 
 
@@ -210,7 +216,9 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     """
     climb = _Climb(info, prior, system_of(info, prior))
     ratios = np.array([sizes[name] for name in prior.names]) / math.sqrt(variance)
-    found = climb.posterior(climb.at(ratios))
+    now = climb.at(ratios)
+    found, wider = climb.posterior(now), climb.with_open(now).solved
+    found = replace(found, camera=wider.camera, joint=(wider.joint, climb.gauge))
     return found if prior.stated is None else replace(found, variance=variance)
 
 
@@ -279,14 +287,13 @@ class _Climb:
         held = [flat and name in _OUT_OF_PLANE for name in self.names]
         self.least = np.full(len(self.names), _NOTHING * prior.size)
         self.most = np.where(held, self.least, prior.size)
-        self.stretch = self.names.index("stretch") if "stretch" in self.names else None
+        self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
         self.of_prints = STRETCH * prior.size, _MOST * prior.size
 
     def allowed(self, ratios: Array, noise: float) -> Array:
-        """Ratios in the range of each part; a stretch has the least size of prints."""
+        """Ratios in the range of each part; stretch and lean have the least size of prints."""
         ratios = np.maximum(ratios, self.least / noise)
-        if self.stretch is not None:
-            ratios[self.stretch] = self.of_prints[0] / noise
+        ratios[self.switched] = self.of_prints[0] / noise
         return ratios
 
     def at(self, ratios: Array) -> _Solution:
@@ -303,22 +310,50 @@ class _Climb:
 
     def limits(self, now: _Solution) -> tuple[Array, Array]:
         """(G,) least and largest ratios; the same for a part that is held."""
-        least, most, k = self.least.copy(), self.most.copy(), self.stretch
-        if k is not None:
-            least[k], most[k] = self.of_prints if self.is_stretched(now) else (least[k], least[k])
+        least, most = self.least.copy(), self.most.copy()
+        for k in self.switched:
+            least[k], most[k] = self.of_prints if self.is_on(now, k) else (least[k], least[k])
         return least / math.sqrt(now.variance), most / math.sqrt(now.variance)
 
-    def is_stretched(self, now: _Solution) -> bool:
-        """Whether the stretch has the size of prints."""
-        size = float(now.ratios[self.stretch]) * math.sqrt(now.variance)
+    def is_on(self, now: _Solution, part: int) -> bool:
+        """Whether a stretch or a lean has the size of prints."""
+        size = float(now.ratios[part]) * math.sqrt(now.variance)
         return size > math.sqrt(self.of_prints[0] * self.least[0])
 
-    def with_stretch_changed(self, now: _Solution) -> _Solution:
-        """The solution with the stretch switched on or off."""
+    def changed(self, now: _Solution, part: int, ratio: float) -> _Solution:
+        """The solution with another size of one part, for which the system need not be solved again."""
         ratios = now.ratios.copy()
-        size = self.least[0] if self.is_stretched(now) else self.of_prints[0]
-        ratios[self.stretch] = size / math.sqrt(now.variance)
-        return self._solution(ratios, now.solved.changed(self._named(ratios), "stretch"))
+        ratios[part] = ratio
+        return self._solution(ratios, now.solved.changed(self._named(ratios), self.names[part]))
+
+    def on_or_off(self, now: _Solution, part: int) -> _Solution:
+        """The solution with or without a stretch or a lean, whichever is more probable."""
+        on = self.is_on(now, part)
+        size = self.least[0] if on else self.of_prints[0]
+        wanted = now.evidence + (-_LOG_ODDS if on else _LOG_ODDS)
+        other = self.climbed(self.changed(now, part, size / math.sqrt(now.variance)), wanted)
+        return other if other.evidence > wanted else now
+
+    def with_open(self, now: _Solution) -> _Solution:
+        """The solution whose covariance contains stretch and lean as far as noise may hide them.
+
+        What is switched off is there with the probability p. If it were, its coefficient would have the
+        posterior mean m and variance v, and the other unknowns would follow it. Averaged over both, its
+        second moment around 0 is ``p (v + m^2)``, which is its posterior variance for some smaller prior.
+        """
+        ratios, noise = now.ratios.copy(), math.sqrt(now.variance)
+        for part in self.switched:
+            if self.is_on(now, part):
+                continue
+            on = self.changed(now, part, self.of_prints[0] / noise)
+            # In units of the prior's variance.
+            v = max(1.0 - float(on.solved.parts.determined[part]), _LEAST_SHARE)
+            squared = float(on.solved.parts.squares[part]) / on.variance
+            p = 1.0 / (1.0 + math.exp(min(now.evidence - on.evidence + _LOG_ODDS, _CERTAIN)))
+            precision = 1.0 / (p * (v + squared)) - (1.0 / v - 1.0)
+            share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
+            ratios[part] = max(share * self.of_prints[0] / noise, now.ratios[part])
+        return self.at(ratios) if (ratios > now.ratios).any() else now
 
     def climbed(self, now: _Solution, wanted: float = -math.inf) -> _Solution:
         """Ascend to the most probable sizes, unless they will not have the wanted log evidence."""

@@ -190,10 +190,11 @@ def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
     if not flat:
         return [("warp", np.concatenate([warp, bend], axis=2))]
     x, y = places[:, 0], places[:, 1]
-    stretch = np.zeros((n, 3, 2))
+    curl, stretch, lean = np.zeros((n, 3, 3)), np.zeros((n, 3, 1)), np.zeros((n, 3, 1))
+    curl[:, 2] = np.column_stack([np.sqrt(2.0) * (x * x + y * y), x * x - y * y, 2 * x * y])
     stretch[:, 0, 0], stretch[:, 1, 0] = x, -y
-    stretch[:, 0, 1], stretch[:, 1, 1] = _LEANING * y, _LEANING * x
-    return [("bend", bend), ("warp", warp), ("stretch", stretch)]
+    lean[:, 0, 0], lean[:, 1, 0] = y, x
+    return [("curl", curl), ("bend", bend), ("warp", warp), ("stretch", stretch), ("lean", lean)]
 
 
 def _as_a_whole(centred: Array, axes: Array) -> Array:
