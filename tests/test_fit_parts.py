@@ -119,8 +119,8 @@ def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
     value = (true.at(grid) * direction).sum(axis=1) + 0.3 + rng.normal(0, 0.003, 200)
     rows = Observations(grid, direction, value, np.full(200, 0.003**2), np.ones((200, 1)))
     fit = fit_map(true, rows, np.zeros(1))
-    assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_variance[0]))
-    assert np.sqrt(fit.shift_variance[0]) < 0.0005
+    assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_covariance[0, 0]))
+    assert np.sqrt(fit.shift_covariance[0, 0]) < 0.0005
 
 
 @pytest.mark.parametrize(("radial", "degree"), [(0, 0), (1, 0), (3, 0), (3, 4)])

@@ -13,8 +13,11 @@ from support.uneven_light import (
     board,
     defocused,
     half_in_shadow,
+    hazy,
     measured_under,
     mottled,
+    moved,
+    toned,
     vignetted,
 )
 
@@ -22,8 +25,10 @@ from support.uneven_light import (
 # gradients.
 
 
-def together(effect: Effect, points: Points, seeds: range, hidden: bool = False) -> Found:
-    found = [measured_under(effect, seed, points, board(seed, hidden)) for seed in seeds]
+def together(
+    effect: Effect, points: Points, seeds: range, hidden: bool = False, response: float = 1.0
+) -> Found:
+    found = [measured_under(effect, seed, points, board(seed, hidden, response)) for seed in seeds]
     return Found(
         float(np.mean([one.kept for one in found])),
         sum(one.hidden for one in found),
@@ -85,3 +90,37 @@ def test_a_board_partly_out_of_focus_is_measured(points: Points) -> None:
     assert found.kept > 0.98  # 0.84 and 0.70
     assert found.rms < 0.01  # 0.012 and 0.015
     assert found.z < 1.3  # 0.9 and 2.1
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("length", slow_but((4.0,), (2.0, 4.0, 6.0)))
+def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
+    length: float, points: Points
+) -> None:
+    found = together(moved(length), points, range(2), response=2.2)
+    assert found.kept > 0.97
+    assert found.rms < 0.014  # 0.03, 0.09 and 0.17 with a common shift of all edges
+    assert 0.4 < found.z < 1.3  # 0.1 for vertices, whose standard deviations were too large
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_reflections_do_not_displace_edges(points: Points) -> None:
+    found = together(hazy(0.4, 90.0), points, range(2), response=2.2)
+    assert found.kept > 0.9
+    assert found.rms < 0.03  # 0.075
+    assert 0.5 < found.z < 1.4  # 0.27 for vertices
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_tone_mapping_that_changes_over_the_board_does_not_displace_edges(points: Points) -> None:
+    found = together(toned(2.2), points, range(2))
+    assert found.kept > 0.97
+    assert found.rms < 0.007  # 0.075 and 0.008
+    assert 0.5 < found.z < 1.4  # 0.1 for vertices
+
+
+def test_a_camera_that_is_not_linear_may_be_partly_out_of_focus() -> None:
+    found = together(defocused(4.0), "midpoints", range(2), response=2.2)
+    assert found.kept > 0.97
+    assert found.rms < 0.02  # 0.32
+    assert found.z < 1.4
