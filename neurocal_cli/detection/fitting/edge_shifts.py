@@ -58,6 +58,10 @@ class EdgeShifts:
         every = self._every(lines)
         return np.concatenate([every[:, :1], *(every[:, kind] for kind in self.used)], axis=1)
 
+    def beyond_response(self, lines: Lines, shift: Array) -> Array:
+        """(E,) shifts [px] without the part that a common response causes, given the unknowns (K,)."""
+        return self.terms(lines) @ shift - shift[0] * self._relative_blur(lines)
+
     def required(self, lines: Lines, mapped: MapFit, variance: Array) -> EdgeShifts:
         """Add the terms that the residuals of a map require; `variance` (E,) [px^2] is that of the edges."""
         if not mapped.excess > _NOT_NOISE:
@@ -79,12 +83,15 @@ class EdgeShifts:
 
     def _every(self, lines: Lines) -> Array:
         """(E, 9) all terms."""
-        sigma, mean, contrast = self.middle
-        s = self.blur.at(lines)[0] / sigma
+        _, mean, contrast = self.middle
+        s = self._relative_blur(lines)
         A, B = self.shading.at(lines.middle)
         levels = [s * (A - mean) / contrast, s * (B - contrast) / contrast]
         places = s[:, None] * quadratic_terms(self.shading.frame, lines.middle)[:, 1:]
         return np.column_stack([np.ones_like(s), s - 1, *levels, places])
+
+    def _relative_blur(self, lines: Lines) -> Array:
+        return self.blur.at(lines)[0] / self.middle[0]
 
 
 def _left(terms: Array, residual: Array) -> float:

@@ -21,6 +21,7 @@ from neurocal_cli.detection.fitting.common_parameters import (
     PixelNoise,
     level_prior,
     profile_shape,
+    with_shift,
 )
 from neurocal_cli.detection.fitting.edge_fit import (
     OFFSET,
@@ -427,6 +428,7 @@ def fit_grid_vertices(
     sigma = 0.5 * (first + second)
     data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
+    shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
@@ -447,16 +449,19 @@ def fit_grid_vertices(
 def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Array:
     """(V, count) effect on the values of vertices of lines whose two halves have different shifts.
 
-    The halves are shifted in opposite directions; equal shifts only turn the line.
+    The halves are shifted in opposite directions; equal shifts only turn the line. The common response is in
+    the vertices' model.
     """
     result, ones = np.zeros((len(grid), count)), np.ones(len(grid))
     for which, step in zip((FIRST, SECOND), 0.25 * np.eye(2), strict=True):
         vertical = np.full(len(grid), which == SECOND)
         before, after = (
-            fitted.shifts.terms(grid_lines(fitted.map.map, grid + side * step, vertical, ones))
+            fitted.shifts.beyond_response(
+                grid_lines(fitted.map.map, grid + side * step, vertical, ones), fitted.map.shift
+            )
             for side in (-1, 1)
         )
-        result[:, which] = 0.5 * light * ((after - before) @ fitted.map.shift)
+        result[:, which] = 0.5 * light * (after - before)
     return result
 
 
