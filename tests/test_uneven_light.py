@@ -101,7 +101,7 @@ def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
     found = together(moved(length), points, range(2), response=2.2)
     assert found.kept > 0.97
     assert found.rms < 0.014  # 0.03, 0.09 and 0.17 with a common shift of all edges
-    assert 0.4 < found.z < 1.3  # 0.1 for vertices, whose standard deviations were too large
+    assert 0.6 < found.z < 1.3  # 0.1 for vertices, whose standard deviations were too large
 
 
 def test_vertices_in_sharpened_images_of_cameras_that_are_not_linear_know_their_errors() -> None:

@@ -225,6 +225,20 @@ class FieldBlur:
         return sigma, self.relative * sigma**2
 
 
+def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Array:
+    """(E,) correlation of the blur along the normals of two crossing lines.
+
+    The covariance ``n1^T S n2`` follows from the variances along n1, n2 and n1 + n2.
+    """
+    first, second = lines
+    both = first.normal + second.normal
+    square = (both**2).sum(axis=1)
+    (a, _), (b, _), (c, _) = (
+        blur.at(one) for one in (first, second, replace(first, normal=both / np.sqrt(square)[:, None]))
+    )
+    return np.asarray((square * c**2 - a**2 - b**2) / (2 * a * b))
+
+
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
     n_u, n_v = normal.T
     return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])

@@ -19,6 +19,7 @@ from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
     PixelNoise,
+    correlation,
     level_prior,
     profile_shape,
     with_shift,
@@ -426,7 +427,9 @@ def fit_grid_vertices(
     blur = _blur(fitted.fit, fitted.lines, fitted.good, fitted.map.map)
     (first, spread), (second, _) = (blur.at(line) for line in lines)
     sigma = 0.5 * (first + second)
-    data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
+    ends = _ends(grid_image.grid.seen)
+    rho = correlation(blur, lines)
+    data = vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, ends)
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
