@@ -62,8 +62,12 @@ class EdgeShifts:
         """(E,) shifts [px] without the part that a common response causes, given the unknowns (K,)."""
         return self.terms(lines) @ shift - shift[0] * self._relative_blur(lines)
 
-    def required(self, lines: Lines, mapped: MapFit, variance: Array) -> EdgeShifts:
-        """Add the terms that the residuals of a map require; `variance` (E,) [px^2] is that of the edges."""
+    def required(self, lines: Lines, mapped: MapFit, variance: Array, share: float) -> EdgeShifts:
+        """Add the terms that the residuals of a map require.
+
+        `variance` (E,) [px^2] is that of the edges, and `share` the greatest share of the squared residuals
+        that each kind of terms may leave.
+        """
         if not mapped.excess > _NOT_NOISE:
             return self
         count = len(variance)
@@ -77,7 +81,7 @@ class EdgeShifts:
                 continue
             rest = _left(every[:, more], residual)
             gain = (left - rest) * (count - len(more))
-            if gain > _GAIN * (len(more) - len(columns)) * rest:
+            if rest < share * left and gain > _GAIN * (len(more) - len(columns)) * rest:
                 used, columns, left = (*used, kind), more, rest
         return self if used == self.used else replace(self, used=used)
 

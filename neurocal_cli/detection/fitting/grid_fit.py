@@ -295,7 +295,10 @@ def _first_fit(
     index = mapped.model_index
     models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
     shifts = EdgeShifts.of(_blur(fit, lines, good, mapped.map), shading, lines)
-    chosen, shifts, observations = _selected(grid_image, mapped, lines, fit, variance, shifts, models)
+    # Only large shifts matter here; those of paper boards would cost a tenth of the time.
+    chosen, shifts, observations = _selected(
+        grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
+    )
     if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
         # An uneven board departs from both maps.
@@ -312,20 +315,30 @@ def _selected(
     variance: Array,
     shifts: EdgeShifts,
     models: Sequence[tuple[int, int]],
+    share: float = 1.0,
 ) -> tuple[MapFit, EdgeShifts, Observations]:
-    """Select the map through fitted edges with variances (E,) [px^2], and the terms of their shifts."""
+    """Select the map through fitted edges with variances (E,) [px^2], and the terms of their shifts.
 
-    def selected(shifts: EdgeShifts) -> tuple[MapFit, Observations]:
+    `share` is that of `EdgeShifts.required`.
+    """
+
+    def selected(
+        near: SmoothMap, shifts: EdgeShifts, models: Sequence[tuple[int, int]]
+    ) -> tuple[MapFit, Observations]:
         terms = shifts.terms(lines)
         observations = grid_image.observations(lines, fit.values[:, OFFSET], variance, terms)
         shift = np.zeros(terms.shape[1])
         shift[0] = start.shift[0]
-        return select_map(start.map, observations, shift, models=models), observations
+        return select_map(near, observations, shift, models=models), observations
 
-    mapped, observations = selected(shifts)
-    required = shifts.required(lines, mapped, variance)
+    mapped, observations = selected(start.map, shifts, models)
+    required = shifts.required(lines, mapped, variance, share)
     if required is not shifts:
-        mapped, observations = selected(required)
+        before, model = mapped.excess, (mapped.map.radial, mapped.map.degree)
+        mapped, observations = selected(mapped.map, required, [model])
+        # Large shifts may have hidden what a richer model would gain.
+        if mapped.excess < _CLEARLY * before:
+            mapped, observations = selected(mapped.map, required, models[models.index(model) :])
     return mapped, required, observations
 
 
