@@ -148,7 +148,8 @@ def some_vertices() -> tuple[VertexPixels, Array, ProfileShape]:
     s1, d1, s2, d2 = rng.uniform(-3, 3, (4, V, N))
     value, gain, Q = rng.uniform(20, 230, (V, N)), rng.uniform(0.9, 1.1, (V, N)), rng.choice([-1, 1], (V, N))
     rho = np.array([[0.0], [0.3], [-0.9]])
-    arrays = (value, gain, Q, np.ones((V, N)), np.zeros(V), s1 / 3, d1, s2 / 3, d2, rho)
+    relative = np.array([[1.0, 1.0], [0.9, 1.1], [1.1, 0.9]])
+    arrays = (value, gain, Q, np.ones((V, N)), np.zeros(V), s1 / 3, d1, s2 / 3, d2, rho, relative)
     data = VertexPixels(*arrays)  # type: ignore[arg-type]
     places = rng.normal(0, 0.2, (V, 4))
     values = np.column_stack([places, np.full(V, 120.0), np.full(V, 90.0), rng.uniform(0.6, 1.2, V)])
@@ -172,19 +173,24 @@ def test_vertex_model_has_the_derivatives_it_says(sharp: bool) -> None:
         np.testing.assert_allclose(linear.rows[:, 1 + k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
+@pytest.mark.parametrize("motion", [0.0, 0.7])
 @pytest.mark.parametrize("angle", [0.3, 0.6, 1.0])
-def test_blurred_oblique_cross_is_as_modelled(angle: float) -> None:
-    """sign(a . x) sign(b . x) blurred by a round Gaussian, against a sum over many random points."""
+def test_blurred_oblique_cross_is_as_modelled(angle: float, motion: float) -> None:
+    """sign(a . x) sign(b . x) blurred by a Gaussian, against a sum over many random points."""
     rng = np.random.default_rng(3)
-    cloud = rng.normal(size=(400_000, 2))
+    along = np.array([0.6, 0.8])
+    cloud = rng.normal(size=(400_000, 2)) + motion * rng.normal(size=(400_000, 1)) * along
     a, b = np.array([0.0, 1.0]), np.array([np.cos(angle), np.sin(angle)])
     places = rng.uniform(-1.5, 1.5, (12, 2))
     exact = [(np.sign((cloud + p) @ a) * np.sign((cloud + p) @ b)).mean() for p in places]
     d1, d2 = (places @ a)[None], (places @ b)[None]
     one, zero = np.ones_like(d1), np.zeros_like(d1)
-    rho = np.array([[a @ b]])
-    data = VertexPixels(zero, one, one, one, np.zeros(1), zero, d1, zero, d2, rho)  # type: ignore[arg-type]
-    values = np.array([[0, 0, 0, 0, 0, 1, 1.0]])
+    S = np.eye(2) + motion**2 * np.outer(along, along)
+    blur = np.sqrt([[a @ S @ a, b @ S @ b]])
+    rho = np.array([[a @ S @ b]]) / blur.prod()
+    relative = blur / blur.mean()
+    data = VertexPixels(zero, one, one, one, np.zeros(1), zero, d1, zero, d2, rho, relative)  # type: ignore[arg-type]
+    values = np.array([[0, 0, 0, 0, 0, 1, blur.mean()]])
     shape = ProfileShape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
     linear = vertex_model(data, values, shape)
     np.testing.assert_allclose(linear.x[0], exact, atol=0.006)

@@ -21,7 +21,8 @@ from neurocal_cli.detection.fitting.batched_newton import (
     fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.common_parameters import BoardBlur
+from neurocal_cli.detection.fitting.common_parameters import BoardBlur, with_shift
+from neurocal_cli.detection.fitting.edge_profile import profile, response
 from neurocal_cli.detection.fitting.map_fit import Observations, fit_map, select_map
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
@@ -119,8 +120,17 @@ def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
     value = (true.at(grid) * direction).sum(axis=1) + 0.3 + rng.normal(0, 0.003, 200)
     rows = Observations(grid, direction, value, np.full(200, 0.003**2), np.ones((200, 1)))
     fit = fit_map(true, rows, np.zeros(1))
-    assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_variance[0]))
-    assert np.sqrt(fit.shift_variance[0]) < 0.0005
+    assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_covariance[0, 0]))
+    assert np.sqrt(fit.shift_covariance[0, 0]) < 0.0005
+
+
+@pytest.mark.parametrize("shift", [-0.3, 0.1, 0.3])
+def test_a_shift_of_edges_may_be_attributed_to_the_response(shift: float) -> None:
+    shape = ProfileShape(np.array([[0.02, 0.0]]), np.array([0.1, -0.05, 0.0, 0.0, 0.0, 0.0]))
+    d = np.linspace(-3, 3, 200)
+    displaced = response(profile((d[None] - shift) / 0.8, shape.tails)[0], shape.nonlinearity)[0]
+    same = response(profile(d[None] / 0.8, shape.tails)[0], with_shift(shape, 0.8, shift).nonlinearity)[0]
+    np.testing.assert_allclose(same, displaced, atol=0.015)
 
 
 @pytest.mark.parametrize(("radial", "degree"), [(0, 0), (1, 0), (3, 0), (3, 4)])

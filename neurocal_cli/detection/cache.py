@@ -23,7 +23,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.writing import write_whole
 
-_FORMAT = 4  # raised when the same image gives other points than before
+_FORMAT = 5  # raised when the same image gives other points than before
 
 
 class DetectionCache:

@@ -87,11 +87,11 @@ def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: A
     centre = edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
-    d += 0.5 * lines.curvature * s * s - mapped.shift[0]
+    d += 0.5 * lines.curvature * s * s - fitted.shift
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
     across = fit.covariance[:, OFFSET, OFFSET] * fit.variance_growth * min(mapped.excess, 1.0)
-    across += mapped.shift_variance[0] + unevenness
+    across += fitted.shift_variance + unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
         [

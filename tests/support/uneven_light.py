@@ -11,7 +11,7 @@ import numpy as np
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import Scene, Sensor, ground_truth
-from neurocal_cli.simulation.rendering.render import digitised, image_light
+from neurocal_cli.simulation.rendering.render import Image, digitised, image_light
 from support.clutter import Clutter
 from support.measured import Points, found, places
 from support.occluders import Disc
@@ -96,6 +96,43 @@ def defocused(most: float) -> Effect:
     return effect
 
 
+def moved(length: float) -> Effect:
+    """The camera moves in a random direction during the exposure, by a length [px]."""
+
+    def effect(light: Array, vertices: Array, rng: np.random.Generator) -> Array:
+        angle, reach = rng.uniform(0, np.pi), int(length) + 1
+        v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        kernel = np.zeros(u.shape)
+        for place in np.linspace(-0.5, 0.5, 101) * length:  # bilinear, so that nothing is shifted
+            du, dv = np.abs(u - place * np.cos(angle)), np.abs(v - place * np.sin(angle))
+            kernel += np.maximum(1 - du, 0) * np.maximum(1 - dv, 0)
+        return np.asarray(cv2.filter2D(light, -1, kernel / kernel.sum()))
+
+    return effect
+
+
+def hazy(strength: float, size: float) -> Effect:
+    """A glossy board reflects a lamp: light is added around a vertex, over a size [px]."""
+
+    def effect(light: Array, vertices: Array, rng: np.random.Generator) -> Array:
+        middle = rng.choice(vertices.reshape(-1, 2))
+        u, v = _pixels(light)
+        away = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / size**2
+        return np.asarray(light + strength * np.exp(-0.5 * away))
+
+    return effect
+
+
+def toned(gamma: float) -> Effect:
+    """The tone mapping changes over the board, from linear to a gamma."""
+
+    def effect(light: Array, vertices: Array, rng: np.random.Generator) -> Array:
+        share = np.clip(_along(light, vertices, rng), 0, 1)
+        return np.asarray(np.maximum(light, 0) ** (1 / (1 + (gamma - 1) * share)))
+
+    return effect
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """What was measured of a board."""
@@ -116,9 +153,10 @@ class Found:
         return float(np.sqrt((self.normalised**2).mean()))
 
 
-def board(seed: int, hidden: bool = False) -> Scene:
+def board(seed: int, hidden: bool = False, response: float = 1.0) -> Scene:
     """A board that fills the image; two discs hide parts of it if wanted."""
-    scene = replace(single(RECIPE, np.random.default_rng(seed)), sensor=Sensor(read_noise=2.0))
+    sensor = Sensor(response, read_noise=2.0)
+    scene = replace(single(RECIPE, np.random.default_rng(seed)), sensor=sensor)
     if not hidden:
         return scene
     rng = np.random.default_rng([seed, 5])
@@ -130,11 +168,22 @@ def board(seed: int, hidden: bool = False) -> Scene:
     return replace(scene, occluders=tuple(discs))
 
 
-def measured_under(effect: Effect, seed: int, points: Points, scene: Scene) -> Found:
+def sharpened(image: Image) -> Image:
+    """Sharpen an image as phones do, with unsharp masking."""
+    values = image.astype(float)
+    values += values - cv2.GaussianBlur(values, (0, 0), 1.5)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def measured_under(
+    effect: Effect, seed: int, points: Points, scene: Scene, processed: Callable[[Image], Image] | None = None
+) -> Found:
     """Measure a board under an effect; its vertices are found to half a pixel."""
     plane = ground_truth(scene).planes[0]
     rng = np.random.default_rng([seed, 11])
     image = digitised(scene.sensor, effect(image_light(scene, 4), plane.vertices, rng), rng)
+    if processed is not None:
+        image = processed(image)
     grid, mirrored = found(plane, seed, hidden=True)
     measured = measure(image, grid, points)
     row = places(measured, plane, mirrored)

@@ -27,6 +27,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     erf_and_density,
     response,
     response_terms,
+    sharp_profile,
     tail_terms,
 )
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance, quadratic_terms
@@ -50,6 +51,7 @@ _TAILS, _RESPONSE = 0.01, 0.06
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # least prior variance of the levels, in variances of the noise
 _TINY = np.float32(1e-30)
+_FAR, _PLACES = 4.0, 401  # samples of the profile: sigma on both sides, and their number
 
 
 @frozen_dataclass
@@ -132,6 +134,23 @@ def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     return replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
 
 
+def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
+    """Attribute a shift of all edges towards the light side [px] to the response; `sigma` [px] is their blur.
+
+    Along an edge, shift and response look alike, and `profile_shape` leaves the shift to the offsets. Where
+    edges cross, they do not.
+    """
+    z = np.linspace(-_FAR, _FAR, _PLACES)[None]
+    half = None if shape.half is None else shape.half.reshape(-1, 2)[:1]
+    tails = shape.tails[:1]
+    here, there = (sharp_profile(x, np.array([[sigma]]), tails, half)[0] for x in (z, z - shift / sigma))
+    terms = np.empty((1, RESPONSE_TERMS, _PLACES))
+    response_terms(here, np.ones_like(here), out=terms)
+    light, wanted = (response(x, shape.nonlinearity)[0] for x in (here, there))
+    change = np.linalg.lstsq(terms[0].T, (wanted - light)[0], rcond=_RIDGE)[0]
+    return replace(shape, nonlinearity=shape.nonlinearity + change)
+
+
 @frozen_dataclass(eq=False)
 class BoardBlur:
     """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n."""
@@ -204,6 +223,20 @@ class FieldBlur:
         log = _places_and_directions(self.frame, lines.middle, lines.normal) @ self.terms
         sigma = np.asarray(np.maximum(np.exp(log), LEAST_BLUR))
         return sigma, self.relative * sigma**2
+
+
+def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Array:
+    """(E,) correlation of the blur along the normals of two crossing lines.
+
+    The covariance ``n1^T S n2`` follows from the variances along n1, n2 and n1 + n2.
+    """
+    first, second = lines
+    both = first.normal + second.normal
+    square = (both**2).sum(axis=1)
+    (a, _), (b, _), (c, _) = (
+        blur.at(one) for one in (first, second, replace(first, normal=both / np.sqrt(square)[:, None]))
+    )
+    return np.asarray((square * c**2 - a**2 - b**2) / (2 * a * b))
 
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:

@@ -54,8 +54,10 @@ def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges 
     rim, fit = fit_rim(grid_image, fitted)
     edges, n = grid_image.edges, len(grid_image.edges.index)
     serves = edges_served(grid_image.grid.shape, edges, rim, fitted.good)
-    between = grid_image.observations(fitted.lines, fitted.fit.values[:, OFFSET], fitted.offset_variance)
-    to_rim = rim.observations(fit.lines, fit.fit.values[:, OFFSET], fit.offset_variance)
+    between, to_rim = (
+        of.observations(x.lines, x.fit.values[:, OFFSET], x.offset_variance, x.shifts.terms(x.lines))
+        for of, x in ((grid_image, fitted), (rim, fit))
+    )
     lens = fitted.map.map.lens_models[fitted.map.map.radial :]
     mapped = select_map(fitted.map.map, between.joined_with(to_rim), fitted.map.shift, models=lens)
     if mapped.excess > _AGREES:

@@ -7,6 +7,7 @@ independent levels, common parameters, a last fit, and the map through its edges
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -18,8 +19,10 @@ from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
     PixelNoise,
+    correlation,
     level_prior,
     profile_shape,
+    with_shift,
 )
 from neurocal_cli.detection.fitting.edge_fit import (
     OFFSET,
@@ -33,6 +36,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
     usual_stride,
 )
 from neurocal_cli.detection.fitting.edge_profile import half_widths
+from neurocal_cli.detection.fitting.edge_shifts import EdgeShifts
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
@@ -118,10 +122,13 @@ class GridEdges:
         """Map the edges to the image."""
         return grid_lines(at, self.centre, self.vertical, self.light)
 
-    def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
-        """Use the edges as observations of a map, with an unknown common shift towards the light side."""
+    def observations(self, lines: Lines, offset: Array, variance: Array, shift: Array) -> Observations:
+        """Use the edges as observations of a map, with unknown shifts towards the light side.
+
+        `shift` (E, K) are `EdgeShifts.terms`.
+        """
         value = (lines.middle * lines.normal).sum(axis=1) + offset
-        return Observations(self.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        return Observations(self.centre, lines.normal, value, variance, shift)
 
 
 @frozen_dataclass(eq=False)
@@ -152,16 +159,16 @@ class GridImage:
         """(V, 2) pixels of the found vertices."""
         return self.grid.pixels[self.grid.seen]
 
-    def anchors(self, sigma: float) -> Observations:
+    def anchors(self, sigma: float, shifts: int = 1) -> Observations:
         """The found vertices as observations of a map, with a standard deviation [px]."""
-        return Observations.of_points(self.vertices, self.pixels, sigma, 1)
+        return Observations.of_points(self.vertices, self.pixels, sigma, shifts)
 
-    def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
+    def observations(self, lines: Lines, offset: Array, variance: Array, shift: Array) -> Observations:
         """Use edges as observations of a map; a few edges are joined with the found vertices as anchors."""
-        edges = self.edges.observations(lines, offset, variance)
+        edges = self.edges.observations(lines, offset, variance, shift)
         if len(offset) > _ENOUGH:
             return edges
-        return edges.joined_with(self.anchors(_ANCHOR))
+        return edges.joined_with(self.anchors(_ANCHOR, shift.shape[1]))
 
 
 @frozen_dataclass(eq=False)
@@ -171,9 +178,21 @@ class GridFit:
     lines: Lines
     fit: BatchFit
     map: MapFit
+    shifts: EdgeShifts
     shading: Shading
     noise: PixelNoise
     good: NDArray[np.bool_]  # (E,) edges that passed the quality tests
+
+    @property
+    def shift(self) -> Array:
+        """(E,) shift of the edges towards the light side [px]."""
+        return self.shifts.terms(self.lines) @ self.map.shift
+
+    @property
+    def shift_variance(self) -> Array:
+        """(E,) variance of the shifts [px^2]."""
+        terms = self.shifts.terms(self.lines)
+        return np.asarray(((terms @ self.map.shift_covariance) * terms).sum(axis=1))
 
     @property
     def offset_variance(self) -> Array:
@@ -251,7 +270,8 @@ def _by_moments(
     levels = levels_beside(strips, half, *shading.at(lines.middle))
     offset, _, blur = moments(strips, half, *levels)
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
-    observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
+    variance = np.full(len(offset), _MOMENT_SIGMA**2)
+    observations = grid_image.observations(lines, offset, variance, np.ones((len(offset), 1)))
     return fit_map(found.map, observations, found.shift), sigma, levels
 
 
@@ -271,21 +291,55 @@ def _first_fit(
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
-    observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
     # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
     index = mapped.model_index
-    chosen = select_map(
-        mapped.map,
-        observations,
-        mapped.shift,
-        models=mapped.map.models[index : max(index, mapped.map.richest_lens) + 1],
+    models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
+    shifts = EdgeShifts.of(_blur(fit, lines, good, mapped.map), shading, lines)
+    # Only large shifts matter here; those of paper boards would cost a tenth of the time.
+    chosen, shifts, observations = _selected(
+        grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
     )
     if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
         # An uneven board departs from both maps.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
-    return GridFit(lines, fit, chosen, shading, PixelNoise(noise, noise, noise), good)
+    return GridFit(lines, fit, chosen, shifts, shading, PixelNoise(noise, noise, noise), good)
+
+
+def _selected(
+    grid_image: GridImage,
+    start: MapFit,
+    lines: Lines,
+    fit: BatchFit,
+    variance: Array,
+    shifts: EdgeShifts,
+    models: Sequence[tuple[int, int]],
+    share: float = 1.0,
+) -> tuple[MapFit, EdgeShifts, Observations]:
+    """Select the map through fitted edges with variances (E,) [px^2], and the terms of their shifts.
+
+    `share` is that of `EdgeShifts.required`.
+    """
+
+    def selected(
+        near: SmoothMap, shifts: EdgeShifts, models: Sequence[tuple[int, int]]
+    ) -> tuple[MapFit, Observations]:
+        terms = shifts.terms(lines)
+        observations = grid_image.observations(lines, fit.values[:, OFFSET], variance, terms)
+        shift = np.zeros(terms.shape[1])
+        shift[0] = start.shift[0]
+        return select_map(near, observations, shift, models=models), observations
+
+    mapped, observations = selected(start.map, shifts, models)
+    required = shifts.required(lines, mapped, variance, share)
+    if required is not shifts:
+        before, model = mapped.excess, (mapped.map.radial, mapped.map.degree)
+        mapped, observations = selected(mapped.map, required, [model])
+        # Large shifts may have hidden what a richer model would gain.
+        if mapped.excess < _CLEARLY * before:
+            mapped, observations = selected(mapped.map, required, models[models.index(model) :])
+    return mapped, required, observations
 
 
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
@@ -293,36 +347,37 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
-    fit, noise = _fine_fit(grid_image, first, lines, shading)
+    blur = _blur(first.fit, first.lines, good, first.map.map)
+    fit, noise = _fine_fit(grid_image, first, lines, shading, blur.at(lines))
     scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
-    observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
     # More accurate edges may need a richer model.
     richer = first.map.map.models[first.map.model_index :]
-    mapped = select_map(first.map.map, observations, first.map.shift, models=richer)
+    shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
+    mapped, shifts, _ = _selected(grid_image, first.map, lines, fit, trusted, shifts, richer)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere. No single edge is an outlier for that, but all edges
     # are less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
-    return GridFit(lines, fit, mapped, shading, noise, is_reliable(fit, departure))
+    return GridFit(lines, fit, mapped, shifts, shading, noise, is_reliable(fit, departure))
 
 
 def _fine_fit(
-    grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
+    grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading, blur: tuple[Array, Array]
 ) -> tuple[BatchFit, PixelNoise]:
     """Fit edges to all pixels, with levels, blur, profile and noise of the whole board."""
     n = len(first.good)
     shape = profile_shape(first.fit, first.good)
     noise = PixelNoise.of(first.fit, grid_image.floor)
-    blur = _blur(first, lines).at(lines)
-    offset = first.map.residual[:n] + first.map.shift[0]
+    shift = first.shift
+    offset = first.map.residual[:n] + shift
     if isinstance(first.map.map, WideMap):
         # A fit that failed in the dark rim of the image starts at the map again.
-        offset = np.where(first.good, offset, first.map.shift[0])
+        offset = np.where(first.good, offset, shift)
     fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
@@ -356,12 +411,12 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     """Fit the edges to the board's rim with the common parameters of all other edges."""
     edges = GridEdges.of(grid_image.grid, 1)
     lines = edges.lines(fitted.map.map)
-    shift = fitted.map.shift[0]
+    shift = fitted.shifts.terms(lines) @ fitted.map.shift
     fit = _fitted(
         grid_image.image,
         lines,
-        np.full(len(edges.index), shift),
-        _blur(fitted, fitted.lines).at(lines),
+        shift,
+        _blur(fitted.fit, fitted.lines, fitted.good, fitted.map.map).at(lines),
         fitted.shading,
         fitted.fit.shape.elsewhere(half_widths(lines.normal)),
         fitted.noise,
@@ -382,17 +437,22 @@ def fit_grid_vertices(
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    blur = _blur(fitted, fitted.lines)
+    blur = _blur(fitted.fit, fitted.lines, fitted.good, fitted.map.map)
     (first, spread), (second, _) = (blur.at(line) for line in lines)
     sigma = 0.5 * (first + second)
-    data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
+    ends = _ends(grid_image.grid.seen)
+    rho = correlation(blur, lines)
+    data = vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, ends)
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
+    shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
+    if fitted.shifts.used:
+        fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
@@ -402,12 +462,31 @@ def fit_grid_vertices(
     return fit, lines, is_reliable(fit, departure)
 
 
-def _blur(fitted: GridFit, edges: Lines) -> BoardBlur | FieldBlur:
+def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Array:
+    """(V, count) effect on the values of vertices of lines whose two halves have different shifts.
+
+    The halves are shifted in opposite directions; equal shifts only turn the line. The common response is in
+    the vertices' model.
+    """
+    result, ones = np.zeros((len(grid), count)), np.ones(len(grid))
+    for which, step in zip((FIRST, SECOND), 0.25 * np.eye(2), strict=True):
+        vertical = np.full(len(grid), which == SECOND)
+        before, after = (
+            fitted.shifts.beyond_response(
+                grid_lines(fitted.map.map, grid + side * step, vertical, ones), fitted.map.shift
+            )
+            for side in (-1, 1)
+        )
+        result[:, which] = 0.5 * light * (after - before)
+    return result
+
+
+def _blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:
     """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
-    board = BoardBlur.of(fitted.fit, edges.normal, fitted.good)
-    wide = isinstance(fitted.map.map, WideMap)
+    board = BoardBlur.of(fit, edges.normal, good)
+    wide = isinstance(at, WideMap)
     if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
-        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
+        field = FieldBlur.of(fit, edges, good, at.frame)
         if wide or field.relative * board.usual**2 < _CLEARLY * board.spread:
             return field
     return board

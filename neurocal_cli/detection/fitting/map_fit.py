@@ -82,7 +82,7 @@ class MapFit:
 
     map: SmoothMap
     shift: Array  # (K,) [px] values of the additional unknowns; see `Observations.shift`
-    shift_variance: Array  # (K,) [px^2]
+    shift_covariance: Array  # (K, K) [px^2]
     residual: Array  # (N,) [px] value minus map and shift
     weight: Array  # (N,) Tukey's weight, from 1 to 0 for outliers
     # Variance of the good and informative residuals relative to the given variances; shrunk towards 1 if it
@@ -253,7 +253,7 @@ def _with_covariance(solution: _Solution, observations: Observations) -> MapFit:
     return MapFit(
         map=replace(now, covariance=covariance),
         shift=shift,
-        shift_variance=np.diag(inverse)[len(free) :].copy(),
+        shift_covariance=inverse[len(free) :, len(free) :].copy(),
         residual=residual,
         weight=weight,
         excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,

@@ -5,9 +5,10 @@ the distances from the two lines in sigma, towards growing r and growing c, the 
 
     x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
 
-The sign is that of the square between the normals, rho is the cosine of the angle between them, and Q is the
-effect of the parallel lines on both sides. The pixels come from two strips along the two lines, each with the
-pixels nearer to its own line.
+The sign is that of the square between the normals, and Q is the effect of the parallel lines on both sides.
+rho is the correlation of the blur along both normals, which is the cosine of the angle between them if the
+blur is round. If it is not, as with motion blur, sigma differs between the lines, too. The pixels come from
+two strips along the two lines, each with the pixels nearer to its own line.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class VertexPixels(FitPixels):
     lever2: Single
     d2: Single
     rho: Single  # (V, 1)
+    relative: Single  # (V, 2) blur across both lines, relative to their mean
 
 
 def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
@@ -73,19 +75,21 @@ def vertex_pixels(
     image: NDArray[np.generic],
     lines: tuple[Lines, Lines],
     light: Array,
-    sigma: Array,
+    blur: tuple[Array, Array],
+    rho: Array,
     shading: Shading,
     last: NDArray[np.bool_],
 ) -> VertexPixels:
-    """Gather the pixels around vertices of blur `sigma` (V,) [px], all with weight 1.
+    """Gather the pixels around vertices, all with weight 1.
 
+    `blur` are two arrays (V,) [px], those across both lines, and `rho` (V,) is the correlation between them.
     `light` (V,) is +1 if the square between the two normals is light, else -1. `last` (V, 2, 2) tells which
     ends of the two lines are ends of the board. At a fold, light of another plane blurs into them.
     """
     parts = []
     for k in (0, 1):
-        half = np.minimum(REACH * sigma, 0.5 * lines[k].width)
-        trim = np.minimum(_LAST * sigma, _MOST_LAST * lines[k].length)[:, None] * last[:, k]
+        half = np.minimum(REACH * blur[k], 0.5 * lines[k].width)
+        trim = np.minimum(_LAST * blur[1 - k], _MOST_LAST * lines[k].length)[:, None] * last[:, k]
         parts.append(strip_pixels(image, lines[k], half, trim))
     u, v, value, inside = (
         np.concatenate([getattr(part, name) for part in parts], axis=1)
@@ -98,20 +102,21 @@ def vertex_pixels(
     index, inside = packed(inside, inside.sum(axis=1))
     u, v, value = (x.reshape(-1)[index] for x in (u, v, value))
     (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
-    Q = _faded(lines, (d1, d2), sigma) * light.astype(np.float32)[:, None]
+    Q = _faded(lines, (d1, d2), blur) * light.astype(np.float32)[:, None]
     value, gain = shading.off(lines[0].middle, u, v, value)
-    rho = (lines[0].normal * lines[1].normal).sum(axis=1).astype(np.float32)[:, None]
     lever1, lever2 = (
         s / (0.5 * line.length).astype(np.float32)[:, None] for s, line in zip((s1, s2), lines, strict=True)
     )
     beyond = np.maximum(parts[0].beyond, parts[1].beyond)
-    return VertexPixels(value, gain, Q, inside.astype(np.float32), beyond, lever1, d1, lever2, d2, rho)
+    weight, correlation = inside.astype(np.float32), rho.astype(np.float32)[:, None]
+    relative = (np.stack(blur, axis=1) / (0.5 * (blur[0] + blur[1]))[:, None]).astype(np.float32)
+    return VertexPixels(value, gain, Q, weight, beyond, lever1, d1, lever2, d2, correlation, relative)
 
 
-def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: Array) -> Single:
+def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], blur: tuple[Array, Array]) -> Single:
     """Factor Q, the effect of near parallel lines on both sides."""
     Q = np.ones_like(distances[0])
-    for line, d in zip(lines, distances, strict=True):
+    for line, d, sigma in zip(lines, distances, blur, strict=True):
         for k, side in ((0, 1), (1, -1)):
             close = line.apart[:, k] < ALONE * sigma
             t = (line.apart[close, k, None] + side * d[close]) / sigma[close, None]
@@ -132,11 +137,12 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (
         x.astype(data.value.dtype)[:, None] for x in values.T
     )
-    z1 = (data.d1 - offset1 - tilt1 * data.lever1) / sigma
-    z2 = (data.d2 - offset2 - tilt2 * data.lever2) / sigma
+    wide1, wide2 = data.relative[:, :1], data.relative[:, 1:]
+    z1 = (data.d1 - offset1 - tilt1 * data.lever1) / (sigma * wide1)
+    z2 = (data.d2 - offset2 - tilt2 * data.lever2) / (sigma * wide2)
     halves = (None, None) if shape.half is None else (shape.half[:, 0], shape.half[:, 1])
-    E1, slope1, spread1, density1 = sharp_profile(z1, sigma, shape.tails, halves[0])
-    E2, slope2, spread2, density2 = sharp_profile(z2, sigma, shape.tails, halves[1])
+    E1, slope1, spread1, density1 = sharp_profile(z1, sigma * wide1, shape.tails, halves[0])
+    E2, slope2, spread2, density2 = sharp_profile(z2, sigma * wide2, shape.tails, halves[1])
     rho = data.rho
     series, bent1, bent2 = _crossed(z1, z2, rho, density1 * density2)
     x = np.asarray((E1 * E2 + series) * data.Q, dtype=data.value.dtype)
@@ -148,11 +154,13 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     by_z2 *= factor
     rows = rows_for(len(x), 7, x.shape[1], data.value.dtype)
     residual, by = rows[:, 0], rows[:, 1:].swapaxes(0, 1)
-    by[FIRST], by[FIRST + 1] = by_z1, by_z1 * data.lever1
-    by[SECOND], by[SECOND + 1] = by_z2, by_z2 * data.lever2
     by[4] = data.root
     by[5] = F * gain
     by[6] = z1 * by_z1 + z2 * by_z2
+    by_z1 /= wide1
+    by_z2 /= wide2
+    by[FIRST], by[FIRST + 1] = by_z1, by_z1 * data.lever1
+    by[SECOND], by[SECOND + 1] = by_z2, by_z2 * data.lever2
     if spread1 is not None and spread2 is not None:
         by[6] -= factor * (spread1 * E2 + E1 * spread2) * data.Q
     residual[...] = (data.value - mean) * data.root - contrast * by[5]
