@@ -48,7 +48,7 @@ class Coordinates:
 
     def variances(self, sizes: Mapping[str, float]) -> Array:
         """(k,) variances for given sizes of the parts."""
-        return np.asarray(self.units @ self.prior.squared(sizes))
+        return np.asarray(self.units @ self.prior.as_array(sizes) ** 2)
 
     def precision(self, sizes: Mapping[str, float]) -> Array:
         """(3 n, 3 n) inverse of the prior covariance of the offsets, by the formula of Woodbury."""

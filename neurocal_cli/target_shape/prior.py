@@ -3,9 +3,11 @@
 Each part of the offsets has a Gaussian prior, whose size is estimated from the data (`posterior`):
 
 - fold: rigid motion of a plane of a folded target;
+- curl: a quadratic surface out of the plane, as of paper that curls (`bends`);
 - bend: smooth, out of the plane;
-- stretch: linear in the plane: one side longer than stated, or sides that are not perpendicular;
 - warp: smooth, in the plane;
+- stretch: one side longer than stated, and the other shorter;
+- lean: sides that are not perpendicular;
 - place and height: independent for each point, in the plane and out of it.
 
 Surveyed points have only the standard deviations that the survey states, independent along the world's axes
@@ -30,13 +32,12 @@ from neurocal_cli.target import Target, is_flat
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
 _HELD = 1e-7  # std of a surveyed point that is stated as exact, over the target's size
-# Std of a stretch, half of the relative difference of two sides. Four boards in photographs are stretched by
+# Std of a stretch, half of the relative difference of two sides, and of a lean, half of the angle by which
+# two sides are off a right angle. Four boards in photographs are stretched by
 # 0.03, 0.29, 0.00 and 0.05 %, and sheared by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
 STRETCH = 1.5e-3
-# Shear of a print relative to its stretch: between 1, as in these photographs, and 0, as in simulated boards.
-# With 1, errors from five views of stretched and of twisted boards are 7 % and 2 % larger, and from those of
-# bent ones 1 % smaller (tests/test_simulated_targets.py, slow). The verdict names a larger shear.
-_LEANING = 0.3
+NOTHING = 1e-7
+"""Size of an absent part over the target's size."""
 _MOST = 150  # most points from which the eigenfunctions are computed
 SINGLE = ("place", "place", "height")
 """The part of single points along each axis."""
@@ -101,13 +102,13 @@ class Prior:
         """Names of the parts."""
         return (STATED,) if self.stated is not None else (*self.groups, *dict.fromkeys(SINGLE))
 
-    def squared(self, sizes: Mapping[str, float]) -> Array:
-        """(G,) squares of the sizes of the parts."""
-        return np.array([sizes[name] for name in self.names]) ** 2
+    def as_array(self, sizes: Mapping[str, float]) -> Array:
+        """(G,) sizes of the parts; those that are not named, as in old files, are absent."""
+        return np.array([sizes.get(name, NOTHING * self.size) for name in self.names])
 
     def variances(self, sizes: Mapping[str, float]) -> tuple[Array, Array]:
         """Variances of the coefficients (m,) and of the single points (n, 3) for given sizes."""
-        both, m = self.units @ self.squared(sizes), self.basis.shape[2]
+        both, m = self.units @ self.as_array(sizes) ** 2, self.basis.shape[2]
         return both[:m], both[m:].reshape(-1, 3)
 
 

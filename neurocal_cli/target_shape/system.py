@@ -192,7 +192,7 @@ class PosesFirst:
     ) -> Solved:
         """The solution with the unknowns x, which have these variances."""
         f, coordinates = self.f, self.coordinates
-        prior = coordinates.units * coordinates.prior.squared(ratios)
+        prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
         return Solved(
             x[:f], coordinates.offsets(x[f:]), cost, logdet,
             Parts.of(prior, x[f:], variances[f:], covariance), camera, joint, changed,
@@ -318,7 +318,7 @@ class PointsFirst:
             return _squared(free @ factors) + np.tensordot(of_points, own @ of_points, axes=((0, 1), (0, 1)))
 
         unknowns = np.concatenate([x[f:s], e.ravel()])
-        prior = self.prior.units * self.prior.squared(ratios)
+        prior = self.prior.units * self.prior.as_array(ratios) ** 2
         return Solved(
             x[:f], self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
             Parts.of(prior, unknowns, variances, covariance),
