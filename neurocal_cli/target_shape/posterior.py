@@ -96,10 +96,13 @@ _START = {
     "place": 3e-4,
     "height": 3e-4,
 }  # of the target's size
-# Least gain in log evidence with which a stretch or a lean is estimated, as by the prior odds in `open_stretch`.
+# Least gain in log evidence with which a stretch or a lean is estimated, as by the odds in `open_stretch`.
 # With 0, errors from five views of bent boards are 5 to 10 % larger (tests/test_simulated_targets.py, slow).
-# For the covariance the prior odds are even, since most prints lean a little.
 _SEEN = math.log(5.0)
+# Least size of a lean in the covariance, over that with which it is estimated: most prints lean a little, see
+# `prior.STRETCH`. Without it, theta is off by up to 4 standard deviations if a bent board stands upright in
+# all views and leans by 0.15 % (tests/test_target_shape.py).
+_LEANING = 0.3
 _CERTAIN = 500.0  # largest log odds: more overflows
 _LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 _MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
@@ -175,8 +178,8 @@ def posterior(
     The quadratic is in the whole offsets from the given target, along each point's axes. With initial sizes
     [world unit], an initial noise variance [px^2] is needed as well, because then the errors on the given
     target are no noise. Flat means that the points stay in their plane, and `with_stretch` that stretch and
-    lean may be switched on or off. The `parts` are those of different views, if they are known already. Raises
-    `numpy.linalg.LinAlgError` if the points do not determine the cameras.
+    lean may be switched on or off. The `parts` are those of different views, if they are known already.
+    Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     system = system_of(info, prior, parts)
     climb = _Climb(info, prior, system, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
@@ -354,6 +357,8 @@ class _Climb:
             p = 1.0 / (1.0 + math.exp(min(now.evidence - on.evidence, _CERTAIN)))
             precision = 1.0 / (p * (v + squared)) - (1.0 / v - 1.0)
             share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
+            if self.names[part] == "lean":
+                share = max(share, _LEANING)
             ratios[part] = max(share * self.of_prints[0] / noise, now.ratios[part])
         return self.at(ratios) if (ratios > now.ratios).any() else now
 
