@@ -17,6 +17,9 @@ _SAME = 0.9
 
 def restarted(solution: Solution, points: Correspondences) -> Solution:
     """Adjust a solution to other points of the same views, or of some of them."""
+    known = solution.problem
+    if points is known.points and points.covariance is None and known.penalty is None:  # it is there already
+        return Solution(known, solution.adjusted, solution.record, would_take=solution.would_take)
     problem = solution.problem.with_points(points)
     if not problem.free_distortion:
         problem = problem.with_seen_pixels()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.outlier_views import least_of_free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
@@ -28,6 +29,8 @@ from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
 _TOLD_APART = 5.0  # standard deviations, as for the verdict
 _OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
+# The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
+_SURELY = 0.5
 _ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
 
@@ -41,11 +44,11 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         return True
     if not problem.free_poses:
         return False
-    return (
-        _given_is_wrong(solution, found)
-        or _are_two_cameras(solution, found)
-        or _changes_between_views(solution, found)
-    )
+    if _given_is_wrong(solution, found):
+        return True
+    # No camera that changes between views fits better than one of each view's own.
+    own = float(least_of_free_networks(solution.adjusted.normal).sum())
+    return _are_two_cameras(solution, found, own) or _changes_between_views(solution, found, own)
 
 
 def contradicts_sigma(solution: Solution) -> bool:
@@ -74,16 +77,18 @@ def _given_is_wrong(solution: Solution, found: Found) -> bool:
     return free_poses and other_distortion_explains(views, solution.state, given, AS_WELL * variance)
 
 
-def _are_two_cameras(solution: Solution, found: Found) -> bool:
+def _are_two_cameras(solution: Solution, found: Found, own: float) -> bool:
     """Whether two cameras (or a moving zoom) on the given target fit better than one on the found target.
+
+    `own` is the squared error with a camera for each view.
 
     A bent board alone can look like two cameras on the given target, so two cameras must also show on the
     found target. A board that bends differently in some views shows that as well, but then two cameras fit
     worse than the found target.
     """
-    if groups_of_views(*found.fits[0]) is None:
-        return False
     before, (_, after) = solution.adjusted, found.fits[0]
+    if _SURELY * own > after.cost.sum() or groups_of_views(*found.fits[0]) is None:
+        return False
     groups = groups_of_views(solution.problem, before)
     return groups is not None and bool((1.0 - groups.explained) * before.cost.sum() < after.cost.sum())
 
@@ -95,7 +100,7 @@ def groups_of_views(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
     return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
 
 
-def _changes_between_views(solution: Solution, found: Found) -> bool:
+def _changes_between_views(solution: Solution, found: Found, own: float) -> bool:
     """Whether a small change of the camera between the views is more probable than the found target.
 
     A change of the image's size by 1 % looks like a target of another shape, or like bends of single views.
@@ -106,10 +111,15 @@ def _changes_between_views(solution: Solution, found: Found) -> bool:
         return False
     repeated = solution.repeated
     spare = views.n_equations - problem.n_parameters
+    wanted = found.evidence - evidence_as_given([(problem, adjusted)])
+
+    def gain(explained: float) -> float:
+        """Gain in log evidence of one unknown that explains this share of the squared error."""
+        return -0.5 * spare * float(np.log1p(-min(explained, _ALL))) - _OCCAM * np.log(views.n_equations)
+
+    if not gain((1.0 - own / float(adjusted.cost.sum())) / _SURELY) > wanted:
+        return False
     scores = scores_of_poses(adjusted.normal, free, problem.free_poses, repeated)
     variance = float(adjusted.cost.sum()) / spare
     change = view_change(views, adjusted.state, free, scores, repeated.group, variance, spare)
-    if change is None:
-        return False
-    gain = -0.5 * spare * float(np.log1p(-min(change.explained, _ALL))) - _OCCAM * np.log(views.n_equations)
-    return bool(gain > found.evidence - evidence_as_given([(problem, adjusted)]))
+    return change is not None and gain(change.explained) > wanted

@@ -212,12 +212,11 @@ def _fitted_to(
 ) -> tuple[Solution, Rejected] | None:
     """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
     solution, rejected = before
-    points = target.seen(problem.points)
     try:
         if len(rejected) or rejected.views:
-            again, rejected = fit_robustly(problem.with_points(points), options)
-        else:
-            again = fit_again(solution, points, options, only_from_here=True)
+            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
+        else:  # the solution has all points, where the target has them
+            again = fit_again(solution, solution.problem.points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None
     return None if again.refusal else (again, rejected)

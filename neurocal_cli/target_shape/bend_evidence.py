@@ -36,24 +36,24 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
     """
     noise, of_precision = info.straight().cost / info.spare, evidence_by_precision(info)
 
-    def evidence(log_size: float) -> float:
+    def evidence(log_size: Array) -> Array:
         return of_precision(noise * np.exp(-2 * log_size))
 
     grid = np.linspace(np.log(_LEAST * size), np.log(_MOST * size), _GRID)
-    values = [evidence(x) for x in grid]
+    values = evidence(grid)
     best = int(np.argmax(values))
-    x, highest = float(grid[best]), values[best]
+    x, highest = float(grid[best]), float(values[best])
     for width in () if roughly else _FINER:
-        low, high = evidence(x - width), evidence(x + width)
+        low, high = evidence(np.array([x - width, x + width])).tolist()
         curved = low - 2 * highest + high
         step = 0.5 * (low - high) / curved * width if curved < 0 else np.sign(high - low) * width
         x += float(np.clip(step, -width, width))
-        highest = evidence(x)
+        highest = float(evidence(np.array([x]))[0])
     return float(noise * np.exp(-2 * x))
 
 
-def evidence_by_precision(info: Information) -> Callable[[float], float]:
-    """Log evidence of the given target as a function of the prior precision of the bends.
+def evidence_by_precision(info: Information) -> Callable[[Array], Array]:
+    """Log evidence (k,) of the given target as a function of prior precisions (k,) of the bends.
 
     With the poses eliminated, the three bend coefficients of each view are diagonalised once.
     """
@@ -71,12 +71,14 @@ def evidence_by_precision(info: Information) -> Callable[[float], float]:
     M -= flat.T @ flat
     logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
 
-    def evidence(precision: float) -> float:
-        left = values + precision
-        N = M - (along.T / left) @ along
-        cost = float(N[f, f] - N[f, :f] @ np.linalg.solve(N[:f, :f], N[:f, f]))
-        by_bends = float(np.log(left / precision).sum() + np.linalg.slogdet(N[:f, :f])[1])
-        return log_evidence(info.spare, cost, logdet + by_bends)
+    def evidence(precision: Array) -> Array:
+        left = values + precision[:, None]
+        N = M - (along.T / left[:, None]) @ along
+        S, g = N[:, :f, :f], N[:, :f, f]
+        cost = N[:, f, f] - (g * np.linalg.solve(S, g[..., None])[..., 0]).sum(axis=1)
+        by_bends = np.log(left / precision[:, None]).sum(axis=1) + np.linalg.slogdet(S)[1]
+        both = zip(cost.tolist(), (logdet + by_bends).tolist(), strict=True)
+        return np.array([log_evidence(info.spare, *one) for one in both])
 
     return evidence
 

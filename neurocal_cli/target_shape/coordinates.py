@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.prior import Part, Prior
+from neurocal_cli.target_shape.prior import Prior
 
 _SMOOTH = ("bend", "warp")
 
@@ -29,7 +29,7 @@ class Coordinates:
     linear: Array  # (3 n, k - 3 n) basis of the linear parts
     groups: dict[str, NDArray[np.intp]]  # indices of the linear parts
     vectors: Array | None  # (n, n) orthonormal eigenfunctions; None if there is no smooth part
-    smooth: dict[str, Array]  # (n, 3) variances of the smooth parts of size 1
+    units: Array  # (k, G) variances for parts of size 1, which add up
 
     def offsets(self, coordinates: Array) -> Array:
         """Offsets (..., n, 3) of coordinates (..., k)."""
@@ -48,13 +48,7 @@ class Coordinates:
 
     def variances(self, sizes: Mapping[str, float]) -> Array:
         """(k,) variances for given sizes of the parts."""
-        own = self.prior.of_points(sizes)
-        for name, unit in self.smooth.items():
-            own = own + sizes[name] ** 2 * unit
-        linear = np.empty(self.linear.shape[1])
-        for name, places in self.groups.items():
-            linear[places] = (sizes[name] / self.prior.size) ** 2
-        return np.concatenate([linear, own.ravel()])
+        return np.asarray(self.units @ self.prior.as_array(sizes) ** 2)
 
     def precision(self, sizes: Mapping[str, float]) -> Array:
         """(3 n, 3 n) inverse of the prior covariance of the offsets, by the formula of Woodbury."""
@@ -70,52 +64,29 @@ class Coordinates:
         inner = np.diag(1.0 / variances[:first]) + B.T @ by_linear
         return np.asarray(found - by_linear @ np.linalg.solve(inner, by_linear.T))
 
-    def parts(self, sizes: Mapping[str, float], found: Array, variances: Array) -> dict[str, Part]:
-        """The parts of the most probable coordinates (k,), which have these posterior variances.
-
-        Of a coordinate x with the prior variance t and the posterior variance v, a part with the prior
-        variance s is ``s x / t``, and the data determine ``s (1 - v / t) / t`` of it.
-        """
-        whole = self.variances(sizes)
-        squares, determined = (found / whole) ** 2, (1.0 - variances / whole) / whole
-        parts = {
-            name: Part(
-                len(places),
-                float(squares[places] @ whole[places]),
-                float(determined[places] @ whole[places]),
-            )
-            for name, places in self.groups.items()
-        }
-        first = self.linear.shape[1]
-        squares, determined = squares[first:].reshape(-1, 3), determined[first:].reshape(-1, 3)
-        for name, unit in self.smooth.items():
-            own, number = sizes[name] ** 2 * unit, int(np.count_nonzero(unit))
-            parts[name] = Part(number, float((own * squares).sum()), float((own * determined).sum()))
-        own = self.prior.of_points(sizes)
-        return parts | self.prior.parts_of_points(own * squares, own * determined)
-
 
 @lru_cache(maxsize=4)  # one calibration asks for them four times
 def coordinates_of(prior: Prior) -> Coordinates:
     """The coordinates that are independent under a prior."""
-    n = len(prior.axes)
+    n, m = len(prior.axes), prior.basis.shape[2]
     groups: dict[str, NDArray[np.intp]] = {}
-    smooth: dict[str, Array] = {}
     places: list[NDArray[np.intp]] = []
+    of_points = prior.units[m:].copy()
     vectors, values = None, np.zeros(n)
-    for name, columns in prior.groups.items():
+    for part, (name, columns) in enumerate(prior.groups.items()):
         if name not in _SMOOTH:
             first = sum(map(len, places))
             groups[name] = np.arange(first, first + len(columns))
             places.append(columns)
             continue
-        part = prior.basis[:, :, columns]
-        along = part.any(axis=(0, 2))
+        functions = prior.basis[:, :, columns]
+        along = functions.any(axis=(0, 2))
         if vectors is None:  # the same functions along all axes
             axis = int(np.argmax(along))
-            modes = part[:, axis, part[:, axis].any(axis=0)] / prior.size
+            modes = functions[:, axis, functions[:, axis].any(axis=0)] / prior.size
             values, vectors = np.linalg.eigh(modes @ modes.T)
             values[: n - modes.shape[1]] = 0.0
-        smooth[name] = values[:, None] * along
-    linear = prior.basis[:, :, np.concatenate([np.zeros(0, dtype=np.intp), *places])].reshape(3 * n, -1)
-    return Coordinates(prior, linear, groups, vectors, smooth)
+        of_points[:, part] = (values[:, None] * along).ravel()
+    linear = np.concatenate([np.zeros(0, dtype=np.intp), *places])
+    units = np.concatenate([prior.units[linear], of_points])
+    return Coordinates(prior, prior.basis[:, :, linear].reshape(3 * n, -1), groups, vectors, units)

@@ -1,7 +1,7 @@
 """Estimate the target together with the cameras: linearise, solve for the offsets, move, repeat.
 
-Each step solves for cameras, poses and offsets together (`posterior`). Then bundle adjustment brings cameras
-and poses to their minimum for the updated target.
+Each step solves for cameras, poses and offsets together (`posterior`). At the end, bundle adjustment brings
+cameras and poses to their minimum for the found target.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bends import N_SHAPES, Bends, surface_of
-from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
@@ -39,6 +39,7 @@ from neurocal_cli.target_shape.posterior import (
     posterior_of,
 )
 from neurocal_cli.target_shape.prior import prior_of
+from neurocal_cli.target_shape.system import WithoutPoses
 from neurocal_cli.target_shape.target_validation import folds_of, passes_cross_validation
 
 _STEPS = 10
@@ -49,7 +50,6 @@ _FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
 _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
-_ITERATIONS = 1  # of a camera on a target that will still move
 _STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
@@ -124,6 +124,16 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
 
     It is -inf if the points do not determine the cameras.
     """
+    return evidence_of_views(views_for_target(fits))
+
+
+def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple[Problem, Adjusted]]:
+    """The fits, with the views from which a target would be estimated."""
+    return _few_enough(fits, None) or fits
+
+
+def evidence_of_views(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Log evidence of the given target, of all views; -inf if the points do not determine the cameras."""
 
     def of_camera(problem: Problem, adjusted: Adjusted) -> Information:
         """The quadratic of one camera, with fixed target points."""
@@ -132,7 +142,7 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
         return of_views(sight_of(problem, adjusted, no_label), normal, np.ones(views.n_views, dtype=bool))
 
     try:
-        return evidence_of_given(*(of_camera(*fit) for fit in _few_enough(fits, None) or fits))
+        return evidence_of_given(*(of_camera(*fit) for fit in fits))
     except np.linalg.LinAlgError:
         return -np.inf
 
@@ -208,44 +218,57 @@ class Search:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
         last = 0.0
+        one_fold = [np.zeros(problem.views.n_views, dtype=np.intp) for problem, _ in self.fits]
+        n_folds = folds_of([problem.views.n_views for problem, _ in self.fits])
         for step in range(_STEPS):
-            here = information_of(self.sights(), len(self.given)).turned(self.prior.axes)
+            # Without initial sizes, those of the first step are rough.
+            known = self.still or self.sizes is not None
+            folded = folded_information(
+                self.sights(), len(self.given), n_folds if known and not self.still else one_fold
+            )
+            here = folded.whole.turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
             info = self._around_given(here)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
+            parts: list[WithoutPoses] = []
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                found = posterior(info, self.prior, self.sizes, self.flat, noise, step < _STRETCH_STEPS)
+                if known:
+                    parts = [
+                        WithoutPoses(part, np.flatnonzero(folded.fold == k))
+                        for k, part in enumerate(folded.parts(info, self._in_offsets))
+                    ]
+                found = posterior(
+                    info, self.prior, self.sizes, self.flat, noise, step < _STRETCH_STEPS, parts
+                )
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
-            # Without initial sizes, those of the first step are rough.
-            known = self.still or self.sizes is not None
             length = float((np.abs(found.camera_step) / std).max(initial=0.0))
             # The next step would be shorter than this one by the same factor as this one than the last.
             settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
             last = length
+            before = self._common()
             states = self._moved(found, info)
             if states is None:
                 return None
             if settled or step == _STEPS - 1:
                 break
-            if not self._adjust(states, _ITERATIONS):
-                return None
+            self._place(states)
         assert states is not None
-        if found.evidence - self._without(info) < least_gain or not self._adjust(self._aligned(states)):
+        without = self._without(info)
+        if found.evidence - without < least_gain or not self._adjust(self._aligned(states)):
             return None
-        folds = folds_of([problem.views.n_views for problem, _ in self.fits])
-        folded = folded_information(self.sights(), len(self.given), folds)
-        whole = self._in_offsets(folded.whole)
-        if not self._passes_cross_validation(found, folded.parts(self._held(whole), self._in_offsets)):
+        if not self._passes_cross_validation(found, parts):
             return None
-        target = self._target(found, found.evidence - evidence_of_given(info.straight()))
+        given = without if self.surface is None else evidence_of_given(info.straight())
+        target = self._target(found, found.evidence - given)
         if not target.stretch() < self.most_stretched:
             return None
+        whole = self._aligned_quadratic(folded.whole, before)
         posterior_here = partial(posterior_of, target, whole, self.prior)
         return Found(target, tuple(self.fits), found.evidence, posterior_here)
 
@@ -253,7 +276,7 @@ class Search:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
 
-    def _passes_cross_validation(self, found: Posterior, parts: list[Information]) -> bool:
+    def _passes_cross_validation(self, found: Posterior, parts: list[WithoutPoses]) -> bool:
         if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
             return False
         return self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)
@@ -271,6 +294,17 @@ class Search:
     def _in_offsets(self, info: Information) -> Information:
         """The quadratic around the current target, in the whole offsets along each point's axes."""
         return info.turned(self.prior.axes).around_given(self.offsets)
+
+    def _aligned_quadratic(self, info: Information, world: Array) -> Information:
+        """The quadratic in the whole offsets around common points (n, 3), aligned as the found target is.
+
+        A similarity of the target moves and scales the poses with it, and changes nothing else.
+        """
+        if self.surface is not None:  # a similarity changes the shapes of bends
+            return self._in_offsets(information_of(self.sights(), len(self.given)))
+        s, R, t = self._nearest(world)
+        offsets = self.prior.along_axes(s * world @ R.T + t - self.given)
+        return info.turned(R.T @ self.prior.axes / s).around_given(offsets)
 
     def sights(self) -> list[Sight]:
         """Observations of each camera for the current target."""
@@ -305,11 +339,17 @@ class Search:
         self.offsets, self.sizes = found.offsets, found.sizes
         return self._predicted(found.camera_step, own[:, :6])
 
-    def _adjust(self, states: list[CameraState], iterations: int = OPTIONS.max_iterations) -> bool:
-        """Adjust the cameras to the current target, from states in pixels; whether that succeeded."""
+    def _place(self, states: list[CameraState]) -> None:
+        """Take the cameras to states in pixels, and their points to the current target."""
         self.fits = [
-            at_world(*self.fits[k], state, self._world(k), iterations) for k, state in enumerate(states)
+            placed(*fit, state, self._world(k))
+            for k, (fit, state) in enumerate(zip(self.fits, states, strict=True))
         ]
+
+    def _adjust(self, states: list[CameraState]) -> bool:
+        """Adjust the cameras to the current target, from states in pixels; whether that succeeded."""
+        self._place(states)
+        self.fits = [(problem, problem.adjust(start)) for problem, start in self.fits]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
     def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
@@ -326,19 +366,22 @@ class Search:
             states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
         return states
 
-    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
-        """Rotate, shift and scale the target to be nearest to the given one, and the cameras with it.
+    def _nearest(self, world: Array) -> tuple[float, Array, Array]:
+        """Scale, rotation and shift that bring common points (n, 3) nearest to the given one.
 
         Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
-            return states
-        world = self._common()
+            return 1.0, np.eye(3), np.zeros(3)
         s, R, t = nearest_similarity(world, self.given)
         held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
-        s, t = held * s, held * t
-        world = s * world @ R.T + t
-        self.offsets = self.prior.along_axes(world - self.given)
+        return held * s, R, held * t
+
+    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
+        """Scale, rotate and shift the target, and the cameras with it."""
+        world = self._common()
+        s, R, t = self._nearest(world)
+        self.offsets = self.prior.along_axes(s * world @ R.T + t - self.given)
         turned = [state.R @ R.T for state in states]
         return [
             replace(state, R=own, t=s * state.t - own @ t) for state, own in zip(states, turned, strict=True)
@@ -365,15 +408,19 @@ def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> S
 
 
 def at_world(
-    problem: Problem,
-    adjusted: Adjusted,
-    state: CameraState,
-    world: Array,
-    iterations: int = OPTIONS.max_iterations,
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
 ) -> tuple[Problem, Adjusted]:
     """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
+    new, start = placed(problem, adjusted, state, world)
+    return new, new.adjust(start)
+
+
+def placed(
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+) -> tuple[Problem, Adjusted]:
+    """A camera with other world coordinates of its points, at a state in pixels and not adjusted yet."""
     new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
     if not problem.free_distortion and state.model != "none":
         # The state contains the given distortion, but `with_points` has removed it from the pixels.
         new = new.with_seen_pixels()
-    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)), iterations)
+    return new, replace(adjusted, state=normalised(state, new.views))

@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import camera_columns, normal_blocks
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
+from neurocal_cli.target_shape.find import Found, evidence_of_views, find_target, views_for_target
 
 # Nested models: each has the coefficients of the previous one and more.
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
@@ -62,11 +62,11 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
 
     Each camera is at its minimum for the given target, and `found` has the same lenses.
     """
-    end = len(POLYNOMIAL_MODELS)
+    fits, end = views_for_target(fits), len(POLYNOMIAL_MODELS)
     places = [_PLACES.get(a.state.model, end) if problem.free[0] else end for problem, a in fits]
     if min(places) >= end - 1:
         return False
-    least = 0.5 * (evidence_as_given(fits) + found.evidence)
+    least = 0.5 * (evidence_of_views(fits) + found.evidence)
     richest = [
         _linearised_with(*fit, POLYNOMIAL_MODELS[-1]) if own < end else fit
         for fit, own in zip(fits, places, strict=True)
@@ -78,12 +78,12 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
             for fit, linearised, own in zip(fits, richest, places, strict=True)
         ]
         # A linear prediction that reaches less than half of the found target's gain settles it.
-        if not evidence_as_given(richer) + _log_prior_of_added(fits, richer) > least:
+        if not evidence_of_views(richer) + _log_prior_of_added(fits, richer) > least:
             continue
         richer = [
             _adjusted_with(*fit, model) if own < place else fit for fit, own in zip(fits, places, strict=True)
         ]
-        if evidence_as_given(richer) + _log_prior_of_added(fits, richer) > found.evidence:
+        if evidence_of_views(richer) + _log_prior_of_added(fits, richer) > found.evidence:
             return True
     return False
 

@@ -3,9 +3,11 @@
 Each part of the offsets has a Gaussian prior, whose size is estimated from the data (`posterior`):
 
 - fold: rigid motion of a plane of a folded target;
+- curl: a quadratic surface out of the plane, as of paper that curls (`bends`);
 - bend: smooth, out of the plane;
-- stretch: linear in the plane: one side longer than stated, or sides that are not perpendicular;
 - warp: smooth, in the plane;
+- stretch: one side longer than stated, and the other shorter;
+- lean: sides that are not perpendicular;
 - place and height: independent for each point, in the plane and out of it.
 
 Surveyed points have only the standard deviations that the survey states, independent along the world's axes
@@ -17,7 +19,7 @@ plane, represented by its largest eigenfunctions. A solid target warps in all di
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -30,13 +32,12 @@ from neurocal_cli.target import Target, is_flat
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
 _HELD = 1e-7  # std of a surveyed point that is stated as exact, over the target's size
-# Std of a stretch, half of the relative difference of two sides. Four boards in photographs are stretched by
+# Std of a stretch, half of the relative difference of two sides, and of a lean, half of the angle by which
+# two sides are off a right angle. Four boards in photographs are stretched by
 # 0.03, 0.29, 0.00 and 0.05 %, and sheared by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
 STRETCH = 1.5e-3
-# Shear of a print relative to its stretch: between 1, as in these photographs, and 0, as in simulated boards.
-# With 1, errors from five views of stretched and of twisted boards are 7 % and 2 % larger, and from those of
-# bent ones 1 % smaller (tests/test_simulated_targets.py, slow). The verdict names a larger shear.
-_LEANING = 0.3
+NOTHING = 1e-7
+"""Size of an absent part over the target's size."""
 _MOST = 150  # most points from which the eigenfunctions are computed
 SINGLE = ("place", "place", "height")
 """The part of single points along each axis."""
@@ -45,12 +46,32 @@ STATED = "stated"
 
 
 @frozen_dataclass(eq=False)
-class Part:
-    """The coefficients of a part of the offsets, in units of their prior's standard deviation."""
+class Parts:
+    """The coefficients of each part of the offsets, in units of their prior's standard deviations."""
 
-    number: int
-    squares: float  # of the most probable coefficients
-    determined: float  # effective number that the data determine
+    squares: Array  # (G,) of the most probable coefficients
+    determined: Array  # (G,) effective number that the data determine
+    # (G, G) w_g (1 - C) w_h, with the most probable coefficients w and their posterior covariance C
+    coupling: Array
+
+    @classmethod
+    def of(
+        cls, variances: Array, found: Array, posterior: Array, covariance: Callable[[Array], Array]
+    ) -> Parts:
+        """The parts of independent unknowns, each a sum of parts with the prior variances (k, G).
+
+        Of an unknown x (k,) with the prior variance t and the posterior variance v (k,), a part with the
+        prior variance s is ``s x / t``, and the data determine ``s (1 - v / t) / t`` of it. `covariance`
+        returns the posterior covariances (G, G) of sums of the unknowns with the factors (k, G).
+        """
+        whole = variances.sum(axis=1)
+        along = found / whole
+        factors = variances * (along / whole)[:, None]
+        return cls(
+            along**2 @ variances,
+            (1.0 - posterior / whole) / whole @ variances,
+            factors.T @ (whole[:, None] * factors) - covariance(factors),
+        )
 
 
 @frozen_dataclass(eq=False)
@@ -64,6 +85,8 @@ class Prior:
     # target.
     gauge: Array
     size: float  # of the target [world unit]
+    # (m + 3 n, G) prior variances of the coefficients and of the single points for parts of size 1
+    units: Array
     stated: Array | None = None  # (n, 3) standard deviations of surveyed points [world unit]
 
     def along_axes(self, world: Array) -> Array:
@@ -79,29 +102,14 @@ class Prior:
         """Names of the parts."""
         return (STATED,) if self.stated is not None else (*self.groups, *dict.fromkeys(SINGLE))
 
-    def of_coefficients(self, sizes: Mapping[str, float]) -> Array:
-        """(m,) variances of the coefficients of the basis for given sizes of the parts."""
-        variances = np.empty(self.basis.shape[2])
-        for name, places in self.groups.items():
-            variances[places] = (sizes[name] / self.size) ** 2
-        return variances
+    def as_array(self, sizes: Mapping[str, float]) -> Array:
+        """(G,) sizes of the parts; those that are not named, as in old files, are absent."""
+        return np.array([sizes.get(name, NOTHING * self.size) for name in self.names])
 
-    def of_points(self, sizes: Mapping[str, float]) -> Array:
-        """(n, 3) variances of the single points for given sizes of the parts."""
-        if self.stated is not None:
-            return np.asarray((sizes[STATED] * self.stated) ** 2)
-        return np.tile([sizes[name] ** 2 for name in SINGLE], (len(self.axes), 1))
-
-    def parts_of_points(self, squares: Array, determined: Array) -> dict[str, Part]:
-        """Parts of the single points from the terms (n, 3) of each; see `Part`."""
-        if self.stated is not None:
-            return {STATED: Part(squares.size, float(squares.sum()), float(determined.sum()))}
-        found = {}
-        for name in dict.fromkeys(SINGLE):
-            along = [axis for axis, other in enumerate(SINGLE) if other == name]
-            terms = squares[:, along], determined[:, along]
-            found[name] = Part(terms[0].size, float(terms[0].sum()), float(terms[1].sum()))
-        return found
+    def variances(self, sizes: Mapping[str, float]) -> tuple[Array, Array]:
+        """Variances of the coefficients (m,) and of the single points (n, 3) for given sizes."""
+        both, m = self.units @ self.as_array(sizes) ** 2, self.basis.shape[2]
+        return both[:m], both[m:].reshape(-1, 3)
 
 
 def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
@@ -127,7 +135,12 @@ def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
     names = np.repeat([name for name, _ in parts], [part.shape[2] for _, part in parts])
     groups = {name: np.flatnonzero(names == name) for name, _ in parts}
     basis = size * np.concatenate([part for _, part in parts], axis=2)
-    return Prior(axes, basis, groups, _gauge(given, axes), size)
+    of_points = [np.tile([float(name == part) for part in SINGLE], n) for name in dict.fromkeys(SINGLE)]
+    of_coefficients = [np.where(names == name, size**-2.0, 0.0) for name in groups]
+    units = np.zeros((len(names) + 3 * n, len(groups) + len(of_points)))
+    units[: len(names), : len(groups)] = np.transpose(of_coefficients)
+    units[len(names) :, len(groups) :] = np.transpose(of_points)
+    return Prior(axes, basis, groups, _gauge(given, axes), size, units)
 
 
 def surveyed_prior(given: Array, stated: Array) -> Prior:
@@ -135,7 +148,9 @@ def surveyed_prior(given: Array, stated: Array) -> Prior:
     n = len(given)
     size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
     axes = np.broadcast_to(np.eye(3), (n, 3, 3))
-    return Prior(axes, np.zeros((n, 3, 0)), {}, np.zeros((3 * n, 0)), size, np.maximum(stated, _HELD * size))
+    stated = np.maximum(stated, _HELD * size)
+    units = stated.reshape(-1, 1) ** 2
+    return Prior(axes, np.zeros((n, 3, 0)), {}, np.zeros((3 * n, 0)), size, units, stated)
 
 
 def prior_of_target(target: Target) -> Prior:
@@ -176,10 +191,11 @@ def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
     if not flat:
         return [("warp", np.concatenate([warp, bend], axis=2))]
     x, y = places[:, 0], places[:, 1]
-    stretch = np.zeros((n, 3, 2))
+    curl, stretch, lean = np.zeros((n, 3, 3)), np.zeros((n, 3, 1)), np.zeros((n, 3, 1))
+    curl[:, 2] = np.column_stack([np.sqrt(2.0) * (x * x + y * y), x * x - y * y, 2 * x * y])
     stretch[:, 0, 0], stretch[:, 1, 0] = x, -y
-    stretch[:, 0, 1], stretch[:, 1, 1] = _LEANING * y, _LEANING * x
-    return [("bend", bend), ("warp", warp), ("stretch", stretch)]
+    lean[:, 0, 0], lean[:, 1, 0] = y, x
+    return [("curl", curl), ("bend", bend), ("warp", warp), ("stretch", stretch), ("lean", lean)]
 
 
 def _as_a_whole(centred: Array, axes: Array) -> Array:

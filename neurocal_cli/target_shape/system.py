@@ -10,18 +10,24 @@ the work grows linearly with the number of views or of points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.coordinates import coordinates_of
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.prior import Part, Prior
+from neurocal_cli.target_shape.prior import Parts, Prior
 
 _SMALL = 48  # largest triangular matrix that is inverted directly; others are split in halves
+_ROUNDING = 1e-12  # of the largest diagonal element
+_LEAST_NOISE = 0.01  # of the variance with the given points
+# The start of a variance that is estimated as negative, which an absent part is as often as not, over the
+# size of the estimate. Shares of 0.01 to 0.1 need equally many steps.
+_UNSURE = 0.03
 _RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefinite
 # Offsets over poses and smooth coefficients, up to which eliminating the poses is faster. On boards of 54 to
 # 300 points in 8 to 60 views, both take the same time at 1.7; at 0.75 and 3.9 one takes three times as long.
@@ -36,7 +42,7 @@ class Solved:
     offsets: Array  # (n, 3) whole offsets
     cost: float
     logdet: float  # log determinant of the whole matrix over that of the prior's precisions
-    parts: dict[str, Part]
+    parts: Parts
     camera: Array  # (f, f) covariance of the cameras
     joint: Callable[[], JointCovariance]
     # The same after a change of one linear part, with the sizes of all parts and the name of that one.
@@ -54,8 +60,9 @@ class JointCovariance:
     camera_root: Array  # (d, f)
     offset_root: Array  # (d, 3 n)
     own: Array  # (n, 3, 3)
-    # Covariances (P, 6, 6) of the poses for known other unknowns, and roots (P, 6, d) of the rest.
-    pose_parts: Callable[[], tuple[Array, Array]]
+    # Of each group of poses: their indices (p,), covariances (p, 6, 6) for known other unknowns, and roots
+    # (p, 6, d) of the rest.
+    pose_parts: Callable[[], Iterable[tuple[NDArray[np.intp], Array, Array]]]
 
     def offset_variance(self, gauge: Array) -> Array:
         """(n, 3) variance of the offsets, without the gauge: rotations, shifts and scale of all points.
@@ -71,20 +78,29 @@ class JointCovariance:
 
     def poses(self, gauge: Array) -> Array:
         """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
-        own, root = self.pose_parts()
-        covariance = own + root @ np.swapaxes(root, 1, 2)
-        if not gauge.size:
-            return np.asarray(covariance)
         by_gauge = self.offset_root @ gauge
         G = gauge.reshape(*self.own.shape[:2], -1)
-        of_gauge = by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G)
-        across = root @ by_gauge
-        return np.asarray(covariance - across @ np.linalg.inv(of_gauge) @ np.swapaxes(across, 1, 2))
+        of_gauge = np.linalg.inv(by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G))
+        groups = list(self.pose_parts())
+        found = np.empty((sum(len(which) for which, *_ in groups), 6, 6))
+        for which, own, root in groups:
+            across = root @ by_gauge
+            found[which] = (
+                own + root @ np.swapaxes(root, 1, 2) - across @ of_gauge @ np.swapaxes(across, 1, 2)
+            )
+        return found
 
 
-def system_of(info: Information, prior: Prior) -> PosesFirst | PointsFirst:
-    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster."""
-    return (PointsFirst if points_first(info.pose_right.size, prior) else PosesFirst)(info, prior)
+def system_of(
+    info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()
+) -> PosesFirst | PointsFirst:
+    """The quadratic in the whole offsets along each point's axes, with its prior, as it is solved faster.
+
+    The parts are those of different views, if they are known already.
+    """
+    if points_first(info.pose_right.size, prior):
+        return PointsFirst(info, prior)
+    return PosesFirst(info, prior, parts)
 
 
 def points_first(of_poses: int, prior: Prior) -> bool:
@@ -99,10 +115,11 @@ class PosesFirst:
     Everything independent of the sizes is computed once.
     """
 
-    def __init__(self, info: Information, prior: Prior) -> None:
+    def __init__(self, info: Information, prior: Prior, parts: Sequence[WithoutPoses] = ()) -> None:
+        self.parts = parts or [WithoutPoses(info)]
         self.coordinates, self.f = coordinates_of(prior), len(info.camera)
-        self.without = WithoutPoses(info)
-        M = self._by_coordinates(self._by_coordinates(self.without.matrix()).T)
+        self.of_poses = sum(part.logdet for part in self.parts)
+        M = self._by_coordinates(self._by_coordinates(sum_of([part.matrix for part in self.parts])).T)
         self.matrix, self.right, self.given_cost = M[:-1, :-1], M[:-1, -1], float(M[-1, -1])
         self.sum = np.empty(self.matrix.shape)  # large arrays are quicker to fill again than to allocate
 
@@ -126,7 +143,10 @@ class PosesFirst:
         root, logdet = _root_of_inverse(M)
         half, camera = root @ self.right, root[:, : self.f]
         x, variances = half @ root, np.einsum("ij,ij->j", root, root)
-        cost, logdet = self.given_cost - float(half @ half), logdet + self.without.logdet + logprior
+        cost, logdet = self.given_cost - float(half @ half), logdet + self.of_poses + logprior
+
+        def covariance(factors: Array) -> Array:
+            return _squared(root[:, self.f :] @ factors)
 
         def changed(ratios: Mapping[str, float], name: str) -> Solved:
             """By the formula of Woodbury, because only a few precisions change."""
@@ -136,6 +156,10 @@ class PosesFirst:
             factor = np.eye(len(rows)) + gain @ across[rows]
             inner = np.linalg.solve(factor, gain)
             by_inner, own = across @ inner, x[rows]
+
+            def changed_covariance(of_rows: Array) -> Array:
+                return np.asarray(of_rows.T @ inner @ of_rows)
+
             more = np.linalg.slogdet(factor)[1] + np.log(after / prior[places]).sum()
             return self._solved(
                 ratios,
@@ -144,13 +168,15 @@ class PosesFirst:
                 cost + float(own @ inner @ own),
                 logdet + float(more),
                 camera.T @ camera - by_inner[: self.f] @ across[: self.f].T,
+                lambda factors: covariance(factors) - changed_covariance(across[self.f :].T @ factors),
                 cache(lambda: self.solve(ratios).joint()),
                 lambda new, other: self.solve(ratios).changed(new, other),
             )
 
         return self._solved(
-            ratios, x, variances, cost, logdet, camera.T @ camera, cache(lambda: self._joint(root)), changed
-        )
+            ratios, x, variances, cost, logdet, camera.T @ camera, covariance,
+            cache(lambda: self._joint(root)), changed,
+        )  # fmt: skip
 
     def _solved(
         self,
@@ -160,34 +186,61 @@ class PosesFirst:
         cost: float,
         logdet: float,
         camera: Array,
+        covariance: Callable[[Array], Array],
         joint: Callable[[], JointCovariance],
         changed: Callable[[Mapping[str, float], str], Solved],
     ) -> Solved:
         """The solution with the unknowns x, which have these variances."""
         f, coordinates = self.f, self.coordinates
+        prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
         return Solved(
             x[:f], coordinates.offsets(x[f:]), cost, logdet,
-            coordinates.parts(ratios, x[f:], variances[f:]), camera, joint, changed,
+            Parts.of(prior, x[f:], variances[f:], covariance), camera, joint, changed,
         )  # fmt: skip
 
     def _joint(self, root: Array) -> JointCovariance:
         n, camera = len(self.coordinates.prior.axes), root[:, : self.f]
         offsets = self.coordinates.offsets(root[:, self.f :]).reshape(len(root), 3 * n)
 
-        def poses() -> tuple[Array, Array]:
-            P, p = self.without.root.shape[:2]
-            inverse = np.swapaxes(self.without.root, 1, 2)[:, :6]
-            gain = inverse @ self.without.rows[:, :-1].reshape(P, p, -1)
-            by_root = gain.reshape(6 * P, -1) @ np.concatenate([camera, offsets], axis=1).T
-            return inverse @ np.swapaxes(inverse, 1, 2), -by_root.reshape(P, 6, len(root))
+        def poses() -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
+            others = np.concatenate([camera, offsets], axis=1).T
+            for part in self.parts:
+                P, p = part.root.shape[:2]
+                inverse = np.swapaxes(part.root, 1, 2)[:, :6]
+                gain = inverse @ part.rows[:, :-1].reshape(P, p, -1)
+                by_root = (gain.reshape(6 * P, -1) @ others).reshape(P, 6, len(root))
+                yield part.poses, inverse @ np.swapaxes(inverse, 1, 2), by_root
 
         return JointCovariance(camera, offsets, np.zeros((n, 3, 3)), poses)
+
+    def moments(self, spare: float) -> Array:
+        """(G,) rough sizes of the parts over the noise's standard deviation, by the method of moments.
+
+        At the given points, the gradient g by the coordinates has the covariance ``sigma^2 N + N T N``, with
+        the matrix N, from which cameras and poses are eliminated, and the prior covariance T. So the expected
+        squares of g, summed over the coordinates of each part, and the expected squared error are linear in
+        sigma^2 and the squared sizes (Rao 1971: minimum norm quadratic unbiased estimation).
+        """
+        f, units = self.f, self.coordinates.units
+        response = np.linalg.solve(
+            self.matrix[:f, :f], np.column_stack([self.matrix[:f, f:], self.right[:f]])
+        )
+        N = self.matrix[f:, f:] - self.matrix[f:, :f] @ response[:, :-1]
+        g = self.right[f:] - self.matrix[f:, :f] @ response[:, -1]
+        own = np.diagonal(N)
+        own = np.maximum(own, _ROUNDING * own.max())
+        weighted = units / own[:, None]
+        cost = self.given_cost - self.right[:f] @ response[:, -1]
+        left = np.block([[spare, own @ units], [(own @ weighted)[:, None], weighted.T @ (N * N) @ units]])
+        squares = np.linalg.lstsq(left, np.append(cost, g**2 @ weighted), rcond=None)[0]
+        noise = max(squares[0], _LEAST_NOISE * cost / spare)
+        return np.asarray(np.sqrt(np.maximum(squares[1:], -_UNSURE * squares[1:]) / noise))
 
     def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
         """Cost and log determinant of `Solved`, without the rest."""
         M, prior = self._with_prior(ratios)
         cost, logdet = _least(M, self.right, self.given_cost)
-        return cost, logdet + self.without.logdet + float(np.log(prior).sum())
+        return cost, logdet + self.of_poses + float(np.log(prior).sum())
 
     def minimum(self, ratios: Mapping[str, float]) -> tuple[Array, Array]:
         """Step (f,) of the cameras and offsets (n, 3) of `Solved`, without the rest."""
@@ -254,27 +307,23 @@ class PointsFirst:
         def joint() -> JointCovariance:
             offsets = single + smooth @ self.prior.basis.reshape(3 * n, -1).T
             poses = root[:, s:].reshape(len(x), P, p)[:, :, :6].transpose(1, 2, 0)
-            return JointCovariance(camera, offsets, own, lambda: (np.zeros((P, 6, 6)), poses))
+            return JointCovariance(camera, offsets, own, lambda: [(np.arange(P), np.zeros((P, 6, 6)), poses)])
 
-        variances = np.einsum("ij,ij->j", single, single).reshape(n, 3) + np.diagonal(own, axis1=1, axis2=2)
-        parts = self._parts(ratios, x[f:s], np.einsum("ij,ij->j", smooth, smooth), e, variances)
+        free = np.concatenate([smooth, single], axis=1)
+        variances = np.einsum("ij,ij->j", free, free)
+        variances[s - f :] += np.diagonal(own, axis1=1, axis2=2).ravel()
+
+        def covariance(factors: Array) -> Array:
+            of_points = factors[s - f :].reshape(n, 3, -1)
+            return _squared(free @ factors) + np.tensordot(of_points, own @ of_points, axes=((0, 1), (0, 1)))
+
+        unknowns = np.concatenate([x[f:s], e.ravel()])
+        prior = self.prior.units * self.prior.as_array(ratios) ** 2
         return Solved(
-            x[:f], self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest, parts,
+            x[:f], self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
+            Parts.of(prior, unknowns, variances, covariance),
             camera.T @ camera, joint, lambda new, _: self.solve(new),
         )  # fmt: skip
-
-    def _parts(
-        self, ratios: Mapping[str, float], smooth: Array, of_smooth: Array, single: Array, of_single: Array
-    ) -> dict[str, Part]:
-        """The parts, from the most probable coefficients (m,) and (n, 3) and their posterior variances."""
-        prior = self.prior.of_coefficients(ratios)
-        squares, determined = smooth**2 / prior, 1.0 - of_smooth / prior
-        parts = {
-            name: Part(len(places), float(squares[places].sum()), float(determined[places].sum()))
-            for name, places in self.prior.groups.items()
-        }
-        prior = self.prior.of_points(ratios)
-        return parts | self.prior.parts_of_points(single**2 / prior, 1.0 - of_single / prior)
 
     def least(self, ratios: Mapping[str, float]) -> tuple[float, float]:
         """Cost and log determinant of `Solved`, without the rest."""
@@ -295,7 +344,7 @@ class PointsFirst:
 
         The log determinant is that of the points' matrices over that of all precisions of the prior.
         """
-        of_smooth, of_single = self.prior.of_coefficients(ratios), self.prior.of_points(ratios)
+        of_smooth, of_single = self.prior.variances(ratios)
         own = self.info.point + np.eye(3) / of_single[:, :, None]
         root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
         rows = np.matmul(root, self.by_point, out=self.rows)
@@ -312,11 +361,13 @@ class WithoutPoses:
 
     With the lower triangular Cholesky factors L of the poses' matrices, `root` (P, p, p) is their inverses,
     and `rows` (P p, f + 3 n + 1) the products of these with the coupling to cameras, offsets and the right
-    side. `logdet` is the log determinant of the poses' part.
+    side. `logdet` is the log determinant of the poses' part, and `poses` (P,) are the indices of the poses
+    among those of all views.
     """
 
-    def __init__(self, info: Information) -> None:
+    def __init__(self, info: Information, poses: NDArray[np.intp] | None = None) -> None:
         self.info, (P, p), d = info, info.pose.shape[:2], info.point_right.size
+        self.poses = np.arange(P) if poses is None else poses
         self.root = np.linalg.inv(np.linalg.cholesky(info.pose))
         f = len(info.camera)
         rows = np.empty((P, p, f + d + 1))
@@ -326,6 +377,7 @@ class WithoutPoses:
         self.rows = rows.reshape(P * p, f + d + 1)
         self.logdet = -2 * float(np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum())
 
+    @cached_property
     def matrix(self) -> Array:
         """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
         info, f, n = self.info, len(self.info.camera), len(self.info.point)
@@ -354,6 +406,18 @@ class WithoutPoses:
             right - by_camera.T @ left,
             info.cost + (offsets * by_point).sum(axis=(1, 2)) - (left**2).sum(axis=0),
         )
+
+
+def sum_of(matrices: Sequence[Array]) -> Array:
+    """The sum; several times as fast as NumPy's over an axis of a stack."""
+    total = matrices[0].copy()
+    for matrix in matrices[1:]:
+        total += matrix
+    return total
+
+
+def _squared(rows: Array) -> Array:
+    return np.asarray(rows.T @ rows)
 
 
 def _least(M: Array, right: Array, cost: float) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from neurocal_cli.target_shape.coordinates import coordinates_of
 from neurocal_cli.target_shape.information import Information, joined
 from neurocal_cli.target_shape.posterior import camera_step, minimum_of
 from neurocal_cli.target_shape.prior import Prior
-from neurocal_cli.target_shape.system import WithoutPoses, points_first
+from neurocal_cli.target_shape.system import WithoutPoses, points_first, sum_of
 
 _FEWEST = 4  # fewest views, so that the others determine a camera
 _FOLDS = 5
@@ -34,22 +34,22 @@ def folds_of(n_views: Sequence[int]) -> list[NDArray[np.intp]]:
 
 
 def passes_cross_validation(
-    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
+    without: Sequence[WithoutPoses], prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> bool:
     """Whether offsets estimated from the other views fit the held-out ones; True if that cannot be tested.
 
     The parts are the folds, in the whole offsets along each point's axes and with the prior of the bends of
     single views, if any. `variance` [px^2] is that of the noise.
     """
-    if len(parts) == 1:
+    if len(without) == 1:
         return True
+    parts = [part.info for part in without]
     folds = np.arange(len(parts))
     # A camera with fewer views than folds is missing in some folds.
     seen = [np.diagonal(part.camera) > 0 for part in parts]
     by_parts = all(some.all() for some in seen)
     try:
         if by_parts:
-            without = [WithoutPoses(part) for part in parts]
             estimated = [found for _, found in without_each(without, prior, sizes, variance)]
         else:
             others = [_seen(joined([part for part in parts if part is not out])) for out in parts]
@@ -96,9 +96,9 @@ def without_each(
     if points_first(sum(part.info.pose_right.size for part in parts), prior):
         others = (joined([part.info for part in parts if part is not out]) for out in parts)
         return [minimum_of(some, prior, sizes, variance) for some in others]
-    matrices = [part.matrix() for part in parts]
+    matrices = [part.matrix for part in parts]
     f = len(parts[0].info.camera)
-    whole = np.sum(matrices, axis=0)
+    whole = sum_of(matrices)
     whole[f:-1, f:-1] += variance * coordinates_of(prior).precision(sizes)
     estimated = []
     for out in matrices:
