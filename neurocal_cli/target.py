@@ -136,13 +136,21 @@ class Target:
 
     def stretch(self) -> float:
         """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""
-        worst = 0.0
+        scales = (np.linalg.svd(linear, compute_uv=False) for linear in self._linear())
+        return max(float(along / across - 1) for along, across in scales)
+
+    def sides(self) -> tuple[float, float]:
+        """Elongation of a side over the other one, and angle [rad] off a right angle, of the worst planes."""
+        linear = np.array(list(self._linear()))
+        one, two = np.linalg.norm(linear, axis=2).T
+        cosine = (linear[:, 0] * linear[:, 1]).sum(axis=1) / (one * two)
+        return float(np.maximum(one / two, two / one).max() - 1), float(np.abs(np.arcsin(cosine)).max())
+
+    def _linear(self) -> Iterator[Array]:
+        """(2, 2) what becomes of unit vectors along the principal axes of each given plane, as rows."""
         for found, given in self._planes():
             rows = np.column_stack([np.ones(len(given)), given[:, :2]])
-            linear = np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:]
-            along, across = np.linalg.svd(linear, compute_uv=False)
-            worst = max(worst, float(along / across - 1))
-        return worst
+            yield np.asarray(np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:], dtype=float)
 
     def _planes(self) -> Iterator[tuple[Array, Array]]:
         """Found and given points of each plane about their centres, along the given ones' principal axes."""

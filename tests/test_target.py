@@ -250,7 +250,7 @@ def test_a_corner_rig_of_three_boards(kind: str, tmp_path: Path, real_files: Rea
 def test_a_board_at_the_limit_of_stretch_is_kept_when_its_lens_is_chosen_anew(
     tmp_path: Path, real_files: RealFiles
 ) -> None:
-    """By 1.9 % under the first lens and 2.02 % under the last: held out, 0.13 px instead of 0.24."""
+    """Its sides lean by 0.02 rad, which is no stretch: held out, 0.13 px instead of 0.24."""
     images = real_files("sony_chess/frame*.jpg")
     words = ["--cols", 4, "--rows", 6, "--square", 30, "--points", "vertices", "-o", tmp_path / "points.csv"]
     assert run("detect", *images, *words).exit_code == 0
@@ -264,7 +264,7 @@ def test_a_board_at_the_limit_of_stretch_is_kept_when_its_lens_is_chosen_anew(
     ("images", "cols", "rows", "square", "stretched", "leaning"),
     [
         ("opencv_stereo/left*.jpg", 9, 6, 25, -0.0003, 0.0004),
-        ("sony_chess/frame*.jpg", 4, 6, 30, -0.0029, -0.0004),
+        ("sony_chess/frame*.jpg", 4, 6, 30, -0.0024, -0.0004),
         ("fisheye_ocam/*.jpg", 6, 8, 32.5, 0.0, 0.0014),
         ("fisheye_stereo/left*.jpg", 9, 6, 24.23, 0.0005, -0.0009),
     ],

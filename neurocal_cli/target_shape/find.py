@@ -52,10 +52,10 @@ _EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
 _STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
-# Prints are stretched by a few thousandths, one in photographs by 2 % (tests/test_target.py, slow); more
-# means that the squares have another size along one side. An estimated target below the first limit may move
-# slightly beyond it when the lens is selected again.
-_STRETCHED, _STRETCHED_AGAIN = 0.025, 0.03
+# Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
+# estimated target below the first limit may move slightly beyond it when the lens is selected again.
+_STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
+_LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0.02 on one in photographs
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # fewest different views of most points
 LEAST_GAIN = 6.0
 """Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
@@ -267,7 +267,8 @@ class Search:
             return None
         given = without if self.surface is None else evidence_of_given(info.straight())
         target = self._target(found, found.evidence - given)
-        if not target.stretch() < self.most_stretched:
+        stretch, lean = target.sides()
+        if not (stretch < self.most_stretched and lean < _LEANING):
             return None
         whole = self._aligned_quadratic(folded.whole, before)
         posterior_here = partial(posterior_of, target, whole, self.prior)

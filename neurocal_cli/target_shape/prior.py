@@ -33,8 +33,8 @@ _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; 
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
 _HELD = 1e-7  # std of a surveyed point that is stated as exact, over the target's size
 # Std of a stretch, half of the relative difference of two sides, and of a lean, half of the angle by which
-# two sides are off a right angle. Four boards in photographs are stretched by
-# 0.03, 0.29, 0.00 and 0.05 %, and sheared by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
+# two sides are off a right angle. In photographs of four boards, these are 0.03, 0.24, 0.00 and 0.05 %, and
+# 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
 STRETCH = 1.5e-3
 NOTHING = 1e-7
 """Size of an absent part over the target's size."""
