@@ -115,7 +115,7 @@ def test_std_hold_where_each_view_has_a_focal_length_of_its_own(n_views: int, se
         std.append(found.std["alpha_u"])
         noise.append(noise_std(arrange(points), found))
     rms, told, by_noise = (np.sqrt(np.mean(np.square(values))) for values in (errors, std, noise))
-    assert rms > 2.0 * by_noise
+    assert rms > 1.9 * by_noise
     # 60 draws know the rms to a tenth, and few views are a rough measure.
     assert 0.5 < rms / told < (1.8 if sets < 60 else 1.45)
 
