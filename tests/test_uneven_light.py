@@ -42,7 +42,7 @@ def together(
 def test_vertices_are_measured_through_strong_vignetting(ratio: float) -> None:
     found = together(vignetted(ratio), "vertices", range(3))
     assert found.kept > 0.97  # 0.92 and 0.75
-    assert found.z < 1.4  # 2.3 and 2.6
+    assert found.z < 1.5  # 2.3 and 2.6
 
 
 def test_vertices_are_measured_beside_a_lamp() -> None:
