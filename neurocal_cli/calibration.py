@@ -118,8 +118,8 @@ class Calibration:
     target : Target or None
         The estimated target; None if it was used as given.
     target_stretched : float
-        If the given target was selected: the probability that its print is nevertheless stretched by a few
-        thousandths, which the standard deviations include. 0 if it is below 0.001.
+        If the given target was selected: the probability that its print is nevertheless stretched or leans by
+        a few thousandths, which the standard deviations include. 0 if it is below 0.001.
     judgement : Verdict or callable, optional
         The verdict read from a file, or the function that computes it from this calibration; see `verdict`.
     lens_choice : dict of float by distortion model [px]

@@ -34,7 +34,9 @@ def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
     precision, size, odds, one = 40.0, 0.2, 3.0, np.array([True])
     for value, gradient in ((0.0, 5.0), (0.3, 0.0)):  # left out, and estimated
         left_out = one & (value == 0.0)
-        prior = OpenPrior(one, left_out, np.array([value]), np.array([size]), (np.array([0]),), odds)
+        prior = OpenPrior(
+            one, left_out, np.array([value]), np.array([size]), (np.array([0]),), ({1.0: odds},)
+        )
         x = np.linspace(-6.0, 6.0, 240_001)
         likelihood = np.exp(gradient * (x - value) - 0.5 * precision * (x - value) ** 2)
         absent = np.interp(0.0, x, likelihood)

@@ -36,7 +36,7 @@ def test_a_stretch_that_noise_hides_is_in_the_standard_deviations() -> None:
     assert chosen.target is None
     assert (chosen.K == by_name.K).all()
     assert by_name.target_stretched == 0
-    assert 0.1 < chosen.target_stretched < 0.3
+    assert 0.1 < chosen.target_stretched < 0.6
     off = abs(chosen.K[0, 0] - truth.A[0, 0])
     assert off > 5 * by_name.std["alpha_u"]
     assert off < 5 * chosen.std["alpha_u"]
@@ -99,9 +99,9 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     assert np.sqrt(np.diagonal(found[1]))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
 
 
-def test_the_spread_is_that_of_all_four_models() -> None:
-    """By quadrature, for a stretch that camera and pixels tell apart from the other."""
-    odds, size = open_stretch_module._ODDS, open_stretch_module.STRETCH
+def test_the_spread_is_that_of_all_models() -> None:
+    """By quadrature, for a stretch that camera and pixels tell apart from the lean."""
+    size = open_stretch_module.STRETCH
     variance, told, off = 0.25, np.array([1.2e-3, 0.8e-3]), np.array([2e-3, -0.3e-3])
     S = np.diag([1.0, *(variance / told**2)])
     found = spread_of_stretch(S, np.append(0.0, off * variance / told**2), variance)
@@ -110,7 +110,9 @@ def test_the_spread_is_that_of_all_four_models() -> None:
     absent = 1.0
     for n in (0, 1):
         likelihood = np.exp(-0.5 * ((o - off[n]) ** 2 - off[n] ** 2) / told[n] ** 2)
-        slab = odds * likelihood * np.exp(-0.5 * (o / size) ** 2) / np.sqrt(2 * np.pi) / size * (o[1] - o[0])
+        states = open_stretch_module._ODDS[n].items()
+        prior = sum(odds / (by * size) * np.exp(-0.5 * (o / (by * size)) ** 2) for by, odds in states)
+        slab = likelihood * prior / np.sqrt(2 * np.pi) * (o[1] - o[0])
         total = 1.0 + slab.sum()
         assert found.E[n, n] == pytest.approx((o**2 * slab).sum() / total, rel=1e-6)
         absent /= total
@@ -118,9 +120,9 @@ def test_the_spread_is_that_of_all_four_models() -> None:
 
 
 def test_what_is_negligible_or_no_print_leaves_standard_deviations_as_they_are() -> None:
-    S = np.diag([1.0, 1e12, 1e12])
+    S = np.diag([1.0, 1e14, 1e14])
     assert spread_of_stretch(S, np.zeros(3), 1.0) is None
-    assert spread_of_stretch(S, np.array([0.0, 1e12 * 0.03, 0.0]), 1.0) is None
+    assert spread_of_stretch(S, np.array([0.0, 1e14 * 0.03, 0.0]), 1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -138,12 +140,12 @@ def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("n_views", "most"), [(3, 1.10), (4, 1.05), (5, 1.02), (8, 1.02), (15, 1.02), (40, 1.02)]
+    ("n_views", "most"), [(3, 1.30), (4, 1.08), (5, 1.05), (8, 1.02), (15, 1.02), (40, 1.02)]
 )
 def test_clean_sets_are_about_as_certain_as_on_a_target_given_by_name(n_views: int, most: float) -> None:
     more, z = [], []
     for seed in range(1000, 1100):
-        points, truth = photographed("flat", seed, n_views, sigma=0.3)
+        points, truth = photographed("flat", seed, n_views)
         found, by_name = calibrate(points), calibrate(points, target="given")
         if found.target is None:
             names = ("alpha_u", "alpha_v", "u0", "v0")

@@ -17,7 +17,7 @@ the open coefficients that it estimates, so only the part of E beyond it is adde
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -42,7 +42,7 @@ _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015)
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
-_ODDS = 3.0  # prior odds that a group is present
+_ODDS = {1.0: 3.0}  # prior odds that a group of the typical size is present
 _SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
 
 
@@ -55,7 +55,8 @@ class OpenPrior:
     value: Array  # (o,) reported values of the open unknowns; 0 if they were left out
     size: Array  # (o,) prior std of the open unknowns around 0, if they are present
     groups: tuple[NDArray[np.intp], ...]  # indices of open unknowns that are present or absent together
-    odds: float = _ODDS  # prior odds that a group is present
+    # For each group, the factors of its size that it may have, and the prior odds of each over its absence.
+    odds: tuple[Mapping[float, float], ...]
     scales: tuple[float, ...] = _SCALES  # common factors of all sizes, equally probable
 
 
@@ -169,6 +170,7 @@ def open_coefficients(
         np.where(left_out, 0.0, np.append(np.zeros(int(free[:5].sum())), reported))[is_open],
         size,
         tuple(groups),
+        (_ODDS,) * len(groups),
     )
     return OpenCoefficients(richer, reported, everything, prior)
 
@@ -219,12 +221,14 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> Spr
 
 def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Prior std (m, o) of the open unknowns in each model, 0 if absent; log prior; whether all are absent."""
-    there = np.array(list(product((False, True), repeat=len(prior.groups))))
-    size = np.zeros((len(prior.scales), len(there), len(prior.size)))
-    for group, present in zip(prior.groups, there.T, strict=True):
-        size[..., group] = np.where(present[:, None], np.outer(prior.scales, prior.size[group])[:, None], 0.0)
-    n_there = np.tile(there.sum(axis=1), len(prior.scales))
-    return size.reshape(len(n_there), -1), n_there * np.log(prior.odds), n_there == 0
+    states = [({0.0: 1.0} | dict(own)).items() for own in prior.odds]
+    factors, odds = np.moveaxis(np.array(list(product(*states))), 2, 0)  # (m, number of groups)
+    size = np.zeros((len(prior.scales), len(factors), len(prior.size)))
+    for group, own in zip(prior.groups, factors.T, strict=True):
+        size[..., group] = np.multiply.outer(prior.scales, np.outer(own, prior.size[group]))
+    n = len(prior.scales)
+    logarithm, is_none = np.log(odds).sum(axis=1), ~factors.any(axis=1)
+    return size.reshape(n * len(factors), -1), np.tile(logarithm, n), np.tile(is_none, n)
 
 
 def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:

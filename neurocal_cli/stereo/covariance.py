@@ -187,7 +187,8 @@ def _joined(is_open: Mask, left_out: Mask, priors: list[OpenPrior]) -> OpenPrior
     starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
     groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
     value, size = (np.concatenate(parts) for parts in zip(*((p.value, p.size) for p in priors), strict=True))
-    return OpenPrior(is_open, left_out, value, size, tuple(groups))
+    odds = tuple(own for prior in priors for own in prior.odds)
+    return OpenPrior(is_open, left_out, value, size, tuple(groups), odds)
 
 
 def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:

@@ -1,9 +1,11 @@
 """Uncertainty of the camera that comes from keeping the given target although its print may be stretched.
 
 Noise can hide the stretch of a print, and a stretched print biases the focal length. So if the given target
-was kept, two stretches are open unknowns o: one side longer than stated, and sides that are not
-perpendicular. Each is either absent or has a Gaussian prior with the size typical of prints. The covariance
-is that of model averaging over all four models, around the reported parameters for the given target.
+was kept, two unknowns o are open: a stretch (one side longer than stated) and a lean (sides that are not
+perpendicular). Each is either absent or has a Gaussian prior with the size typical of prints; a lean may also
+be small, as that of most prints. The covariance is that of model averaging over all six models, around the
+reported parameters for the given target.
+
 `bundle_adjustment.open_coefficients` does the same for the lens.
 """
 
@@ -22,11 +24,14 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target import is_flat
-from neurocal_cli.target_shape.prior import STRETCH
+from neurocal_cli.target_shape.prior import LEAN, STRETCH
 
-# Prior odds of each stretch. Larger odds make clean data less certain; with these, the std of few views grows
-# by less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
-_ODDS = 0.2
+# Prior odds of a stretch, and of a small and a large lean, by its size over STRETCH. Larger odds make clean
+# data less certain. With these, the std of alpha from 3, 4, 5 and 8 views grows by 19, 5, 3 and 0.7 % in the
+# median, and that of theta by 31, 16, 12 and 4 %. Without a small lean, these are 4, 1, 0.5 and 0.1 %; but if
+# a flat board stands upright in all views and leans by 0.15 %, theta is off by 4.2 deviations rms and by
+# 14 at most, instead of 2.1 and 5.6. Repeated by tests/test_open_stretch.py and test_target_shape.py (slow).
+_ODDS = ({1.0: 0.2}, {LEAN / STRETCH: 1.0, 1.0: 0.2})
 _NEGLIGIBLE = 1e-3  # probability up to which the standard deviations stay unchanged to the last bit
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together, beyond which it is no stretch of a print
 
@@ -89,7 +94,7 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | Non
     """
     is_open = np.arange(len(g)) >= len(g) - 2
     groups = (np.array([0]), np.array([1]))
-    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, STRETCH), groups, _ODDS, scales=(1.0,))
+    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, STRETCH), groups, _ODDS, (1.0,))
     found = spread_of_open(S, g, variance, prior)
     T = found.follow[:-2]
     left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance

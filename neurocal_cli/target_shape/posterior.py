@@ -32,7 +32,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.prior import NOTHING, STATED, STRETCH, Prior
+from neurocal_cli.target_shape.prior import LEAN, NOTHING, STATED, STRETCH, Prior
 from neurocal_cli.target_shape.system import (
     JointCovariance,
     PointsFirst,
@@ -99,10 +99,6 @@ _START = {
 # Least gain in log evidence with which a stretch or a lean is estimated, as by the odds in `open_stretch`.
 # With 0, errors from five views of bent boards are 5 to 10 % larger (tests/test_simulated_targets.py, slow).
 _SEEN = math.log(5.0)
-# Least size of a lean in the covariance, over that with which it is estimated: most prints lean a little, see
-# `prior.STRETCH`. Without it, theta is off by up to 4 standard deviations if a bent board stands upright in
-# all views and leans by 0.15 % (tests/test_target_shape.py).
-_LEANING = 0.3
 _CERTAIN = 500.0  # largest log odds: more overflows
 _LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 _MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
@@ -358,7 +354,7 @@ class _Climb:
             precision = 1.0 / (p * (v + squared)) - (1.0 / v - 1.0)
             share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
             if self.names[part] == "lean":
-                share = max(share, _LEANING)
+                share = max(share, LEAN / STRETCH)
             ratios[part] = max(share * self.of_prints[0] / noise, now.ratios[part])
         return self.at(ratios) if (ratios > now.ratios).any() else now
 
