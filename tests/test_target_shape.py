@@ -36,7 +36,8 @@ PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 TOO_SIMPLE = tuple(
     (seed, n_views, k1) for seed in (1, 2, 3) for n_views in (3, 5, 15) for k1 in (-0.2, -0.05, 0.03, 0.1)
 )
-SIZES = {"curl": 0.3, "lean": 0.2, "bend": 0.3, "stretch": 0.2, "warp": 0.1, "place": 0.05, "height": 0.04}
+_OUT_OF_PLANE = {"curl": 0.3, "twist": 0.1, "bend": 0.3, "height": 0.04}
+SIZES = _OUT_OF_PLANE | {"lean": 0.2, "stretch": 0.2, "warp": 0.1, "place": 0.05}
 
 
 def minimum(points: Correspondences, model: str = "k1k2") -> tuple[Problem, Adjusted]:

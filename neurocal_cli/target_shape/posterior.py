@@ -84,11 +84,12 @@ class Posterior:
         return joint().poses(gauge)
 
 
-_OUT_OF_PLANE = ("curl", "bend", "height")
+_OUT_OF_PLANE = ("curl", "twist", "bend", "height")
 _SWITCHED = ("stretch", "lean")
 _START = {
     "fold": 3e-3,
     "curl": 3e-3,
+    "twist": 3e-3,
     "bend": 3e-3,
     "stretch": STRETCH,
     "lean": STRETCH,

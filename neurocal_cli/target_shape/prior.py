@@ -3,7 +3,8 @@
 Each part of the offsets has a Gaussian prior, whose size is estimated from the data (`posterior`):
 
 - fold: rigid motion of a plane of a folded target;
-- curl: a quadratic surface out of the plane, as of paper that curls (`bends`);
+- curl: a parabola out of the plane along each side, as of paper that curls (`bends`);
+- twist: out of the plane, opposite corners to the same side;
 - bend: smooth, out of the plane;
 - warp: smooth, in the plane;
 - stretch: one side longer than stated, and the other shorter;
@@ -195,11 +196,19 @@ def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
     if not flat:
         return [("warp", np.concatenate([warp, bend], axis=2))]
     x, y = places[:, 0], places[:, 1]
-    curl, stretch, lean = np.zeros((n, 3, 3)), np.zeros((n, 3, 1)), np.zeros((n, 3, 1))
-    curl[:, 2] = np.column_stack([np.sqrt(2.0) * (x * x + y * y), x * x - y * y, 2 * x * y])
+    curl, twist, stretch, lean = (np.zeros((n, 3, k)) for k in (2, 1, 1, 1))
+    curl[:, 2] = np.column_stack([np.sqrt(2.0) * (x * x + y * y), x * x - y * y])
+    twist[:, 2, 0] = 2 * x * y
     stretch[:, 0, 0], stretch[:, 1, 0] = x, -y
     lean[:, 0, 0], lean[:, 1, 0] = y, x
-    return [("curl", curl), ("bend", bend), ("warp", warp), ("stretch", stretch), ("lean", lean)]
+    return [
+        ("curl", curl),
+        ("twist", twist),
+        ("bend", bend),
+        ("warp", warp),
+        ("stretch", stretch),
+        ("lean", lean),
+    ]
 
 
 def _as_a_whole(centred: Array, axes: Array) -> Array:
