@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -252,7 +252,6 @@ class Search:
             # The next step would be shorter than this one by the same factor as this one than the last.
             settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
             last = length
-            before = self._common()
             states = self._moved(found, info)
             if states is None:
                 return None
@@ -270,9 +269,7 @@ class Search:
         stretch, lean = target.sides()
         if not (stretch < self.most_stretched and lean < _LEANING):
             return None
-        whole = self._aligned_quadratic(folded.whole, before)
-        posterior_here = partial(posterior_of, target, whole, self.prior)
-        return Found(target, tuple(self.fits), found.evidence, posterior_here)
+        return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
 
     def _without(self, info: Information) -> float:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
@@ -293,20 +290,20 @@ class Search:
         """With bends, add their prior."""
         return info if self.surface is None else info.held(self.precision)
 
+    def _posterior_of(self, target: Target, found: Posterior) -> Callable[[float], Posterior]:
+        """The posterior of the estimated target for a variance of the noise [px^2].
+
+        Without bends, that of the last step is taken, which has nearly this variance and alignment.
+        """
+        if self.surface is None:
+            opened = cache(found.opened)
+            return lambda variance: opened()
+        info = self._in_offsets(information_of(self.sights(), len(self.given)))
+        return partial(posterior_of, target, info, self.prior)
+
     def _in_offsets(self, info: Information) -> Information:
         """The quadratic around the current target, in the whole offsets along each point's axes."""
         return info.turned(self.prior.axes).around_given(self.offsets)
-
-    def _aligned_quadratic(self, info: Information, world: Array) -> Information:
-        """The quadratic in the whole offsets around common points (n, 3), aligned as the found target is.
-
-        A similarity of the target moves and scales the poses with it, and changes nothing else.
-        """
-        if self.surface is not None:  # a similarity changes the shapes of bends
-            return self._in_offsets(information_of(self.sights(), len(self.given)))
-        s, R, t = self._nearest(world)
-        offsets = self.prior.along_axes(s * world @ R.T + t - self.given)
-        return info.turned(R.T @ self.prior.axes / s).around_given(offsets)
 
     def sights(self) -> list[Sight]:
         """Observations of each camera for the current target."""

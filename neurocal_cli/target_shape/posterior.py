@@ -56,6 +56,15 @@ class Posterior:
     evidence: float  # log evidence, with a flat prior on the cameras' normalised parameters
     # The covariance of cameras, offsets and poses and the gauge (3 n, g); None if the points stay as given.
     joint: tuple[Callable[[], JointCovariance], Array] | None = None
+    # Camera and joint covariance with stretch and lean as far as noise may hide them; None if they are that.
+    with_open: Callable[[], tuple[Array, Callable[[], JointCovariance]]] | None = None
+
+    def opened(self) -> Posterior:
+        """The same with a covariance that contains stretch and lean as far as noise may hide them."""
+        if self.joint is None or self.with_open is None:
+            return self
+        camera, joint = self.with_open()
+        return replace(self, camera=camera, joint=(joint, self.joint[1]), with_open=None)
 
     @property
     def followed(self) -> Array:
@@ -217,10 +226,7 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     residuals. Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     climb = _Climb(info, prior, system_of(info, prior))
-    ratios = prior.as_array(sizes) / math.sqrt(variance)
-    now = climb.at(ratios)
-    found, wider = climb.posterior(now), climb.with_open(now).solved
-    found = replace(found, camera=wider.camera, joint=(wider.joint, climb.gauge))
+    found = climb.posterior(climb.at(prior.as_array(sizes) / math.sqrt(variance))).opened()
     return found if prior.stated is None else replace(found, variance=variance)
 
 
@@ -322,18 +328,19 @@ class _Climb:
         size = float(now.ratios[part]) * math.sqrt(now.variance)
         return size > math.sqrt(self.of_prints[0] * self.least[0])
 
-    def changed(self, now: _Solution, part: int, ratio: float) -> _Solution:
-        """The solution with another size of one part, for which the system need not be solved again."""
+    def changed(self, now: _Solution, new: Mapping[int, float]) -> _Solution:
+        """The solution with new ratios of some parts, for which the system need not be solved again."""
         ratios = now.ratios.copy()
-        ratios[part] = ratio
-        return self._solution(ratios, now.solved.changed(self._named(ratios), self.names[part]))
+        ratios[list(new)] = list(new.values())
+        names = [self.names[part] for part in new]
+        return self._solution(ratios, now.solved.changed(self._named(ratios), names))
 
     def on_or_off(self, now: _Solution, part: int) -> _Solution:
         """The solution with or without a stretch or a lean, whichever is more probable."""
         on = self.is_on(now, part)
         size = self.least[0] if on else self.of_prints[0]
         wanted = now.evidence + (-_SEEN if on else _SEEN)
-        other = self.climbed(self.changed(now, part, size / math.sqrt(now.variance)), wanted)
+        other = self.climbed(self.changed(now, {part: size / math.sqrt(now.variance)}), wanted)
         return other if other.evidence > wanted else now
 
     def with_open(self, now: _Solution) -> _Solution:
@@ -343,11 +350,11 @@ class _Climb:
         posterior mean m and variance v, and the other unknowns would follow it. Averaged over both, its
         second moment around 0 is ``p (v + m^2)``, which is its posterior variance for some smaller prior.
         """
-        ratios, noise = now.ratios.copy(), math.sqrt(now.variance)
+        noise, wider = math.sqrt(now.variance), {}
         for part in self.switched:
             if self.is_on(now, part):
                 continue
-            on = self.changed(now, part, self.of_prints[0] / noise)
+            on = self.changed(now, {part: self.of_prints[0] / noise})
             # In units of the prior's variance.
             v = max(1.0 - float(on.solved.parts.determined[part]), _LEAST_SHARE)
             squared = float(on.solved.parts.squares[part]) / on.variance
@@ -356,8 +363,10 @@ class _Climb:
             share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
             if self.names[part] == "lean":
                 share = max(share, LEAN / STRETCH)
-            ratios[part] = max(share * self.of_prints[0] / noise, now.ratios[part])
-        return self.at(ratios) if (ratios > now.ratios).any() else now
+            ratio = share * self.of_prints[0] / noise
+            if ratio > now.ratios[part]:
+                wider[part] = ratio
+        return self.changed(now, wider) if wider else now
 
     def climbed(self, now: _Solution, wanted: float = -math.inf) -> _Solution:
         """Ascend to the most probable sizes, unless they will not have the wanted log evidence."""
@@ -401,8 +410,13 @@ class _Climb:
 
     def posterior(self, now: _Solution) -> Posterior:
         solved, noise = now.solved, math.sqrt(now.variance)
+
+        def with_open() -> tuple[Array, Callable[[], JointCovariance]]:
+            wider = self.with_open(now).solved
+            return wider.camera, wider.joint
+
         return Posterior(
-            offsets=solved.offsets,
+            offsets=solved.offsets(),
             variance=now.variance,
             camera_step=solved.camera_step,
             camera=solved.camera,
@@ -410,4 +424,5 @@ class _Climb:
             determined=float(solved.parts.determined.sum()),
             evidence=now.evidence,
             joint=(solved.joint, self.gauge),
+            with_open=with_open,
         )

@@ -39,14 +39,14 @@ class Solved:
     """The minimum of the quadratic, and the covariance for unit noise."""
 
     camera_step: Array  # (f,)
-    offsets: Array  # (n, 3) whole offsets
+    offsets: Callable[[], Array]  # (n, 3) whole offsets
     cost: float
     logdet: float  # log determinant of the whole matrix over that of the prior's precisions
     parts: Parts
     camera: Array  # (f, f) covariance of the cameras
     joint: Callable[[], JointCovariance]
-    # The same after a change of one linear part, with the sizes of all parts and the name of that one.
-    changed: Callable[[Mapping[str, float], str], Solved]
+    # The same after a change of some linear parts, with the sizes of all parts and the names of those.
+    changed: Callable[[Mapping[str, float], Sequence[str]], Solved]
 
 
 @frozen_dataclass(eq=False)
@@ -148,9 +148,9 @@ class PosesFirst:
         def covariance(factors: Array) -> Array:
             return _squared(root[:, self.f :] @ factors)
 
-        def changed(ratios: Mapping[str, float], name: str) -> Solved:
+        def changed(ratios: Mapping[str, float], names: Sequence[str]) -> Solved:
             """By the formula of Woodbury, because only a few precisions change."""
-            places = self.coordinates.groups[name]
+            places = np.concatenate([self.coordinates.groups[name] for name in names])
             after, rows = self.coordinates.variances(ratios)[places], self.f + places
             across, gain = root.T @ root[:, rows], np.diag(1.0 / after - 1.0 / prior[places])
             factor = np.eye(len(rows)) + gain @ across[rows]
@@ -159,6 +159,12 @@ class PosesFirst:
 
             def changed_covariance(of_rows: Array) -> Array:
                 return np.asarray(of_rows.T @ inner @ of_rows)
+
+            def joint() -> JointCovariance:
+                try:  # larger variances add rows to the root of the covariance
+                    return self._joint(np.concatenate([root, np.linalg.cholesky(-inner).T @ across.T]))
+                except np.linalg.LinAlgError:
+                    return self.solve(ratios).joint()
 
             more = np.linalg.slogdet(factor)[1] + np.log(after / prior[places]).sum()
             return self._solved(
@@ -169,8 +175,8 @@ class PosesFirst:
                 logdet + float(more),
                 camera.T @ camera - by_inner[: self.f] @ across[: self.f].T,
                 lambda factors: covariance(factors) - changed_covariance(across[self.f :].T @ factors),
-                cache(lambda: self.solve(ratios).joint()),
-                lambda new, other: self.solve(ratios).changed(new, other),
+                cache(joint),
+                lambda new, others: changed(new, list(dict.fromkeys([*names, *others]))),
             )
 
         return self._solved(
@@ -188,13 +194,13 @@ class PosesFirst:
         camera: Array,
         covariance: Callable[[Array], Array],
         joint: Callable[[], JointCovariance],
-        changed: Callable[[Mapping[str, float], str], Solved],
+        changed: Callable[[Mapping[str, float], Sequence[str]], Solved],
     ) -> Solved:
         """The solution with the unknowns x, which have these variances."""
         f, coordinates = self.f, self.coordinates
         prior = coordinates.units * coordinates.prior.as_array(ratios) ** 2
         return Solved(
-            x[:f], coordinates.offsets(x[f:]), cost, logdet,
+            x[:f], lambda: coordinates.offsets(x[f:]), cost, logdet,
             Parts.of(prior, x[f:], variances[f:], covariance), camera, joint, changed,
         )  # fmt: skip
 
@@ -320,7 +326,7 @@ class PointsFirst:
         unknowns = np.concatenate([x[f:s], e.ravel()])
         prior = self.prior.units * self.prior.as_array(ratios) ** 2
         return Solved(
-            x[:f], self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
+            x[:f], lambda: self.prior.basis @ x[f:s] + e, float(M[-1, -1] - half @ half), logdet + of_rest,
             Parts.of(prior, unknowns, variances, covariance),
             camera.T @ camera, joint, lambda new, _: self.solve(new),
         )  # fmt: skip
