@@ -22,7 +22,7 @@ from neurocal_cli.target_shape.coordinates import coordinates_of
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Parts, Prior
 
-_SMALL = 48  # largest triangular matrix that is inverted directly; others are split in halves
+_SMALL = 32  # largest matrix whose Cholesky factor is inverted directly; others are split in halves
 _ROUNDING = 1e-12  # of the largest diagonal element
 _LEAST_NOISE = 0.01  # of the variance with the given points
 # The start of a variance that is estimated as negative, which an absent part is as often as not, over the
@@ -428,32 +428,29 @@ def _squared(rows: Array) -> Array:
 
 def _least(M: Array, right: Array, cost: float) -> tuple[float, float]:
     """Cost at the minimum of a quadratic, and the log determinant of its matrix."""
-    factor = _cholesky(M)
-    part = np.linalg.solve(factor, right)
-    return cost - float(part @ part), 2 * float(np.log(np.diagonal(factor)).sum())
+    root, logdet = _root_of_inverse(M)
+    part = root @ right
+    return cost - float(part @ part), logdet
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
     """A factor R of the inverse R^T R, and the log determinant of the matrix."""
-    root = _cholesky(M)
-    _invert_triangular(root)
+    root = np.zeros_like(M)
+    try:
+        _fill_root(M, root)
+    except np.linalg.LinAlgError:  # nearly degenerate coefficients, such as xi and alpha
+        _fill_root(M + np.diag(_RIDGE * np.diagonal(M)), root)
     return root, -2 * float(np.log(np.diagonal(root)).sum())
 
 
-def _cholesky(M: Array) -> Array:
-    try:
-        return np.asarray(np.linalg.cholesky(M))
-    except np.linalg.LinAlgError:  # nearly degenerate coefficients, such as xi and alpha
-        diagonal = np.diagonal(M)
-        return np.asarray(np.linalg.cholesky(M + np.diag(_RIDGE * diagonal)))
-
-
-def _invert_triangular(L: Array) -> None:
-    """Invert a lower triangular matrix in place, by halves: in a third of the time of NumPy's inverse."""
-    n, h = len(L), len(L) // 2
+def _fill_root(M: Array, root: Array) -> None:
+    """The inverse of the Cholesky factor, by halves: in two thirds of the time of NumPy's functions."""
+    n, h = len(M), len(M) // 2
     if n <= _SMALL:
-        L[...] = np.linalg.inv(L)
+        root[...] = np.linalg.inv(np.linalg.cholesky(M))
         return
-    _invert_triangular(L[:h, :h])
-    _invert_triangular(L[h:, h:])
-    np.matmul(-L[h:, h:], L[h:, :h] @ L[:h, :h], out=L[h:, :h])
+    first, last = root[:h, :h], root[h:, h:]
+    _fill_root(M[:h, :h], first)
+    L = M[h:, :h] @ first.T
+    _fill_root(M[h:, h:] - L @ L.T, last)
+    np.matmul(-last, L @ first, out=root[h:, :h])
