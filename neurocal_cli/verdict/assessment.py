@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,9 @@ from neurocal_cli.verdict.proportions import Proportions, proportions
 from neurocal_cli.verdict.rules import reach_verdict
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
+
+if TYPE_CHECKING:
+    from neurocal_cli.verdict.moving_centre import MovingCentre
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
@@ -208,6 +212,7 @@ class _AtMinimum:
             poses=self.repeated.n_poses,
             # Sigmas that are wrong give single points the weight that all this is computed with.
             change=None if stated else self._change(noise),
+            centre=None if stated else self._centre(contradiction),
             board=None if stated else self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
@@ -310,6 +315,16 @@ class _AtMinimum:
             return change
         # A board that bends differently in each view mimics two slightly different groups of views.
         return None if abs(change.amount) < _BY_FLEXING else change
+
+    def _centre(self, contradiction: float) -> MovingCentre | None:
+        # The rays of a wide lens do not meet in one point, and a rich lens takes in every error.
+        special = self.camera.distortion.wide or self.state.model == "rich"
+        if special or not self.free_poses or self._is_exact():
+            return None
+        from neurocal_cli.verdict.moving_centre import moving_centre
+
+        q = reduced(self.normal, self.free, self.free_poses)
+        return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
 
     def _board(self) -> BoardShape | None:
         if not self.free[0] or not self.free_poses or self.calibration.target is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from neurocal_cli.verdict.findings import Finding, Limit, name_some
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
+
+if TYPE_CHECKING:
+    from neurocal_cli.verdict.moving_centre import MovingCentre
 
 # Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
@@ -43,7 +46,13 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
     whether the target was estimated.
     """
     change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
-    missing = evidence.missing
+    missing, centre = evidence.missing, evidence.centre
+    if centre is not None and not any(
+        other is not None and other.explained > _NEARLY * centre.explained
+        for other in (change, board, groups, missing)
+    ):
+        yield _moving(centre)
+        return
     if missing is not None and _explains(missing.explained, evidence):
         # Residual distortion looks like a bent board, and like several cameras.
         least = missing.explained
@@ -60,6 +69,15 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
     # A bent board makes views differ significantly as well; duplicated rows exaggerate the significance.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
         yield _changed(change, wide)
+
+
+def _moving(centre: MovingCentre) -> Finding:
+    return (
+        1,
+        f"the image centre moves from view to view, by about {centre.size:.2g} px, as image stabilisation "
+        "moves it",
+        "switch image stabilisation off, or expect that predicted pixels are off by as much",
+    )
 
 
 def _too_simple(missing: MissingCoefficients) -> Finding:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
@@ -13,10 +15,13 @@ from neurocal_cli.verdict.proportions import Proportions
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
+if TYPE_CHECKING:
+    from neurocal_cli.verdict.moving_centre import MovingCentre
+
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """Measures of a calibration's quality; the last five are None if there is nothing of the kind."""
+    """Measures of a calibration's quality; the last six are None if there is nothing of the kind."""
 
     rmse_px: float  # rms reprojection error of the calibration
     held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
@@ -42,6 +47,7 @@ class Evidence:
     poses: int  # number of different poses among the views (`repeated_poses`)
     groups: ViewGroups | None  # two cameras among the views, or a changing focal length
     change: ViewChange | None  # of the camera between views
+    centre: MovingCentre | None  # moving from view to view
     board: BoardShape | None  # bend or stretch of a target that is given as flat
     missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks
     proportions: Proportions | None  # of a board whose axes have different units

@@ -100,7 +100,7 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     # A common error explains the others, so it is reported first even if it hardly biases the camera.
     wide, estimated = calibration.camera.distortion.wide, calibration.target is not None
     for grade, reason, advice in common_errors(evidence, calibration.unit, wide, estimated):
-        yield max(grade, int(bool(errors))), reason, advice
+        yield max([grade, *(of_error for of_error, *_ in errors)]), reason, advice
     yield from errors
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)

@@ -269,6 +269,9 @@ FLAT: dict[str, Spoiler] = {
     "two cameras mixed": lambda p, rng: of_cameras([600.0, 800.0]),
     "two cameras mixed, 5 % apart": lambda p, rng: of_cameras([600.0, 630.0]),
     "zoom changing from view to view": lambda p, rng: of_cameras([560.0, 600.0, 640.0, 700.0]),
+    "image stabilisation on": lambda p, rng: moved(
+        p, pixels=p.pixels + (8 * rng.normal(size=(10, 2)))[p.view_index]
+    ),
     "half of the images cropped": lambda p, rng: of_cameras([600.0], shift=-60.0),
     "half of the images at half size": lambda p, rng: moved(
         p, pixels=np.where(in_views(p, range(5))[:, None], p.pixels / 2, p.pixels)
@@ -434,6 +437,7 @@ CAUSES: dict[str, str] = {
     "two cameras mixed": "two cameras",
     "two cameras mixed, 5 % apart": "two cameras",
     "zoom changing from view to view": "the focal length changes from view to view",
+    "image stabilisation on": "the image centre moves from view to view",
     "half of the images cropped": "one part is cropped",
     "half of the images at half size": "of two sizes",
     "one image of another zoom": "view09 (it fits another zoom",
