@@ -55,7 +55,9 @@ def moving_centre(
     The state is normalised, at the minimum, q are the quadratics of the views (V,) in the free parameters,
     `spare` are the equations beyond the unknowns, and `contradiction` is the rms error over the noise floor.
     """
-    if len(q.cost) < _FEWEST or not free[[0, 2, 3, 4]].all() or not contradiction > 1:
+    if len(q.cost) < _FEWEST or not free[[0, 2, 3, 4]].all():
+        return None
+    if not spare * np.log(contradiction) > _GAIN:  # no more can be gained than down to the noise floor
         return None
     variance = float(q.cost.sum()) / spare
     changes = {name: _Effect.of(q, step[free]) for name, step in _changes(views, state)}
