@@ -14,6 +14,8 @@ import numpy as np
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.odd_points import view_of_another_unit
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, free_pose_variance
 from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
@@ -75,7 +77,7 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     lens = provisional(start, joints, options)
     x = start.controls
     each = np.array([member.nets.local(x) for member in lens.members])
-    _refuse_contradiction(lens, each)
+    _refuse_contradiction(lens, each, start.lens.points)
     refuse_gaps(lens, start.lens.points.source)
     local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
@@ -91,15 +93,16 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     return replace(finished, warnings=_warnings(finished, start, tables_rms))
 
 
-def _refuse_contradiction(lens: ZoomLens, each: Array) -> None:
+def _refuse_contradiction(lens: ZoomLens, each: Array, points: Correspondences) -> None:
     """Refuse networks with outputs (M, S, L) that are no valid camera at one of their own settings."""
     valid = (np.isfinite(each).all(axis=2) & (each[:, :, :2] > 0).all(axis=2)).all(axis=0)
     if valid.all():
         return
     where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
+    why = view_of_another_unit(points) or f"the networks give no camera at {where}"
     raise DegenerateGeometryError(
-        f"no lens fits all the settings: the networks give no camera at {where}; check the names, the unit "
-        "of X,Y,Z and the image size of every setting"
+        f"no lens fits all the settings: {why}; check the names, the unit of X,Y,Z and the image size of "
+        "every setting"
     )
 
 
