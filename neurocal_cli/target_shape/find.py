@@ -49,6 +49,7 @@ _DENSE, _MOST_DENSE = 600, 3000
 _FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
 _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
+_NOT_YET = 5.0  # log evidence that another step may add
 _SETTLED = 0.02  # of the cameras' standard deviations
 _STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
@@ -91,18 +92,19 @@ def find_target(
     flat: bool = False,
     known: Target | None = None,
     least_gain: float = -np.inf,
+    least: float = -np.inf,
 ) -> Found | None:
     """Estimate the true positions of a target's points, from cameras at their minimum.
 
     Points with equal coordinates are the same. Flat means that they stay in their planes. `known` is an
     estimated target whose coordinates the points have already; the search starts from it. It ends early if
-    the gain in log evidence will be smaller than `least_gain`. None if the points do not determine a target,
-    or if the result is too different from the given one.
+    the gain in log evidence will be smaller than `least_gain`, or the log evidence than `least`. None if the
+    points do not determine a target, or if the result is too different from the given one.
     """
     some = _few_enough(fits, known)
     if some is None:
         return None
-    found = Search(some, flat, known).result(least_gain)
+    found = Search(some, flat, known).result(least_gain, least)
     return found if found is None or some is fits else _of_all_views(found, fits, known)
 
 
@@ -207,15 +209,15 @@ class Search:
         self.bends = np.zeros((len(names), N_SHAPES)) if bends is None else bends.of_views(names)
         self.precision = 1.0
 
-    def result(self, least_gain: float) -> Found | None:
+    def result(self, least_gain: float, least: float = -np.inf) -> Found | None:
         """As for `find_target`."""
         try:
             with np.errstate(all="ignore"):
-                return self._run(least_gain)
+                return self._run(least_gain, least)
         except np.linalg.LinAlgError:
             return None
 
-    def _run(self, least_gain: float) -> Found | None:
+    def _run(self, least_gain: float, least: float) -> Found | None:
         """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
         last = 0.0
@@ -246,6 +248,8 @@ class Search:
                 )
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
+            if known and found.evidence < least - _NOT_YET:
+                return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
             length = float((np.abs(found.camera_step) / std).max(initial=0.0))
@@ -260,7 +264,7 @@ class Search:
             self._place(states)
         assert states is not None
         without = self._without(info)
-        if found.evidence - without < least_gain or not self._adjust(self._aligned(states)):
+        if found.evidence < max(least, without + least_gain) or not self._adjust(self._aligned(states)):
             return None
         if not self._passes_cross_validation(found, parts):
             return None

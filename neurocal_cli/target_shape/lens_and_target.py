@@ -37,24 +37,25 @@ def find_lens_and_target(
         return None
     for step, least in ((1, _RICHER), (-1, _SIMPLER)):
         moved = False
-        while (other := _with_other_lens(best, step, flat)) is not None:
-            if not other.evidence > best.evidence + least:
-                break
+        while (other := _with_other_lens(best, step, flat, best.evidence + least)) is not None:
             best, moved = other, True
         if moved:
             break
     return best
 
 
-def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
-    """Estimate the target with every camera's next distortion model; None at the end of the chain."""
+def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found | None:
+    """Estimate the target with every camera's next distortion model.
+
+    None at the end of the chain, or if the log evidence is not larger than `least`.
+    """
     fits = []
     for problem, adjusted in found.fits:
         place = _PLACES.get(adjusted.state.model, -2) + step
         if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
             return None
         fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
-    return find_target(fits, flat, found.target)
+    return find_target(fits, flat, found.target, least=least)
 
 
 def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
