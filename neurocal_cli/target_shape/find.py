@@ -51,7 +51,6 @@ _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _NOT_YET = 5.0  # log evidence that another step may add
 _SETTLED = 0.02  # of the cameras' standard deviations
-_STRETCH_STEPS = 2  # steps in which a stretch is tried and left out; it does not change later
 _LARGEST = 0.02  # largest offset over the target's size; more is another target
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
 # estimated target below the first limit may move slightly beyond it when the lens is selected again.
@@ -243,9 +242,7 @@ class Search:
                         WithoutPoses(part, np.flatnonzero(folded.fold == k))
                         for k, part in enumerate(folded.parts(info, self._in_offsets))
                     ]
-                found = posterior(
-                    info, self.prior, self.sizes, self.flat, noise, step < _STRETCH_STEPS, parts
-                )
+                found = posterior(info, self.prior, self.sizes, self.flat, noise, step == 0, parts)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             if known and found.evidence < least - _NOT_YET:

@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.target import distinct_points, is_flat, planes_of
+from neurocal_cli.target import Target, distinct_points, is_flat, planes_of
 from neurocal_cli.target_shape.bend_evidence import most_probable_precision
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search
 from neurocal_cli.target_shape.information import of_views, without_points
@@ -26,9 +26,9 @@ def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | N
     `common` is the estimated common shape of the board, if there is one. It is returned if the evidence for
     bends is not clear.
     """
-    if not _may_bend(fit[0]):
-        return common
     known = None if common is None else common.target
+    if not _may_bend(fit[0], known):
+        return common
     try:
         rigid, bent = _promise(Search([fit] if common is None else common.fits, False, known, bending=True))
     except np.linalg.LinAlgError:  # the points do not determine the camera
@@ -45,10 +45,15 @@ def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | N
     return common if best is None or best.evidence < least else best
 
 
-def _may_bend(problem: Problem) -> bool:
-    """Whether there are enough views of a single plane, without measured distances."""
+def _may_bend(problem: Problem, known: Target | None) -> bool:
+    """Whether there are enough views of a single plane, without measured distances.
+
+    `known` is the estimated target, if there is one.
+    """
     if not problem.free_poses or problem.views.n_views < _FEWEST or problem.points.distances:
         return False
+    if known is not None:
+        return is_flat(known.given) and not known.plane.any()
     given, _, ids = distinct_points([problem.points])
     return is_flat(given) and not planes_of(given, ids).any()
 
