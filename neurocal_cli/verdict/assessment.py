@@ -324,7 +324,10 @@ class _AtMinimum:
         from neurocal_cli.verdict.moving_centre import moving_centre
 
         q = reduced(self.normal, self.free, self.free_poses)
-        return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
+        try:
+            return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
+        except np.linalg.LinAlgError:  # the views do not determine the camera
+            return None
 
     def _board(self) -> BoardShape | None:
         if not self.free[0] or not self.free_poses or self.calibration.target is not None:
