@@ -52,8 +52,10 @@ def moving_centre(
 ) -> MovingCentre | None:
     """Find a centre that moves between the views; None if nothing shows that it does.
 
-    The state is normalised, at the minimum, q are the quadratics of the views (V,) in the free parameters,
-    `spare` are the equations beyond the unknowns, and `contradiction` is the rms error over the noise floor.
+    The state is normalised, at the minimum, `free` (5 + K,) are the estimated ones of A's entries and the
+    coefficients, q are the quadratics of the V views in these, `spare` are the equations beyond the unknowns,
+    and `contradiction` is the rms error over the noise floor. Raises `numpy.linalg.LinAlgError` if the views
+    do not determine the camera.
     """
     if len(q.cost) < _FEWEST or not free[[0, 2, 3, 4]].all():
         return None
@@ -100,9 +102,8 @@ class _Effect:
         values, vectors = np.linalg.eigh(step.T @ by_step[:, :-1])
         values = np.maximum(values, 0.0).ravel()
         along = np.swapaxes(by_step @ vectors, 1, 2).reshape(len(values), -1)
-        f = len(step)
-        M = np.empty((f + 1, f + 1))
-        M[:f, :f], M[f, :f], M[:f, f], M[f, f] = q.S.sum(axis=0), *(2 * [q.g.sum(axis=0)]), q.cost.sum()
+        g = q.g.sum(axis=0)
+        M = np.block([[q.S.sum(axis=0), g[:, None]], [g[None], q.cost.sum()]])
         return cls(values, along, least_by_precision(M, values, along))
 
     def gains(self, variance: float, spare: float) -> Array:
