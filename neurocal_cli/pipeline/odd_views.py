@@ -82,6 +82,11 @@ def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondence
     """Hypotheses about errors in a view's rows, each with the rows corrected for it."""
     pixels, world = points.pixels, points.world
     yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1])
+    if points.image_size is not None:
+        yield (
+            "its image is turned by 180 degrees against the others",
+            replace(points, pixels=np.array(points.image_size) - 1 - pixels),
+        )
     for scale, name in ((2.0, "half"), (0.5, "twice")):
         yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5)
     for axis, name in ((0, "u"), (1, "v")):

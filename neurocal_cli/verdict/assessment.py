@@ -9,6 +9,7 @@ Everything is computed from the calibration and its points, so a file can be jud
 * the correlation of neighbouring residuals (`residual_correlation`);
 * two cameras among the views, or a changing focal length (`view_groups`);
 * a board whose axes have different units (`proportions`);
+* an image centre that moves (`moving_centre`), and images turned by 180 degrees (`turned_images`);
 * coefficients that the chosen distortion model lacks (`missing_coefficients`);
 * given parameters that the points contradict (`given_parameters`);
 * the coverage of the image and of directions by the points (`coverage`);
@@ -213,6 +214,7 @@ class _AtMinimum:
             # Sigmas that are wrong give single points the weight that all this is computed with.
             change=None if stated else self._change(noise),
             centre=None if stated else self._centre(contradiction),
+            turned=() if stated else self._turned(contradiction),
             board=None if stated else self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
@@ -235,8 +237,7 @@ class _AtMinimum:
         target, p = self.calibration.target, {"p1", "p2"} - given
         if target is None and not rich and p.isdisjoint(coefficient_names(self.state.model)):
             return found
-        points = self.points if target is None else target.as_given(self.points)
-        views = self.views if target is None else self._arranged(points)
+        points, views = self._as_given()
         simpler: tuple[Reestimated, ...] = ()
         if not rich:
             state = normalised(self.given, views)
@@ -328,6 +329,26 @@ class _AtMinimum:
             return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
         except np.linalg.LinAlgError:  # the views do not determine the camera
             return None
+
+    def _turned(self, contradiction: float) -> tuple[str, ...]:
+        size, special = self.points.image_size, self._is_exact() or self.state.model == "rich"
+        if size is None or special or not (self.free_poses and self.free[3:5].all()):
+            return ()
+        from neurocal_cli.verdict.turned_images import can_show, turned_images
+
+        if not can_show(self.views.n_views, contradiction, self.spare):
+            return ()
+        _, views = self._as_given()
+        try:
+            return turned_images(views, normalised(self.given, views), self.free, size, self.spare)
+        except np.linalg.LinAlgError:  # the views do not determine the camera
+            return ()
+
+    def _as_given(self) -> tuple[Correspondences, Views]:
+        """The points at the coordinates of the given target, also arranged by views."""
+        target = self.calibration.target
+        points = self.points if target is None else target.as_given(self.points)
+        return points, self.views if target is None else self._arranged(points)
 
     def _board(self) -> BoardShape | None:
         if not self.free[0] or not self.free_poses or self.calibration.target is not None:

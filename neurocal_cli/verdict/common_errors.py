@@ -45,6 +45,9 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
     A wide lens may have no single centre of projection. `unit` is that of the world, and `estimated` tells
     whether the target was estimated.
     """
+    if evidence.turned:
+        yield _turned(evidence.turned)
+        return
     change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
     missing, centre = evidence.missing, evidence.centre
     if centre is not None and not any(
@@ -69,6 +72,14 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
     # A bent board makes views differ significantly as well; duplicated rows exaggerate the significance.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
         yield _changed(change, wide)
+
+
+def _turned(names: tuple[str, ...]) -> Finding:
+    return (
+        2,
+        f"{name_some(names)}: turned by 180 degrees against the other images, so their centre is mirrored",
+        "give all images as the camera has stored them, without turning them upright",
+    )
 
 
 def _moving(centre: MovingCentre) -> Finding:

@@ -48,6 +48,7 @@ class Evidence:
     groups: ViewGroups | None  # two cameras among the views, or a changing focal length
     change: ViewChange | None  # of the camera between views
     centre: MovingCentre | None  # moving from view to view
+    turned: tuple[str, ...]  # images that are turned by 180 degrees against the others
     board: BoardShape | None  # bend or stretch of a target that is given as flat
     missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks
     proportions: Proportions | None  # of a board whose axes have different units

@@ -31,6 +31,7 @@ _MORE = 1.5  # and over that of any other change
 _EXCESS = 0.7  # least share of the squared error above the noise floor that it explains
 _FEWEST = 5  # fewest views
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 40))  # over the focal length
+_FREE = 1e-12  # precision of a shift that is free
 _FAR = 5.0  # largest shift of a view over the rms of the other views: more is a single odd view
 
 
@@ -74,6 +75,12 @@ def moving_centre(
         return None
     size = np.sqrt(left / spare / precision)  # the variance of the noise is what is left
     return MovingCentre(float(size * state.entries[0, 0] * views.pixel_scale), explained)
+
+
+def least_with_own_centres(views: Views, state: CameraState, free: NDArray[np.bool_], q: Quadratics) -> float:
+    """Squared error with a centre of its own for each view, by one Gauss-Newton step; see `moving_centre`."""
+    step = dict(_changes(views, state))["centre"][free]
+    return float(_Effect.of(q, step).least(np.array([_FREE]))[0][0])
 
 
 def _changes(views: Views, state: CameraState) -> list[tuple[str, Array]]:

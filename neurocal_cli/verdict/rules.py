@@ -136,7 +136,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             0 if flexes else _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            f"deviations{'' if e.groups or e.missing or e.proportions or e.stated else _NO_SINGLE_CAMERA}",
+            f"deviations{'' if _is_explained(e) else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
@@ -146,6 +146,11 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "model or the target does not fit",
             "try another --distortion, or measure the target",
         )
+
+
+def _is_explained(e: Evidence) -> bool:
+    """Whether a cause is known why no single camera fits."""
+    return bool(e.groups or e.missing or e.proportions or e.stated or e.turned or e.centre)
 
 
 def _by_flexing(e: Evidence, diagonal: float) -> bool:

@@ -117,7 +117,7 @@ class _Split:
 def _two_cameras(
     views: Views, state: CameraState, quadratics: Quadratics, free: NDArray[np.bool_]
 ) -> _Split | None:
-    member = _dealt(quadratics)
+    member = divided(quadratics)
     found: _Split | None = None
     for _ in range(_ADJUSTED):
         if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < _FEWEST:
@@ -137,7 +137,7 @@ def _two_cameras(
     return found
 
 
-def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
+def divided(quadratics: Quadratics) -> NDArray[np.bool_] | None:
     """The best clustering into two groups from several random starts, with the quadratic model."""
     rng = np.random.default_rng(0)
     V = len(quadratics.cost)
