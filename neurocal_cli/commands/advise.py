@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -45,7 +43,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     if plot is not None:
         from neurocal_cli.planning.plots import draw_advice
 
-        write_plot(plot, partial(draw_advice, advice, known))
+        write_plot(plot, draw_advice, advice, known)
     if as_json:
         print_summary(advice_json(advice))
     else:

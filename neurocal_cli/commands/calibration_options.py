@@ -15,7 +15,11 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
 
-_BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
+# Options of back-propagation only, and their names in `BackpropOptions`.
+_BACKPROP = {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}
+
+# Options that are arguments of `methods.calibrate` with the same name and value.
+_SAME = ("method", "trainer", "distortion", "outliers", "target", "seed", "starts")
 
 
 @frozen_dataclass
@@ -64,9 +68,9 @@ class Estimation:
         if self.method != "neuro":
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
-        for name, option in _BACKPROP_ONLY.items():
+        for name in _BACKPROP:
             if getattr(self, name) is not None:
-                self._require("trainer", "backprop", option)
+                self._require("trainer", "backprop", f"--{name.replace('_', '-')}")
 
     def _require(self, name: str, wanted: str, option: str) -> None:
         """Refuse an option that needs another value of the option with this name."""
@@ -80,22 +84,13 @@ class Estimation:
             if points.image_size not in (None, self.image_size):
                 note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
-        arguments: dict[str, Any] = {
-            "type": int(self.type),
-            "method": self.method,
-            "trainer": self.trainer,
-            "distortion": self.distortion,
-            "skew": not self.no_skew,
-            "outliers": self.outliers,
-            "target": self.target,
-            "seed": self.seed,
-            "starts": self.starts,
-        }
-        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
-        if given := {name: value for name, value in values.items() if value is not None}:
+        arguments: dict[str, Any] = {name: getattr(self, name) for name in _SAME}
+        arguments |= {"type": int(self.type), "skew": not self.no_skew}
+        values = {to: getattr(self, name) for name, to in _BACKPROP.items()}
+        if given := {to: value for to, value in values.items() if value is not None}:
             from neurocal_cli.training.backprop import BackpropOptions
 
-            arguments["backprop"] = BackpropOptions(**given)  # type: ignore[arg-type]
+            arguments["backprop"] = BackpropOptions(**given)
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:

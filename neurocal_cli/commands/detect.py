@@ -15,6 +15,7 @@ from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_fo
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
+    debugging,
     note,
     one_line,
     print_summary,
@@ -182,8 +183,7 @@ def _wanted(
     if cache is not None:
         preparation.check_folder("--cache", cache)
         known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
-    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
+    return DetectionOptions(board, kind, gamma, overlay is not None, debugging(), known)
 
 
 def _examined(

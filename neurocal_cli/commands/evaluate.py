@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
-from neurocal_cli.commands.streams import note, print_summary, show, warn
+from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
 
@@ -78,21 +77,20 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     preparation.check_one_stdin(calibration, points)
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (calibration, points))
-    given = None if points is None else preparation.given_points([points])
+    given = None if points is None else preparation.given_points(points)
     evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
         from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
 
-        write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
+        write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     _tell(evaluation)
     from neurocal_cli.report import evaluation_json, evaluation_tables
-    from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:
-        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+        show(evaluation_tables(evaluation), verdict)
 
 
 def _evaluate_camera(
@@ -122,8 +120,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
         (renamed, "other points than the calibration has under this name"),
     ):
         if names:
-            some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-            note(f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed")
+            note(f"{first_of(names)}: {why}; the pose is fitted with the intrinsic parameters fixed")
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
@@ -207,20 +204,20 @@ def stereo(
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
-        write_plots(plots, partial(draw_points_in_space, evaluation, rig))
+        write_plots(plots, draw_points_in_space, evaluation, rig)
     from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
-    from neurocal_cli.verdict.report import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
-        names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note(f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed")
+        note(
+            f"{first_of(evaluation.fitted)}: the calibrations have no such images; the poses are fitted with "
+            "the cameras fixed"
+        )
     warn(*evaluation.warnings)
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
-        verdict = evaluation.verdict
-        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+        show(stereo_evaluation_tables(evaluation), evaluation.verdict)
 
 
 def _evaluate_stereo(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -52,17 +53,17 @@ def check_plots(plots: Plots, output: str | None = None) -> None:
         options.check_plot(file, output)
 
 
-def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
-    """Draw and write all pictures; `draw` gives a picture of a kind ("png") and of a panel."""
+def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write all pictures of a subject; see `write_plot`."""
     for panel, file in plots:
-        write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
+        write_plot(file, partial(draw, panel=panel), *subject)
 
 
-def write_plot(file: str, draw: Callable[[str], bytes]) -> None:
-    """Draw and write a picture of the kind that its name ends in."""
+def write_plot(file: str, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write a picture of a subject, of the `kind` that the file's name ends in."""
     from neurocal_cli.io.writing import write_whole
 
-    write_whole(file, draw(os.path.splitext(file)[1][1:].lower()))
+    write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
 
 
 html_option = options.path(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -68,8 +68,8 @@ def compute_in_one_thread() -> None:
         os.environ.setdefault(name, "1")
 
 
-def given_points(names: str | Sequence[str]) -> Correspondences:
-    """Read points, and report rows of their files that were left out."""
+def given_points(*names: str) -> Correspondences:
+    """Read points of one camera, and report rows of their files that were left out."""
     from neurocal_cli.io.points_csv import ids_at_two_places, read_points
 
     notes: list[str] = []

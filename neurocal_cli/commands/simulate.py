@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -189,7 +188,7 @@ def simulate(
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_simulation
 
-        write_plot(plot, partial(draw_simulation, study, starts, scene.unit))
+        write_plot(plot, draw_simulation, study, starts, scene.unit)
     if as_json:
         found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
         found |= noise_json(study)
@@ -240,7 +239,7 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_rates
 
-        write_plot(plot, partial(draw_rates, study))
+        write_plot(plot, draw_rates, study)
     if as_json:
         print_summary(rates_json(study))
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import partial
 
 import click
 
@@ -114,24 +113,20 @@ def stereo(
         raise UsageError("-o and --ros name the same file twice; give three different files")
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
 
-    prepared = []
-    for name, side in zip((left, right), sides, strict=True):
-        notes: list[str] = []
-        points = read_points(name, notes=notes)
-        note(*notes, *ids_at_two_places(points))
-        prepared.append(side.prepare(points))
+    prepared = [
+        side.prepare(preparation.given_points(name)) for name, side in zip((left, right), sides, strict=True)
+    ]
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     if plots:
         from neurocal_cli.plots.pages import draw_rig
 
-        write_plots(plots, partial(draw_rig, rig))
+        write_plots(plots, draw_rig, rig)
     if ros is not None:
         from neurocal_cli.io.rig_yaml import format_ros_pair
         from neurocal_cli.io.writing import write_whole

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -18,6 +19,8 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+    from neurocal_cli.calibration import Verdict
 
 TYPED = "neurocal.typed"  # key of the words of the command line in click's context
 
@@ -56,6 +59,11 @@ def set_verbosity(level: int) -> None:
 def verbose() -> bool:
     """Whether the user gave --verbose."""
     return _VERBOSITY.get() > 0
+
+
+def debugging() -> bool:
+    """Whether the user wants to see where an unexpected error arose."""
+    return os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
 
 
 def one_line(text: str) -> str:
@@ -124,8 +132,13 @@ def is_terminal(stream: TextIO | None) -> bool:
 
 
 def some_of(names: Sequence[str]) -> str:
-    """List the first names, and the number of further ones."""
+    """The first name, and the number of further ones."""
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def first_of(names: Sequence[str]) -> str:
+    """The first five names, and dots for further ones."""
+    return ", ".join([*names[:5], *(["..."] if len(names) > 5 else [])])
 
 
 def print_summary(tree: dict[str, Any]) -> None:
@@ -195,10 +208,12 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
     return failed
 
 
-def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
-    """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
+def show(tables: Sequence[Sequence[Sequence[str]]], verdict: Verdict | None) -> None:
+    """Print tables and a verdict below them on stdout: plain text, or the tables drawn on a terminal."""
     from neurocal_cli.report import align
+    from neurocal_cli.verdict.report import verdict_lines
 
+    below = [] if verdict is None else verdict_lines(verdict)
     if not is_terminal(sys.stdout):
         blocks = [*map(align, tables), *([below] if below else [])]
         click.echo("\n\n".join("\n".join(block) for block in blocks))
