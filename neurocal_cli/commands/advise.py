@@ -32,7 +32,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    options.check_plot(plot, "-")
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (calibration,))
     from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.planning.advice import advise as weigh

@@ -255,7 +255,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     preparation.check_one_stdin(lens_file, points)
-    options.check_plot(plot, None)
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens

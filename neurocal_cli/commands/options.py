@@ -282,7 +282,7 @@ def plot(what: str) -> Callable[[F], F]:
     return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
 
 
-def check_plot(plot: str | None, output: str | None = None) -> None:
+def check_plot(plot: str | None, output: str = "-") -> None:
     """Refuse a picture that cannot be drawn, before any work is done."""
     if plot is None:
         return
@@ -290,7 +290,7 @@ def check_plot(plot: str | None, output: str | None = None) -> None:
         raise UsageError(
             f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
         )
-    if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
+    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
         raise UsageError("-o and --plot name the same file; give two different files")
     from neurocal_cli.plots.figure import check_available
 

@@ -47,7 +47,7 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     )
 
 
-def check_plots(plots: Plots, output: str | None = None) -> None:
+def check_plots(plots: Plots, output: str = "-") -> None:
     """Refuse pictures that cannot be drawn; see `options.check_plot`."""
     for _, file in plots:
         options.check_plot(file, output)

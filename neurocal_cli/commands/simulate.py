@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +14,7 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
+    from neurocal_cli.simulation.starts import StartStudy
 
 _SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
 _DEFAULT_METHODS = "neuro,nonlinear,linear,tsai"
@@ -159,7 +160,7 @@ def simulate(
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
         preparation.check_folder("--save", save)
-    options.check_plot(plot, "-")
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
 
@@ -170,31 +171,21 @@ def simulate(
         _rates(data_sets, seed, jobs, plot, as_json)
         return
     scene, paper = _scene(camera, board, views, seed)
+    levels = sorted(set(sigma))
     if save is not None:
-        _save(scene, save, sigma, seed, images)
+        _save(scene, save, levels, seed, images)
     from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json, text_of
-    from neurocal_cli.simulation.starts import study_starts
+    from neurocal_cli.simulation.report import simulation_json, simulation_tables, text_of
 
-    levels = tuple(sorted(set(sigma)))
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
-        starts = None
-        if random_starts:
-            try:
-                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
-            except DegenerateGeometryError as error:
-                note(f"no random starts: {error}")
+        starts = _starts(scene, random_starts, seed, jobs, progress)
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_simulation
 
         write_plot(plot, draw_simulation, study, starts, scene.unit)
     if as_json:
-        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
-        found |= noise_json(study)
-        if starts is not None:
-            found["random_starts"] = starts_json(starts)
-        print_summary(found)
+        print_summary(simulation_json(scene, seed, study, starts))
     else:
         click.echo(text_of(*simulation_tables(study, starts, paper)))
 
@@ -230,6 +221,21 @@ def _scene(
     return scenes.scene_of(camera, board, poses), False
 
 
+def _starts(
+    scene: SimulatedScene, count: int, seed: int, jobs: int, progress: ProgressBar
+) -> StartStudy | None:
+    """The study of random starts; None without any, or if the points do not determine a camera."""
+    from neurocal_cli.simulation.starts import study_starts
+
+    if not count:
+        return None
+    try:
+        return study_starts(scene, _STARTS_SIGMA, count, seed, jobs, progress)
+    except DegenerateGeometryError as error:
+        note(f"no random starts: {error}")
+        return None
+
+
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.simulation.rates import study_rates
     from neurocal_cli.simulation.report import rates_json, rates_tables, text_of
@@ -246,7 +252,7 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
         click.echo(text_of(*rates_tables(study)))
 
 
-def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:
+def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:
     """Write the truth and the data simulated from it; the noisy points are those of the first trial."""
     import numpy as np
 
@@ -259,7 +265,7 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     make_folder(folder)
     write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))
     write_points(scene.points(), os.path.join(folder, "exact.csv"))
-    for k, level in enumerate(sorted(set(sigma))):
+    for k, level in enumerate(levels):
         points = scene.points(level, np.random.default_rng((seed, k, 0)))
         name = str(level).removesuffix(".0")  # all digits, so that no two levels share a file
         write_points(points, os.path.join(folder, f"sigma_{name}.csv"))

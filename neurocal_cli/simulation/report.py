@@ -10,6 +10,7 @@ import numpy as np
 from neurocal_cli.report import align, number_or_none
 from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
+from neurocal_cli.simulation.scenes import SimulatedScene
 from neurocal_cli.simulation.starts import StartStudy
 
 Table = list[list[str]]
@@ -140,8 +141,16 @@ def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
     return [(title, counts), ("median epochs of these", epochs)], below
 
 
+def simulation_json(
+    scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None
+) -> dict[str, Any]:
+    """The studies of noise and starts for JSON; missing numbers are None."""
+    whole = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed, **noise_json(study)}
+    return whole if starts is None else {**whole, "random_starts": starts_json(starts)}
+
+
 def noise_json(study: NoiseStudy) -> dict[str, Any]:
-    """The whole study for JSON; missing numbers are None."""
+    """The study of noise for JSON."""
     return {
         "trials": study.trials,
         "sigma": study.sigma.tolist(),
