@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
     debugging,
     note,
+    note_once,
     one_line,
     print_summary,
     say,
-    some_of,
     warn,
     where_reasons_are,
 )
@@ -29,7 +29,6 @@ from neurocal_cli.errors import NeurocalError, UsageError
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions
-    from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.measuring import Points
     from neurocal_cli.detection.outcome import Outcome
 
@@ -139,36 +138,36 @@ def detect(
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
-    target = preparation.given_board(board, cols, rows, square, unit)
-    if target is None:
-        raise UsageError(preparation.NO_SIZE)
-    if target.distances:
-        scale = target.scale
-        said = f"; {scale.contradiction}" if scale.contradiction else ""
-        note(
-            f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
-            f"{100 * scale.std:.2g} %{said}"
-        )
-    target = target.as_measured()
+    target = _measured(preparation.given_board(board, cols, rows, square, unit))
     wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
         outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
     else:
         outcomes = _watched(images, wanted, board, output, watch)
     outcomes = of_one_size(outcomes)
-    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
-    _report(outcomes, found, target, as_json)
+    _report(outcomes, target, as_json)
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import make_folder, write_whole
+    from neurocal_cli.io.writing import write_whole
 
-    text = format_points(replace(gather(found, target.unit), distances=target.distances))
+    text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
     if overlay is not None:
-        make_folder(overlay)
-        for name, outcome in outcomes.items():
-            if outcome.overlay is not None:
-                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
+        _write_overlays(outcomes, overlay)
     write_whole(output, text)
+
+
+def _measured(board: Board | None) -> Board:
+    """The board in its measured size; a UsageError if there is none."""
+    if board is None:
+        raise UsageError(preparation.NO_SIZE)
+    if board.distances:
+        scale = board.scale
+        said = f"; {scale.contradiction}" if scale.contradiction else ""
+        note(
+            f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
+            f"{100 * scale.std:.2g} %{said}"
+        )
+    return board.as_measured()
 
 
 def _wanted(
@@ -234,6 +233,15 @@ def _watched(
     return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
 
 
+def _write_overlays(outcomes: Mapping[str, Outcome], folder: str) -> None:
+    from neurocal_cli.io.writing import make_folder, write_whole
+
+    make_folder(folder)
+    for name, outcome in outcomes.items():
+        if outcome.overlay is not None:
+            write_whole(os.path.join(folder, f"{name}.png"), outcome.overlay)
+
+
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Warn of images of different sizes before any work, because one camera has one image size."""
     from neurocal_cli.io.image_headers import stated_sizes
@@ -263,10 +271,9 @@ def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     ]
 
 
-def _report(
-    outcomes: Mapping[str, Outcome], found: Mapping[str, Detection], board: Board, as_json: bool
-) -> None:
+def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> None:
     """Report failed images with the reason, and remarks common to several images once."""
+    found = detections(outcomes)
     problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
     for problem in problems.values() if len(outcomes) > 1 else ():
         complain(problem)
@@ -274,7 +281,7 @@ def _report(
     for name, outcome in outcomes.items():
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(*(f"{some_of(names)}: {text}" for text, names in remarks.items()))
+    note_once(remarks)
     warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
     warn(*_mixed_orientations(outcomes.values()))
     warn(*_another_board([_shown(outcome) for outcome in outcomes.values()], board))

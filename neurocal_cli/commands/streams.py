@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -101,6 +101,12 @@ def note(*texts: str) -> None:
         say(f"note: {one_line(text)}")
 
 
+def note_once(remarks: Mapping[str, Sequence[str]]) -> None:
+    """Report remarks, each with the first name of those that it is about, and their number."""
+    for text, names in remarks.items():
+        note(f"{names[0]}: {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
+
+
 def warn(*texts: str) -> None:
     """Warn of problems that may make the result worse than it looks."""
     for text in texts:
@@ -129,11 +135,6 @@ def conclude(
 def is_terminal(stream: TextIO | None) -> bool:
     """Whether the stream is a terminal."""
     return stream is not None and not stream.closed and stream.isatty()
-
-
-def some_of(names: Sequence[str]) -> str:
-    """The first name, and the number of further ones."""
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def first_of(names: Sequence[str]) -> str:

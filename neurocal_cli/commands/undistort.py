@@ -10,7 +10,7 @@ from functools import partial
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import is_terminal, print_summary, say
+from neurocal_cli.commands.streams import is_terminal, note_once, print_summary, say
 from neurocal_cli.errors import UsageError
 
 _NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
@@ -133,7 +133,7 @@ def undistort(
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
     work = Undistorting(original, view, interpolation, folder)
     failed = work.correct_all(paths, outputs)
-    work.tell_notes()
+    note_once(work.notes)
     if new_camera is not None:
         work.write_camera(new_camera)
     if maps is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.commands.streams import each_of, note, say, some_of, warn
+from neurocal_cli.commands.streams import each_of, note, say, warn
 from neurocal_cli.distortion.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
@@ -61,11 +61,6 @@ class Undistorting:
         for place in zip(paths, outputs, strict=True):
             self._correct(place)
         return {}
-
-    def tell_notes(self) -> None:
-        """Report the remarks about images, each once."""
-        for text, names in self.notes.items():
-            note(f"{some_of(names)}: {text}")
 
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
