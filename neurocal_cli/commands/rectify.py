@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rectified_pair import RectifiedPair, RowError
     from neurocal_cli.stereo.rig import Rig
 
+_Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera
 _SIDES = ("left", "right")
 # Median difference of rows, as a multiple of that of the rig's own points, and in px: 1 for other points of
 # the rig, 5 if one file is given twice; tests/test_cli_rectify.py.
@@ -96,18 +97,10 @@ def rectify(
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
-    from neurocal_cli.io.exchange.neurocal import as_rig
-    from neurocal_cli.io.exchange.reading import read_cameras
+    _check_folders(output, sides)
     from neurocal_cli.stereo.rectified_pair import rectified_pair
 
-    cameras = read_cameras([rig])
-    if (count := len(cameras.cameras)) != 2:
-        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", rig)
-    found = as_rig(cameras)
+    found = _read_rig(rig)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
@@ -120,8 +113,18 @@ def rectify(
         print_summary(work.summary)
 
 
-def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The files of the left and of the right camera: the first and the second half of the arguments."""
+def _read_rig(name: str) -> Rig:
+    from neurocal_cli.io.exchange.neurocal import as_rig
+    from neurocal_cli.io.exchange.reading import read_cameras
+
+    cameras = read_cameras([name])
+    if (count := len(cameras.cameras)) != 2:
+        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", name)
+    return as_rig(cameras)
+
+
+def _sides(files: Sequence[str]) -> _Paths:
+    """Files of the first and of the second half of the arguments."""
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if len(files) % 2:
@@ -137,6 +140,14 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
+
+
+def _check_folders(output: str, sides: _Paths) -> None:
+    """Refuse folders of results that are folders of inputs."""
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
 
 
 @dataclass
@@ -181,7 +192,7 @@ class _Work:
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         preparation.warn_of_poor(self.rig)
 
-    def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+    def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
         from neurocal_cli.calibration import undistorted_before
         from neurocal_cli.io.points_csv import format_points, read_points
@@ -221,7 +232,7 @@ class _Work:
                 "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
             )
 
-    def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+    def rectify_images(self, sides: _Paths) -> None:
         """Rectify all pairs; those that fail are named and left out."""
         pairs = list(zip(*sides, strict=True))
         done = len(pairs) - len(each_of(pairs, self._rectify_pair, "pairs", "rectified"))

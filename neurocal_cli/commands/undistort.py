@@ -103,15 +103,7 @@ def undistort(
           --maps maps.npz
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(camera, *files)
-    options.check_alpha(alpha)
-    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
-        raise UsageError(
-            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
-        )
-    most = 170 if shape == "plane" else 360
-    if fov is not None and not 0 < fov <= most:
-        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
-        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
+    _check_view(alpha, shape, fov, size)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     if not files and options.typed("output"):
@@ -131,7 +123,7 @@ def undistort(
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
-    work = Undistorting(original, view, interpolation, folder)
+    work = Undistorting(original, view, interpolation, folder, original.image_size)
     failed = work.correct_all(paths, outputs)
     note_once(work.notes)
     if new_camera is not None:
@@ -145,6 +137,19 @@ def undistort(
     work.tell_loss()
     if len(paths) > 1:
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
+
+
+def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[int, int] | None) -> None:
+    """Refuse options of the result that are out of range or contradict each other."""
+    options.check_alpha(alpha)
+    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
+        raise UsageError(
+            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
+        )
+    most = 170 if shape == "plane" else 360
+    if fov is not None and not 0 < fov <= most:
+        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
+        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
 
 
 def _folder(paths: Sequence[str], output: str) -> str | None:

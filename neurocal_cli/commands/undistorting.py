@@ -29,13 +29,10 @@ class Undistorting:
     view: Callable[[tuple[int, int] | None], Undistorted]  # of the results, from the size of the images
     interpolation: str
     folder: str | None  # output folder, if the output is one
+    size: tuple[int, int] | None  # of the images [px], once it is known
     notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
     left_out: int = 0  # number of points that the result cannot show
-    size: tuple[int, int] | None = None  # of the images [px], once it is known
     remapping: Remapping | None = None
-
-    def __post_init__(self) -> None:
-        self.size = self.camera.image_size
 
     def new(self) -> Undistorted:
         """The camera of the results, once the size of the images is known."""
