@@ -36,11 +36,7 @@ _ENDINGS = (".svg", ".pdf", ".png")
 )
 @options.json
 def board(
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     paper: str,
     dpi: float,
     output: str,
@@ -72,12 +68,12 @@ def board(
         raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
-    beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
-    preparation.check_outputs((output, beside), (board,))
+    beside = None if board.file is not None else os.path.splitext(output)[0] + ".yaml"
+    preparation.check_outputs((output, beside), (board.file,))
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
-    target = preparation.given_board(board, cols, rows, square, unit) or default_board(size)
+    target = board.read() or default_board(size)
     sheet = on_paper(target, size)
     from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
     from neurocal_cli.io.writing import write_whole

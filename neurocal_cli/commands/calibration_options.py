@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
-from functools import wraps
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -129,22 +129,10 @@ def _note_exact(what: str) -> None:
     note(f"{what} is taken as exact: the standard deviations do not include its errors")
 
 
-def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def estimation_options(files: bool = True) -> Callable[[F], F]:
     """Add the options of `Estimation`, a command's keyword ``estimation``; known cameras only if `files`."""
-    names = [field.name for field in fields(Estimation)]
-
-    def add(command: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(command)
-        def collected(*args: Any, **kwargs: Any) -> Any:
-            estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
-            return command(*args, estimation=estimation, **kwargs)
-
-        for option in reversed(_OPTIONS):
-            if files or option not in _FILES:
-                collected = option(collected)
-        return collected
-
-    return add
+    added = [option for option in _OPTIONS if files or option not in _FILES]
+    return options.collected(Estimation, added, "estimation")
 
 
 _FILES = [

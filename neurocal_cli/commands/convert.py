@@ -66,11 +66,7 @@ def convert(
     target: str,
     model: str | None,
     force: bool,
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     image_size: tuple[int, int] | None,
     as_json: bool,
     output: str,
@@ -120,18 +116,18 @@ def convert(
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
           -o corners.npz
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(*files, board)
+    preparation.check_one_stdin(*files, board.file)
     preparation.check_summary(as_json, output)
-    preparation.check_unit(unit)
+    board.check_unit()
     folder = os.path.isdir(output) or output.endswith(os.sep)
-    preparation.check_outputs(() if folder else (output,), (*files, board))
-    of_board = None if square is None and board is None else unit
-    target_board = preparation.given_board(board, cols, rows, square, of_board)
+    preparation.check_outputs(() if folder else (output,), (*files, board.file))
+    described = board.file is not None or board.square is not None
+    target_board = (board if described else replace(board, unit=None)).read()
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.io.files import repeatable_stdin
 
     with repeatable_stdin() if "-" in files else nullcontext():
-        found = _read(files, target_board, unit, image_size)
+        found = _read(files, target_board, board.unit, image_size)
     if isinstance(found, CameraSet):
         summary = _write_cameras(found, target, model, force, output)
     elif model is None:

@@ -87,11 +87,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
 @options.output("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     points: str,
     gamma: float | None,
     overlay: str | None,
@@ -133,17 +129,17 @@ def detect(
           --cache found --frames 30 -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(*images, board)
+    preparation.check_one_stdin(*images, board.file)
     preparation.check_summary(as_json, output)
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
-    target = _measured(preparation.given_board(board, cols, rows, square, unit))
+    target = _measured(board.read())
     wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
-        outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
+        outcomes = _examined(images, wanted, board.file, output, overlay, jobs, frames)
     else:
-        outcomes = _watched(images, wanted, board, output, watch)
+        outcomes = _watched(images, wanted, board.file, output, watch)
     outcomes = of_one_size(outcomes)
     _report(outcomes, target, as_json)
     from neurocal_cli.detection.detect import gather
@@ -159,7 +155,7 @@ def detect(
 def _measured(board: Board | None) -> Board:
     """The board in its measured size; a UsageError if there is none."""
     if board is None:
-        raise UsageError(preparation.NO_SIZE)
+        raise UsageError(options.NO_SIZE)
     if board.distances:
         scale = board.scale
         said = f"; {scale.contradiction}" if scale.contradiction else ""

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from functools import partial
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import partial, wraps
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -17,6 +18,12 @@ from click.types import FloatParamType
 
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+
+if TYPE_CHECKING:
+    from neurocal_cli.board import Board
+
+NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 _PICTURES = (".png", ".pdf", ".svg")
 
@@ -154,6 +161,23 @@ def _option(
     return click.option(*names, *([] if to is None else [to]), help=help, **attributes)
 
 
+def collected(kind: type, added: Sequence[Callable[[F], F]], to: str) -> Callable[[F], F]:
+    """Add options that are the fields of a dataclass, whose instance is the parameter `to` of the command."""
+    names = [field.name for field in fields(kind)]
+
+    def add(command: Any) -> Any:
+        @wraps(command)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            kwargs[to] = kind(**{name: kwargs.pop(name, None) for name in names})
+            return command(*args, **kwargs)
+
+        for option in reversed(added):
+            call = option(call)
+        return call
+
+    return add
+
+
 def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names an input."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
@@ -191,23 +215,54 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
 
 
+@frozen_dataclass
+class BoardOptions:
+    """The values of the options of a board, whose file is not read yet."""
+
+    file: str | None
+    cols: int | None
+    rows: int | None
+    square: float | None
+    unit: str | None
+
+    def read(self) -> Board | None:
+        """The board; None if no option describes one, a UsageError if they contradict each other."""
+        from neurocal_cli.board import Board
+
+        self.check_unit()
+        cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
+        if self.file is not None:
+            if (cols, rows, square, unit) != (None,) * 4:
+                raise UsageError(
+                    "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+                )
+            from neurocal_cli.io.board_yaml import read_board
+
+            return read_board(self.file)
+        if (cols, rows, square, unit) == (None,) * 4:
+            return None
+        if cols is None or rows is None or square is None:
+            raise UsageError(NO_SIZE)
+        return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+    def check_unit(self) -> None:
+        """Refuse a unit that cannot be stored in a file, with a UsageError."""
+        unit = self.unit
+        if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+            raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
+
+
 def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
-    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `preparation.given_board`."""
+    """Add the options of `BoardOptions`, a command's keyword ``board``."""
     size = partial(count, without="none", least=2, most=1000)
     added = (
-        path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+        path("--board", "BOARD.yaml", "Board file; a board may have several planes.", to="file"),
         size("--cols", "C", "Number of inner vertices in a row of the board."),
         size("--rows", "R", "Number of rows of inner vertices."),
         number("--square", "S", "Side length of a square.", without="none", positive=True),
         click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
     )
-
-    def add(f: F) -> F:
-        for option in reversed(added):
-            f = option(f)
-        return f
-
-    return add
+    return collected(BoardOptions, added, "board")
 
 
 camera_name = click.option(

@@ -1,4 +1,4 @@
-"""What commands do before their work: check inputs and outputs, and read points, boards and known cameras."""
+"""What commands do before their work: check inputs and outputs, and read points and known cameras."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rig import Rig
-
-NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
@@ -69,7 +66,7 @@ def compute_in_one_thread() -> None:
 
 
 def given_points(*names: str) -> Correspondences:
-    """Read points of one camera, and report rows of their files that were left out."""
+    """Read points, and report rows of their files that were left out."""
     from neurocal_cli.io.points_csv import ids_at_two_places, read_points
 
     notes: list[str] = []
@@ -124,32 +121,3 @@ def warn_of_poor(rig: Rig, so: str = "") -> None:
     verdict = rig.verdict
     if verdict is not None and verdict.word == "poor":
         warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
-
-
-def given_board(
-    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
-) -> Board | None:
-    """Read the board; None if no option describes one, a UsageError if they contradict each other."""
-    from neurocal_cli.board import Board
-
-    check_unit(unit)
-    numbers = (cols, rows, square)
-    if path is not None:
-        if numbers != (None, None, None) or unit is not None:
-            raise UsageError(
-                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
-            )
-        from neurocal_cli.io.board_yaml import read_board
-
-        return read_board(path)
-    if numbers == (None, None, None) and unit is None:
-        return None
-    if cols is None or rows is None or square is None:
-        raise UsageError(NO_SIZE)
-    return Board.single(cols, rows, square, "mm" if unit is None else unit)
-
-
-def check_unit(unit: str | None) -> None:
-    """Refuse a unit that cannot be stored in a file, with a UsageError."""
-    if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
-        raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
