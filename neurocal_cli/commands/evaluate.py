@@ -86,11 +86,12 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     _tell(evaluation)
     from neurocal_cli.report import evaluation_json, evaluation_tables
+    from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:
-        show(evaluation_tables(evaluation), verdict)
+        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _evaluate_camera(
@@ -200,6 +201,7 @@ def stereo(
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
     from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
+    from neurocal_cli.verdict.report import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -211,7 +213,8 @@ def stereo(
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
-        show(stereo_evaluation_tables(evaluation), evaluation.verdict)
+        verdict = evaluation.verdict
+        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _read_pair(files: tuple[str, str]) -> tuple[Correspondences, Correspondences]:

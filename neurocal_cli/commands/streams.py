@@ -20,8 +20,6 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from neurocal_cli.calibration import Verdict
-
 TYPED = "neurocal.typed"  # key of the words of the command line in click's context
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
@@ -209,12 +207,10 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
     return failed
 
 
-def show(tables: Sequence[Sequence[Sequence[str]]], verdict: Verdict | None) -> None:
-    """Print tables and a verdict below them on stdout: plain text, or the tables drawn on a terminal."""
+def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
+    """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
     from neurocal_cli.report import align
-    from neurocal_cli.verdict.report import verdict_lines
 
-    below = [] if verdict is None else verdict_lines(verdict)
     if not is_terminal(sys.stdout):
         blocks = [*map(align, tables), *([below] if below else [])]
         click.echo("\n\n".join("\n".join(block) for block in blocks))
