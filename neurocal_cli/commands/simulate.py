@@ -174,8 +174,9 @@ def simulate(
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
+    from neurocal_cli.comparison.report import text_of
     from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import simulation_json, simulation_tables, text_of
+    from neurocal_cli.simulation.report import simulation_json, simulation_tables
 
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
@@ -237,8 +238,9 @@ def _starts(
 
 
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
+    from neurocal_cli.comparison.report import text_of
     from neurocal_cli.simulation.rates import study_rates
-    from neurocal_cli.simulation.report import rates_json, rates_tables, text_of
+    from neurocal_cli.simulation.report import rates_json, rates_tables
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)

@@ -29,7 +29,6 @@ from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 _BLOCK = 5  # trials per task, all with one sigma
-_HALF_TURN = np.pi
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
 
 
@@ -160,7 +159,7 @@ def _errors(task: _Task) -> Array:
             poses = [found.views[name].pose for name in scene.poses]
             errors[n, m] = _parameters(found.intrinsics, k, poses) - truth
     of_poses = errors[..., -6 * len(scene.poses) :].reshape(*errors.shape[:2], -1, 6)
-    of_poses[..., :3] = (of_poses[..., :3] + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+    of_poses[..., :3] = (of_poses[..., :3] + np.pi) % (2 * np.pi) - np.pi
     return errors
 
 

@@ -40,7 +40,6 @@ from neurocal_cli.network import random_weights
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-STARTS = ("lm", "backprop", "weights", "camera")
 _SAME = 1.001  # greatest ratio to the best rms error
 _FLOOR = 1e-9  # px, added to it; without noise the best error is rounding
 _FOCAL = 0.5, 20.0  # half image widths
@@ -94,7 +93,7 @@ def study_starts(
     """
     problem = _problem(scene, sigma, seed)
     check_points(problem)
-    kinds = [kind for kind in STARTS if can_start(problem, kind)]
+    kinds = [kind for kind in _KINDS if can_start(problem, kind)]
     tasks = [
         _Task(scene, sigma, kind, seed, range(first, min(first + _BLOCK, starts)))
         for kind in kinds
@@ -122,7 +121,7 @@ def _problem(scene: SimulatedScene, sigma: float, seed: int) -> Problem:
 
 def _ends(task: _Task) -> list[float]:
     problem = _problem(task.scene, task.sigma, task.seed)
-    kind = STARTS.index(task.kind)
+    kind = list(_KINDS).index(task.kind)
     return [
         single_start(problem, task.kind, np.random.default_rng((task.seed, _NOISE, kind, start)))
         for start in task.starts
@@ -138,7 +137,7 @@ def can_start(problem: Problem, kind: str) -> bool:
 
 
 def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float:
-    """Final rms error [px] of one random start of a kind of `STARTS`; infinite if the result is not a camera.
+    """Final rms error [px] of one random start of a kind; infinite if the result is not a camera.
 
     The problem must be without a distortion.
     """
