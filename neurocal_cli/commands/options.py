@@ -79,11 +79,15 @@ class Command(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the arguments, then the options."""
-        rows = [(str(p.metavar), p.description) for p in self.params if isinstance(p, Argument)]
-        if rows:
+        if rows := arguments(self):
             with formatter.section("Arguments"):
                 formatter.write_dl(rows)
         super().format_options(ctx, formatter)
+
+
+def arguments(command: click.Command) -> list[tuple[str, str]]:
+    """The arguments of a command, as they stand in its usage, and their descriptions."""
+    return [(str(p.metavar), p.description) for p in command.params if isinstance(p, Argument)]
 
 
 class FiniteNumber(FloatParamType):

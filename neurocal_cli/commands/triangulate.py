@@ -162,13 +162,11 @@ class _Tally:
         """Report the outcome on stderr, or as JSON on stdout."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
-            one = self.off == 1
-            which = "is more than" if one else "are more than"
-            lines = "its epipolar line" if one else "their epipolar lines"
-            parts.append(f"{self.off} of them {which} {self.limit:.3g} px off {lines}")
+            are, lines = ("is", "its epipolar line") if self.off == 1 else ("are", "their epipolar lines")
+            parts.append(f"{self.off} of them {are} more than {self.limit:.3g} px off {lines}")
         if self.behind:
-            which = "is" if self.behind == 1 else "are"
-            parts.append(f"{self.behind} {which} behind a camera or at infinity")
+            are = "is" if self.behind == 1 else "are"
+            parts.append(f"{self.behind} {are} behind a camera or at infinity")
         if as_json:
             counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
             print_summary({**counts, "n_outside": self.outside, "epipolar_limit_px": self.limit})

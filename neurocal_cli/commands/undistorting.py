@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from neurocal_cli.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.commands.streams import each_of, note, say, warn
@@ -81,7 +83,7 @@ class Undistorting:
     def summary(self) -> dict[str, Any]:
         """Summary of the results for programs."""
         shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
-        camera = {key: getattr(x, "tolist", lambda x=x: x)() for key, x in self._described().items()}
+        camera = {key: np.asarray(value).tolist() for key, value in self._described().items()}
         return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
 
     def write_camera(self, path: str) -> None:
@@ -108,7 +110,7 @@ class Undistorting:
         return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
 
     def _described(self) -> dict[str, Any]:
-        """The camera of the results as JSON values."""
+        """The camera of the results by the names of its parts."""
         new = self.new()
         if isinstance(new, Panorama):
             return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
