@@ -10,6 +10,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -76,7 +77,6 @@ def board(
     target = board.read() or default_board(size)
     sheet = on_paper(target, size)
     from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
-    from neurocal_cli.io.writing import write_whole
 
     if ending == ".png":
         write_whole(output, board_png(sheet, dpi))

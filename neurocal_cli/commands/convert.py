@@ -13,6 +13,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.io.files import repeatable_stdin
+from neurocal_cli.io.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -124,7 +126,6 @@ def convert(
     described = board.file is not None or board.square is not None
     target_board = (board if described else replace(board, unit=None)).read()
     from neurocal_cli.io.exchange.camera_set import CameraSet
-    from neurocal_cli.io.files import repeatable_stdin
 
     with repeatable_stdin() if "-" in files else nullcontext():
         found = _read(files, target_board, board.unit, image_size)
@@ -144,7 +145,6 @@ def convert(
 def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
     """Write points; return the summary for programs."""
     from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
-    from neurocal_cli.io.writing import write_whole
 
     text = corner_text(points, target, os.path.splitext(output)[1].lower())
     losses, remarks = points_lost(points, target)
@@ -223,8 +223,6 @@ def _read(
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
-    from neurocal_cli.io.writing import check_places, make_folder, write_whole
-
     if set(contents) == {""}:
         write_whole(output, contents[""])
         return

@@ -25,6 +25,9 @@ from neurocal_cli.commands.streams import (
     where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
+from neurocal_cli.io.image_headers import stated_sizes
+from neurocal_cli.io.image_paths import find_images, view_names
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -144,7 +147,6 @@ def detect(
     _report(outcomes, target, as_json)
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import write_whole
 
     text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
     if overlay is not None:
@@ -192,7 +194,6 @@ def _examined(
 ) -> dict[str, Outcome]:
     """Outcomes of all images, by the names of their views."""
     from neurocal_cli.detection.batch import default_jobs, detect_files
-    from neurocal_cli.io.image_paths import find_images, view_names
 
     given = find_images(words)
     view_names(given)  # no name twice
@@ -217,8 +218,6 @@ def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
 ) -> dict[str, Outcome]:
     """Outcomes of the images that have arrived, by the names of their views."""
-    from neurocal_cli.io.image_paths import find_images, view_names
-
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
     preparation.check_outputs((output,), (board_file,))
@@ -230,8 +229,6 @@ def _watched(
 
 
 def _write_overlays(outcomes: Mapping[str, Outcome], folder: str) -> None:
-    from neurocal_cli.io.writing import make_folder, write_whole
-
     make_folder(folder)
     for name, outcome in outcomes.items():
         if outcome.overlay is not None:
@@ -240,8 +237,6 @@ def _write_overlays(outcomes: Mapping[str, Outcome], folder: str) -> None:
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Warn of images of different sizes before any work, because one camera has one image size."""
-    from neurocal_cli.io.image_headers import stated_sizes
-
     sizes = Counter(size for size in stated_sizes(paths) if size is not None)
     if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
         return []

@@ -12,6 +12,7 @@ import click
 
 from neurocal_cli import __version__
 from neurocal_cli.commands import options
+from neurocal_cli.io.writing import make_folder, write_whole
 
 _EXIT_STATUS = (
     ("0", "Done."),
@@ -68,8 +69,6 @@ def man(ctx: click.Context, directory: str) -> None:
     Examples:
       neurocal man man
     """  # noqa: D301 - as in the group
-    from neurocal_cli.io.writing import make_folder, write_whole
-
     make_folder(directory)
     for name, page in man_pages(ctx.find_root().command).items():
         write_whole(os.path.join(directory, name), page)

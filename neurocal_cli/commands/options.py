@@ -19,6 +19,7 @@ from click.types import FloatParamType
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.plots.figure import check_available
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -351,6 +352,4 @@ def check_plot(plot: str | None, output: str = "-") -> None:
         )
     if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
         raise UsageError("-o and --plot name the same file; give two different files")
-    from neurocal_cli.plots.figure import check_available
-
     check_available()

@@ -12,6 +12,8 @@ import click
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
+from neurocal_cli.io.files import read_bytes
+from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
@@ -61,8 +63,6 @@ def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None
 
 def write_plot(file: str, draw: Callable[..., bytes], *subject: Any) -> None:
     """Draw and write a picture of a subject, of the `kind` that the file's name ends in."""
-    from neurocal_cli.io.writing import write_whole
-
     write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
 
 
@@ -82,8 +82,6 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
 
     from neurocal_cli.html_report.page import Origin, versions
     from neurocal_cli.html_report.reports import calibration_page, rig_page
-    from neurocal_cli.io.files import read_bytes
-    from neurocal_cli.io.writing import write_whole
     from neurocal_cli.stereo.rig import Rig
 
     files = {}

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+from neurocal_cli.io.outputs import held_back
+from neurocal_cli.io.writing import STDOUT_NAMES, check_places
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
@@ -19,9 +21,6 @@ if TYPE_CHECKING:
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
     """Refuse outputs that cannot be written, or that are one of the inputs; see `check_places`."""
-    from neurocal_cli.io.outputs import held_back
-    from neurocal_cli.io.writing import check_places
-
     held = held_back()
     if held is not None:
         held.protect(*inputs)
@@ -49,8 +48,6 @@ def check_one_stdin(*names: str | None) -> None:
 
 def check_summary(as_json: bool, *outputs: str | None) -> None:
     """Refuse a summary and a result on one stream, with a UsageError."""
-    from neurocal_cli.io.writing import STDOUT_NAMES
-
     if as_json and not STDOUT_NAMES.isdisjoint(outputs):
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
 

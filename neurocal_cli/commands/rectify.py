@@ -13,6 +13,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
+from neurocal_cli.io.image_paths import find_images, is_image, view_names
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
@@ -90,8 +92,6 @@ def rectify(
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     preparation.check_folder("-o", output)
-    from neurocal_cli.io.image_paths import is_image
-
     sides = _sides(files)
     images = bool(files) and is_image(sides[0][0])
     if not images:
@@ -125,8 +125,6 @@ def _read_rig(name: str) -> Rig:
 
 def _sides(files: Sequence[str]) -> _Paths:
     """Files of the first and of the second half of the arguments."""
-    from neurocal_cli.io.image_paths import find_images, view_names
-
     if len(files) % 2:
         raise UsageError(
             f"there are {len(files)} files or patterns; give as many for the right camera as for the left one"
@@ -275,8 +273,6 @@ class _Work:
             say(text)
 
     def _write(self, name: str, content: str | bytes) -> None:
-        from neurocal_cli.io.writing import make_folder, write_whole
-
         place = os.path.join(self.output, name)
         make_folder(os.path.dirname(place))
         write_whole(place, content)

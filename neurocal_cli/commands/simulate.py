@@ -10,7 +10,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
-from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
@@ -197,7 +198,6 @@ def _scene(
     """The scene, and whether it is that of the paper."""
     import numpy as np
 
-    from neurocal_cli.errors import FormatError
     from neurocal_cli.simulation import scenes
 
     if camera_file is None and board_file is None and views is None:
@@ -261,7 +261,6 @@ def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, im
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.points_csv import write_points
     from neurocal_cli.io.result_files import write_calibration
-    from neurocal_cli.io.writing import make_folder, write_whole
     from neurocal_cli.simulation.scenes import true_calibration
 
     make_folder(folder)

@@ -13,6 +13,7 @@ from neurocal_cli.commands.calibration_options import Estimation, estimation_opt
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.plots import RIG_PANELS
 
 if TYPE_CHECKING:
@@ -142,7 +143,6 @@ def stereo(
 
 def _write_ros(rig: Rig, files: tuple[str, str], alpha: float | None) -> None:
     from neurocal_cli.io.rig_yaml import format_ros_pair
-    from neurocal_cli.io.writing import write_whole
 
     for name, text in zip(files, format_ros_pair(rig, alpha), strict=True):
         write_whole(name, text)

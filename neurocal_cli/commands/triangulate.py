@@ -12,6 +12,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_chunks
 
 if TYPE_CHECKING:
     from neurocal_cli.io.triangulation_csv import Matches
@@ -93,7 +94,6 @@ def triangulate(
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
-    from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
     if sigma is None and math.isnan(rig.sigma):

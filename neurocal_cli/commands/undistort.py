@@ -12,6 +12,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import is_terminal, note_once, print_summary, say
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.image_paths import find_images, is_image
 
 _NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
 
@@ -112,7 +113,6 @@ def undistort(
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.exchange.reading import read_intrinsics
-    from neurocal_cli.io.image_paths import find_images, is_image
 
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
@@ -154,8 +154,6 @@ def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[
 
 def _folder(paths: Sequence[str], output: str) -> str | None:
     """The output folder, if the output is one."""
-    from neurocal_cli.io.image_paths import is_image
-
     several = len(paths) > 1
     if output == "-":
         if several:
@@ -181,8 +179,6 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
 
 def _place(folder: str, path: str) -> str:
     """The output of an input in the output folder."""
-    from neurocal_cli.io.image_paths import is_image
-
     name = "points.csv" if path == "-" else os.path.basename(path)
     return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
