@@ -169,7 +169,7 @@ def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
         o = Z @ entries.reshape(3, 4).T
         return np.asarray((o[:, :2] / o[:, 2:] - views.pixels).ravel())
 
-    least = least_squares(error, (W @ V)[0].ravel())
+    least = least_squares(error, (W @ V)[0].ravel(), np.zeros(views.pixels.size, dtype=np.intp), 12)
     depth = Z @ least.x.reshape(3, 4)[2]
     if depth.min() * depth.max() <= 0:
         return np.inf
