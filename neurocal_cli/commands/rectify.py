@@ -18,6 +18,7 @@ from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
+    from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rectified_pair import RectifiedPair, RowError
     from neurocal_cli.stereo.rig import Rig
 
@@ -192,26 +193,13 @@ class _Work:
 
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
-        from neurocal_cli.calibration import undistorted_before
-        from neurocal_cli.io.points_csv import format_points, read_points
+        from neurocal_cli.io.points_csv import format_points
         from neurocal_cli.report import number_or_none
-        from neurocal_cli.stereo.rectified_pair import rectify_points, row_error
+        from neurocal_cli.stereo.rectified_pair import row_error
 
         if len(sides[0]) > 1:
             raise UsageError("give one CSV file of points for each camera")
-        moved = []
-        for side, (path,) in enumerate(sides):
-            notes: list[str] = []
-            points = read_points(path, notes=notes)
-            if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
-                warn(why)
-            moved.append(rectify_points(self.pair, side, points))
-            if len(moved[-1]) < len(points):
-                notes.append(
-                    f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
-                    "which are 90 degrees from the rectified camera's axis or more"
-                )
-            note(*notes)
+        moved = [self._rectified(side, path) for side, (path,) in enumerate(sides)]
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
@@ -229,6 +217,25 @@ class _Work:
                 "most points do not fit the rig; check that LEFT and RIGHT are of its two cameras, that "
                 "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
             )
+
+    def _rectified(self, side: int, path: str) -> Correspondences:
+        """Read and rectify the points of one camera, 0 left or 1 right."""
+        from neurocal_cli.calibration import undistorted_before
+        from neurocal_cli.io.points_csv import read_points
+        from neurocal_cli.stereo.rectified_pair import rectify_points
+
+        notes: list[str] = []
+        points = read_points(path, notes=notes)
+        if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
+            warn(why)
+        moved = rectify_points(self.pair, side, points)
+        if len(moved) < len(points):
+            notes.append(
+                f"{points.source}: {len(points) - len(moved)} of {len(points)} points are left out, "
+                "which are 90 degrees from the rectified camera's axis or more"
+            )
+        note(*notes)
+        return moved
 
     def rectify_images(self, sides: _Paths) -> None:
         """Rectify all pairs; those that fail are named and left out."""

@@ -84,7 +84,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         from neurocal_cli.io.rig_yaml import rig_from_field
 
         rig = rig_from_field(root)
-        words = images * (3 - len(images)) if images else ()
+        words = images * (3 - len(images))
         shown = [
             _photographs(camera, word, 2) for camera, word in zip((rig.left, rig.right), words, strict=False)
         ]
