@@ -206,7 +206,11 @@ def _read(
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
     from neurocal_cli.io.exchange.reading import read_cameras
 
-    cameras = read_cameras(files)
+    return _completed(read_cameras(files), unit, size)
+
+
+def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
+    """Cameras with the unit and the image size that their file lacks; an InputError if it has others."""
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
