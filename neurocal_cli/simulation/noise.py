@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,12 +57,7 @@ class NoiseStudy:
     apart: dict[tuple[str, str], float] = field(default_factory=dict)
 
 
-@frozen_dataclass(eq=False)
-class _Task:
-    scene: SimulatedScene
-    methods: tuple[str, ...]
-    sigma: float
-    seeds: tuple[tuple[int, ...], ...]  # of each trial; empty for one trial without noise
+_Task = tuple[float, list[tuple[int, ...]]]  # sigma [px], and the seeds of trials
 
 
 def study_noise(
@@ -78,15 +74,12 @@ def study_noise(
     The number of processes, `jobs`, does not change the result.
     """
     chosen = tuple(methods)
-    blocks = [
-        tuple((seed, k, trial) for trial in range(first, min(first + _BLOCK, trials)))
-        for k in range(len(sigma))
-        for first in range(0, trials, _BLOCK)
-    ]
-    tasks = [_Task(scene, chosen, 0.0, ())]
-    tasks += [_Task(scene, chosen, sigma[block[0][1]], block) for block in blocks]
+    tasks: list[_Task] = [(0.0, [(0,)])]
+    for k, level in enumerate(sigma):
+        seeds: list[tuple[int, ...]] = [(seed, k, trial) for trial in range(trials)]
+        tasks += [(level, seeds[first : first + _BLOCK]) for first in range(0, trials, _BLOCK)]
     found = []
-    for result in work_through(_errors, tasks, jobs):
+    for result in work_through(partial(_errors, scene, chosen), tasks, jobs):
         found.append(result)
         if progress is not None:
             progress("noise trials", len(found) / len(tasks))
@@ -141,15 +134,13 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     return np.concatenate([list(std.values()), poses[order].ravel()])
 
 
-def _errors(task: _Task) -> Array:
+def _errors(scene: SimulatedScene, methods: tuple[str, ...], task: _Task) -> Array:
     """(T, M, 5 + K + 6 V) errors of each trial and method; nan if there is no answer."""
-    scene, model = task.scene, task.scene.camera.model
-    truth = _truth(scene)
-    seeds = task.seeds or ((0,),)
-    errors = np.full((len(seeds), len(task.methods), len(truth)), np.nan)
+    (sigma, seeds), model, truth = task, scene.camera.model, _truth(scene)
+    errors = np.full((len(seeds), len(methods), len(truth)), np.nan)
     for n, seed in enumerate(seeds):
-        points = scene.points(task.sigma, np.random.default_rng(seed) if task.seeds else None)
-        for m, method in enumerate(task.methods):
+        points = scene.points(sigma, np.random.default_rng(seed))
+        for m, method in enumerate(methods):
             try:
                 found = calibrate_with(method, points, model, seed=seed[-1])
             except NeurocalError:

@@ -68,15 +68,6 @@ def reached(rms: Array, best: float) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(rms) & (rms <= _SAME * best + _FLOOR))
 
 
-@frozen_dataclass(eq=False)
-class _Task:
-    scene: SimulatedScene
-    sigma: float
-    kind: str
-    seed: int
-    starts: range
-
-
 def study_starts(
     scene: SimulatedScene,
     sigma: float,
@@ -94,14 +85,12 @@ def study_starts(
     problem = _problem(scene, sigma, seed)
     check_points(problem)
     kinds = [kind for kind in _KINDS if can_start(problem, kind)]
-    tasks = [
-        _Task(scene, sigma, kind, seed, range(first, min(first + _BLOCK, starts)))
-        for kind in kinds
-        for first in range(0, starts, _BLOCK)
-    ]
+    numbers = range(starts)
+    tasks = [(kind, numbers[first : first + _BLOCK]) for kind in kinds for first in numbers[::_BLOCK]]
+    results = work_through(partial(_ends, scene, sigma, seed), tasks, jobs)
     found: dict[str, list[float]] = {kind: [] for kind in kinds}
-    for n, (task, ends) in enumerate(zip(tasks, work_through(_ends, tasks, jobs), strict=True), start=1):
-        found[task.kind] += ends
+    for n, ((kind, _), ends) in enumerate(zip(tasks, results, strict=True), start=1):
+        found[kind] += ends
         if progress is not None:
             progress("random starts", n / len(tasks))
     rms = {kind: np.array(ends) for kind, ends in found.items()}
@@ -119,12 +108,12 @@ def _problem(scene: SimulatedScene, sigma: float, seed: int) -> Problem:
     return problem_for(points, 1)
 
 
-def _ends(task: _Task) -> list[float]:
-    problem = _problem(task.scene, task.sigma, task.seed)
-    kind = list(_KINDS).index(task.kind)
+def _ends(scene: SimulatedScene, sigma: float, seed: int, task: tuple[str, range]) -> list[float]:
+    """Final rms errors [px] of starts of a kind, which are counted."""
+    problem, (kind, starts) = _problem(scene, sigma, seed), task
+    number = list(_KINDS).index(kind)
     return [
-        single_start(problem, task.kind, np.random.default_rng((task.seed, _NOISE, kind, start)))
-        for start in task.starts
+        single_start(problem, kind, np.random.default_rng((seed, _NOISE, number, start))) for start in starts
     ]
 
 
