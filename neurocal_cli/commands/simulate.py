@@ -30,11 +30,11 @@ class _Command(options.Command):
         expanded: list[str] = []
         after = False
         for word in args:
-            if after and _is_number(word) and expanded[-1] != "--sigma":
+            more = after and _is_number(word)
+            if more and expanded[-1] != "--sigma":
                 expanded.append("--sigma")
-            elif not (after and _is_number(word)):
-                after = word == "--sigma"
             expanded.append(word)
+            after = more or word == "--sigma"
         return super().parse_args(ctx, expanded)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import click
@@ -119,7 +119,8 @@ def undistort(
         options.note_unused("without images", "interpolation")
     folder = _folder(paths, output) if paths else None
     outputs = [output for _ in paths] if folder is None else [_place(folder, path) for path in paths]
-    _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
+    results = *zip(paths, outputs, strict=True), ("the new camera", new_camera), ("the tables", maps)
+    _check_distinct((camera, *paths), results)
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
@@ -161,13 +162,14 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
         if is_image(paths[0]) and is_terminal(sys.stdout):
             raise UsageError("an image cannot be shown on a terminal; give a file, -o FILE")
         return None
+    if os.path.isdir(output) or output.endswith(os.sep):
+        return output
     unlike = is_image(paths[0]) and not is_image(output)
-    if not (several or os.path.isdir(output) or output.endswith(os.sep) or unlike):
+    if not (several or unlike):
         return None
-    if os.path.exists(output) and not os.path.isdir(output):
+    if os.path.exists(output):
         raise UsageError(f"-o {output} is a file; give a folder")
-    file = is_image(output) or output.lower().endswith((*_NOT_WRITTEN, ".csv"))
-    if file and not (os.path.isdir(output) or output.endswith(os.sep)):
+    if is_image(output) or output.lower().endswith((*_NOT_WRITTEN, ".csv")):
         raise UsageError(
             f"several files cannot go to one file, {output}; give a folder, -o DIR"
             if several
@@ -183,15 +185,13 @@ def _place(folder: str, path: str) -> str:
     return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
 
-def _check_distinct(
-    inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
-) -> None:
-    """Refuse to overwrite inputs, or to write two results, which a UsageError names, to the same file."""
+def _check_distinct(inputs: Iterable[str], results: Iterable[tuple[str, str | None]]) -> None:
+    """Refuse to overwrite inputs, or to write two results, given as names and places, to the same file."""
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}
-    targets = list(zip(outputs, paths, strict=True))
-    targets += [(place, what) for what, place in others.items() if place is not None]
-    for target, source in targets:
+    for source, target in results:
+        if target is None:
+            continue
         place = os.path.realpath(target) if target != "-" else "-"
         if place in read:
             raise UsageError(f"{target} is an input and would be overwritten; give another output")
