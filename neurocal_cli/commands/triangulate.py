@@ -96,10 +96,7 @@ def triangulate(
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
-    if sigma is None and math.isnan(rig.sigma):
-        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-        sigma = _USUAL_SIGMA
-    sigma = rig.sigma if sigma is None else sigma
+    sigma = _noise(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
@@ -131,6 +128,14 @@ def _rig(names: tuple[str, ...]) -> Rig:
     if not rig.warnings:
         preparation.warn_of_poor(rig, "; points in space may be far off")
     return rig
+
+
+def _noise(rig: Rig) -> float:
+    """Standard deviation of the rig's own pixels [px], or an assumed one if it does not state any."""
+    if not math.isnan(rig.sigma):
+        return rig.sigma
+    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+    return _USUAL_SIGMA
 
 
 class _Tally:

@@ -41,8 +41,8 @@ def _errors(camera: dict[str, Compared]) -> list[list[str]]:
         cells = ["-"] * 4
         if one.calibration is not None:
             model = one.calibration.distortion_model
-            cells = [_px(one.calibration.rmse_px), _px(one.held_out_px), f"{1000 * one.seconds:.0f}"]
-            cells.append("no distortion" if model == "none" else model)
+            errors = _px(one.calibration.rmse_px), _px(one.held_out_px)
+            cells = [*errors, f"{1000 * one.seconds:.0f}", "no distortion" if model == "none" else model]
         rows.append([method, *cells])
     return rows
 
