@@ -45,13 +45,9 @@ class Estimation:
 
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read, with a UsageError."""
-        for given, option, type_ in (
-            (self.image_center, "--image-center", "2"),
-            (self.intrinsics, "--intrinsics", "3"),
-            (self.extrinsics, "--extrinsics", "4"),
-        ):
-            if given is not None:
-                self._require("type", type_, option)
+        self._require("image_center", "type", "2")
+        self._require("intrinsics", "type", "3")
+        self._require("extrinsics", "type", "4")
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
@@ -69,14 +65,14 @@ class Estimation:
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
         for name in _BACKPROP:
-            if getattr(self, name) is not None:
-                self._require("trainer", "backprop", f"--{name.replace('_', '-')}")
+            self._require(name, "trainer", "backprop")
 
-    def _require(self, name: str, wanted: str, option: str) -> None:
-        """Refuse an option that needs another value of the option with this name."""
-        if (given := getattr(self, name)) != wanted:
-            need = f"--{name} {wanted}"
-            raise UsageError(f"{option} needs {need}, but the {name} is {given}; give {need}")
+    def _require(self, name: str, other: str, wanted: str) -> None:
+        """Refuse an option that is given, but needs another value of the other option."""
+        value = getattr(self, other)
+        if getattr(self, name) is not None and value != wanted:
+            option, need = f"--{name.replace('_', '-')}", f"--{other} {wanted}"
+            raise UsageError(f"{option} needs {need}, but the {other} is {value}; give {need}")
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
         """Read the given files; return the points and the library's keyword arguments."""

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from neurocal_cli.simulation.starts import StartStudy
 
 _SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
-_DEFAULT_METHODS = "neuro,nonlinear,linear,tsai"
 _FLAT_VIEWS = 10
 _STARTS_SIGMA = 0.5  # px
 
@@ -76,7 +75,7 @@ def _is_number(word: str) -> bool:
     multiple=True,
 )
 @options.count("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
-@options.methods(_DEFAULT_METHODS)
+@options.methods("neuro,nonlinear,linear,tsai")
 @options.count(
     "--random-starts",
     "N",
