@@ -73,33 +73,33 @@ def study_noise(
 
     The number of processes, `jobs`, does not change the result.
     """
-    chosen = tuple(methods)
     tasks: list[_Task] = [(0.0, [(0,)])]
     for k, level in enumerate(sigma):
         seeds: list[tuple[int, ...]] = [(seed, k, trial) for trial in range(trials)]
         tasks += [(level, seeds[first : first + _BLOCK]) for first in range(0, trials, _BLOCK)]
     found = []
-    for result in work_through(partial(_errors, scene, chosen), tasks, jobs):
+    for result in work_through(partial(_errors, scene, methods), tasks, jobs):
         found.append(result)
         if progress is not None:
             progress("noise trials", len(found) / len(tasks))
-    exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(chosen), -1)
+    exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(methods), -1)
     fold = _Fold(scene)
-    results = {}
-    for m, method in enumerate(chosen):
-        errors = noisy[:, :, m]
-        results[method] = MethodErrors(
+    errors = {method: noisy[:, :, m] for m, method in enumerate(methods)}
+    results = {
+        method: MethodErrors(
             fold.worst(exact[0, m]),
-            fold.rms(errors),
-            fold.mean(errors),
+            fold.rms(errors[method]),
+            fold.mean(errors[method]),
             fold.bound(cramer_rao(scene, method)),
-            np.isnan(errors[..., 0]).sum(axis=1),
+            np.isnan(errors[method][..., 0]).sum(axis=1),
         )
+        for m, method in enumerate(methods)
+    }
     whole = cramer_rao(scene, "neuro")
     apart = {
-        (a, b): _apart(noisy[:, :, chosen.index(a)], noisy[:, :, chosen.index(b)], np.array(sigma), whole)
+        (a, b): _apart(errors[a], errors[b], np.array(sigma), whole)
         for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
-        if a in chosen and b in chosen and not (results[a].failed + results[b].failed >= trials).any()
+        if a in errors and b in errors and not (results[a].failed + results[b].failed >= trials).any()
     }
     names = *INTRINSIC_NAMES, *coefficient_names(scene.camera.model), *POSE_NAMES
     return NoiseStudy(names, _truth(scene)[: len(names)], np.array(sigma), trials, results, apart)
@@ -134,7 +134,7 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     return np.concatenate([list(std.values()), poses[order].ravel()])
 
 
-def _errors(scene: SimulatedScene, methods: tuple[str, ...], task: _Task) -> Array:
+def _errors(scene: SimulatedScene, methods: Sequence[str], task: _Task) -> Array:
     """(T, M, 5 + K + 6 V) errors of each trial and method; nan if there is no answer."""
     (sigma, seeds), model, truth = task, scene.camera.model, _truth(scene)
     errors = np.full((len(seeds), len(methods), len(truth)), np.nan)
