@@ -167,7 +167,10 @@ def _option(
 
 
 def collected(kind: type, added: Sequence[Callable[[F], F]], to: str) -> Callable[[F], F]:
-    """Add options that are the fields of a dataclass, whose instance is the parameter `to` of the command."""
+    """Add options whose values a command gets as one dataclass, its parameter `to`.
+
+    Fields without an option are None.
+    """
     names = [field.name for field in fields(kind)]
 
     def add(command: Any) -> Any:
