@@ -78,20 +78,19 @@ def least_pixel_error(
 
 
 def least_squares(
-    residuals: Callable[[Array], Array], start: Array, view: NDArray[np.intp] | None = None, shared: int = 0
+    residuals: Callable[[Array], Array], start: Array, view: NDArray[np.intp], shared: int
 ) -> Minimum:
-    """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns of views, by a trust region.
+    """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns, by a trust region.
 
-    `residuals` maps unknowns (n,) to residuals (m,), and `view` (m,) is the view of each residual. Without
-    it, every residual may depend on every unknown. With it, the first `shared` unknowns are those that all
-    views share; the others belong to single views, in order.
+    `residuals` maps unknowns (n,) to residuals (m,), and `view` (m,) is the view of each residual. The first
+    `shared` unknowns are those that all views share; the others belong to single views, in order.
     """
     from scipy.optimize import least_squares as minimise
 
     def finite(x: Array) -> Array:
         return np.nan_to_num(residuals(x), nan=1e10, posinf=1e10, neginf=-1e10)
 
-    sparse = view is not None and len(start) > _DENSE
+    sparse = len(start) > _DENSE
     options: dict[str, Any] = {"method": "lm"}
     if sparse:
         options = {"method": "trf", "tr_solver": "lsmr"}
@@ -105,12 +104,10 @@ def least_squares(
 
 
 def _differences(
-    residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp] | None, shared: int, sparse: bool
+    residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp], shared: int, sparse: bool
 ) -> Any:
     """Derivatives (m, n) by forward differences; the unknowns of different views are varied together."""
     at = residuals(x)
-    if view is None:
-        view, shared = np.zeros(len(at), dtype=np.intp), len(x)
     own = np.arange(shared, len(x)).reshape(int(view.max()) + 1, -1)
     steps = _STEP * np.maximum(np.abs(x), 1.0)
     differences = []

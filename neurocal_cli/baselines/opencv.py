@@ -48,8 +48,8 @@ def opencv(problem: Problem) -> Found:
     world = [np.ascontiguousarray(points.world[rows], dtype=np.float32) for rows in parts]
     pixels = [np.ascontiguousarray(points.pixels[rows], dtype=np.float32) for rows in parts]
     size = points.image_size or tuple(int(side) + 1 for side in points.pixels.max(axis=0))
-    names = problem.distortion.model if problem.free_distortion else "none"
-    flags = _flags(cv2, names)
+    model = problem.distortion.model if problem.free_distortion else "none"
+    flags = _flags(cv2, model)
     guess = np.array([[size[0], 0, (size[0] - 1) / 2], [0, size[0], (size[1] - 1) / 2], [0, 0, 1.0]])
     in_z = all(np.ptp(one[:, 2]) == 0 for one in world)
     if problem.type == 2:
@@ -68,7 +68,7 @@ def opencv(problem: Problem) -> Found:
     R = np.array([cv2.Rodrigues(turn)[0] for turn in turns], dtype=float)
     t = np.array([np.ravel(shift) for shift in shifts], dtype=float)
     width = len(problem.free_camera) - 5
-    state = CameraState(np.array([A[ENTRIES]]), R, t, names, np.array(k, dtype=float).ravel()[:width])
+    state = CameraState(np.array([A[ENTRIES]]), R, t, model, np.array(k, dtype=float).ravel()[:width])
     if not (np.isfinite(state.entries).all() and (state.entries[0, [0, 2]] > 0).all()):
         raise DegenerateGeometryError("OpenCV's result is not a valid camera; use the method neuro")
     remarks = ("OpenCV's calibrateCamera has no skew: theta is a right angle",)

@@ -111,7 +111,7 @@ class _Alignment:
         rows = self.rows.copy()
         rows[:, 0] /= s
         if self.flat:
-            rows[:, :, :] /= np.linalg.svd(rows[:, :, :2])[1][:, 0, None, None]
+            rows /= np.linalg.svd(rows[:, :, :2])[1][:, 0, None, None]
             left = np.sqrt(np.maximum(1 - (rows[:, :, :2] ** 2).sum(axis=2), 0.0))
             dot = (rows[:, 0, :2] * rows[:, 1, :2]).sum(axis=1)
             rows[:, 0, 2] = sign * left[:, 0]

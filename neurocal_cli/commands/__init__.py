@@ -8,7 +8,7 @@ at their top that needs NumPy, so that ``--help`` is fast.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.streams import TYPED, one_line, set_verbosity, tell
+from neurocal_cli.commands.streams import TYPED, debugging, one_line, set_verbosity, tell
 from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
@@ -46,25 +46,20 @@ _SUMMARIES = {
 class _LazyGroup(click.Group):
     """A group that imports a command's module only when it is used; a hidden command has no summary."""
 
-    def __init__(self, *args: Any, summaries: Mapping[str, str | None], **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._summaries = summaries
-
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self._summaries)
+        return list(_SUMMARIES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in self._summaries:
-            self._load(cmd_name)
-        else:
-            for name in self._summaries:  # so that click can suggest the nearest name
-                self._load(name)
+        # All are loaded for a wrong name, so that click can suggest the nearest one.
+        for name in [cmd_name] if cmd_name in _SUMMARIES else _SUMMARIES:
+            if name not in self.commands:
+                self.add_command(getattr(import_module(f"{__name__}.{name}"), name), name)
         return self.commands.get(cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the table of commands without loading them."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, text in self._summaries.items() if text])
+            formatter.write_dl([(name, text) for name, text in _SUMMARIES.items() if text])
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
@@ -84,10 +79,6 @@ class _LazyGroup(click.Group):
         with _one_line_errors(), all_or_none(finishing=(click.exceptions.Exit,)):
             return super().invoke(ctx)
 
-    def _load(self, name: str) -> None:
-        if name not in self.commands:
-            self.add_command(getattr(import_module(f"{__name__}.{name}"), name), name)
-
 
 @contextmanager
 def _one_line_errors() -> Iterator[None]:
@@ -102,7 +93,7 @@ def _one_line_errors() -> Iterator[None]:
     except NeurocalError as error:
         message, exit_code = str(error), error.exit_code
     except Exception as error:
-        if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
+        if debugging():
             raise
         message, exit_code = _explain(error), 1
     tell(f"Error: {one_line(message)}")
@@ -124,11 +115,7 @@ def _explain(error: Exception) -> str:
     return f"internal error: {what}; run with NEUROCAL_DEBUG=1 to see where"
 
 
-@click.command(
-    cls=_LazyGroup,
-    summaries=_SUMMARIES,
-    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
-)
+@click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.option(
     "-q", "--quiet", count=True, show_default="no", help="Print only warnings and errors; twice: only errors."
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -34,7 +32,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    options.check_plot(plot, "-")
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (calibration,))
     from neurocal_cli.io.calibration_tree import read_calibration
     from neurocal_cli.planning.advice import advise as weigh
@@ -45,7 +43,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     if plot is not None:
         from neurocal_cli.planning.plots import draw_advice
 
-        write_plot(plot, partial(draw_advice, advice, known))
+        write_plot(plot, draw_advice, advice, known)
     if as_json:
         print_summary(advice_json(advice))
     else:

@@ -10,6 +10,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -36,11 +37,7 @@ _ENDINGS = (".svg", ".pdf", ".png")
 )
 @options.json
 def board(
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     paper: str,
     dpi: float,
     output: str,
@@ -72,22 +69,19 @@ def board(
         raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
-    beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
-    preparation.check_outputs((output, beside), (board,))
+    beside = None if board.file is not None else os.path.splitext(output)[0] + ".yaml"
+    preparation.check_outputs((output, beside), (board.file,))
     from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
-    target = preparation.given_board(board, cols, rows, square, unit)
-    if target is None:
-        target = default_board(size)
+    target = board.read() or default_board(size)
     sheet = on_paper(target, size)
     from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
-    from neurocal_cli.io.writing import write_whole
 
-    if ending == ".svg":
-        write_whole(output, board_svg(sheet))
+    if ending == ".png":
+        write_whole(output, board_png(sheet, dpi))
     else:
-        write_whole(output, board_pdf(sheet) if ending == ".pdf" else board_png(sheet, dpi))
+        write_whole(output, board_svg(sheet) if ending == ".svg" else board_pdf(sheet))
     if beside is not None:
         from neurocal_cli.io.board_yaml import write_board
 
@@ -96,9 +90,8 @@ def board(
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:
-    alike = [p for p in target.planes if (p.cols - p.rows) % 2 == 0]
-    if alike and len(target.planes) == 1:
-        cols, rows = alike[0].cols, alike[0].rows
+    cols, rows = target.planes[0].cols, target.planes[0].rows
+    if len(target.planes) == 1 and (cols - rows) % 2 == 0:
         warn(
             f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
             f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -80,7 +78,7 @@ def calibrate(
     options.check_camera_name(camera_name)
     check_plots(plots, output)
     preparation.check_outputs((output, html, *(file for _, file in plots)), inputs)
-    given, arguments = estimation.prepare(preparation.given_points(points))
+    given, arguments = estimation.prepare(preparation.given_points(*points))
 
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.methods import calibrate as learn
@@ -92,7 +90,7 @@ def calibrate(
         from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
 
-        write_plots(plots, partial(draw_camera, Subject.of(calibration)))
+        write_plots(plots, draw_camera, Subject.of(calibration))
     warn(*write_result(calibration, output, lean=lean))
     write_page(html, calibration, *inputs)
     conclude(calibration, as_json, calibration_json, calibration_report)

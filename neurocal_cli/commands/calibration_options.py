@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
-from functools import wraps
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.commands import options, preparation
+from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -15,7 +15,11 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
 
-_BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
+# Options of back-propagation only, and their names in `BackpropOptions`.
+_BACKPROP = {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}
+
+# Options that are arguments of `methods.calibrate` with the same name and value.
+_SAME = ("method", "trainer", "distortion", "outliers", "target", "seed", "starts")
 
 
 @frozen_dataclass
@@ -41,13 +45,9 @@ class Estimation:
 
     def check(self) -> None:
         """Refuse options that contradict each other, before any file is read, with a UsageError."""
-        for given, option, type_ in (
-            (self.image_center, "--image-center", "2"),
-            (self.intrinsics, "--intrinsics", "3"),
-            (self.extrinsics, "--extrinsics", "4"),
-        ):
-            if given is not None:
-                self._require("type", type_, option)
+        self._require("image_center", "type", "2")
+        self._require("intrinsics", "type", "3")
+        self._require("extrinsics", "type", "4")
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
@@ -64,15 +64,15 @@ class Estimation:
         if self.method != "neuro":
             unused = ("starts", "seed", *(["outliers"] if self.outliers == "reject" else []))
             options.note_unused(f"with --method {self.method}", *unused)
-        for name, option in _BACKPROP_ONLY.items():
-            if getattr(self, name) is not None:
-                self._require("trainer", "backprop", option)
+        for name in _BACKPROP:
+            self._require(name, "trainer", "backprop")
 
-    def _require(self, name: str, wanted: str, option: str) -> None:
-        """Refuse an option that needs another value of the option with this name."""
-        if (given := getattr(self, name)) != wanted:
-            need = f"--{name} {wanted}"
-            raise UsageError(f"{option} needs {need}, but the {name} is {given}; give {need}")
+    def _require(self, name: str, other: str, wanted: str) -> None:
+        """Refuse an option that is given, but needs another value of the other option."""
+        value = getattr(self, other)
+        if getattr(self, name) is not None and value != wanted:
+            option, need = f"--{name.replace('_', '-')}", f"--{other} {wanted}"
+            raise UsageError(f"{option} needs {need}, but the {other} is {value}; give {need}")
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
         """Read the given files; return the points and the library's keyword arguments."""
@@ -80,22 +80,13 @@ class Estimation:
             if points.image_size not in (None, self.image_size):
                 note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
-        arguments: dict[str, Any] = {
-            "type": int(self.type),
-            "method": self.method,
-            "trainer": self.trainer,
-            "distortion": self.distortion,
-            "skew": not self.no_skew,
-            "outliers": self.outliers,
-            "target": self.target,
-            "seed": self.seed,
-            "starts": self.starts,
-        }
-        values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
-        if given := {name: value for name, value in values.items() if value is not None}:
+        arguments: dict[str, Any] = {name: getattr(self, name) for name in _SAME}
+        arguments |= {"type": int(self.type), "skew": not self.no_skew}
+        values = {to: getattr(self, name) for name, to in _BACKPROP.items()}
+        if given := {to: value for to, value in values.items() if value is not None}:
             from neurocal_cli.training.backprop import BackpropOptions
 
-            arguments["backprop"] = BackpropOptions(**given)  # type: ignore[arg-type]
+            arguments["backprop"] = BackpropOptions(**given)
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
@@ -134,22 +125,10 @@ def _note_exact(what: str) -> None:
     note(f"{what} is taken as exact: the standard deviations do not include its errors")
 
 
-def estimation_options(files: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def estimation_options(files: bool = True) -> Callable[[F], F]:
     """Add the options of `Estimation`, a command's keyword ``estimation``; known cameras only if `files`."""
-    names = [field.name for field in fields(Estimation)]
-
-    def add(command: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(command)
-        def collected(*args: Any, **kwargs: Any) -> Any:
-            estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
-            return command(*args, estimation=estimation, **kwargs)
-
-        for option in reversed(_OPTIONS):
-            if files or option not in _FILES:
-                collected = option(collected)
-        return collected
-
-    return add
+    added = [option for option in _OPTIONS if files or option not in _FILES]
+    return options.collected(Estimation, added, "estimation")
 
 
 _FILES = [

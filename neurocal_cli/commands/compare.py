@@ -82,7 +82,7 @@ def compare(
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(points, right)
     preparation.compute_in_one_thread()
-    given = [preparation.given_points([name]) for name in (points, right) if name is not None]
+    given = [preparation.given_points(name) for name in (points, right) if name is not None]
     if image_size is not None:
         given = [replace(one, image_size=image_size) for one in given]
 

@@ -13,6 +13,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.io.files import repeatable_stdin
+from neurocal_cli.io.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
@@ -66,11 +68,7 @@ def convert(
     target: str,
     model: str | None,
     force: bool,
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     image_size: tuple[int, int] | None,
     as_json: bool,
     output: str,
@@ -120,44 +118,47 @@ def convert(
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
           -o corners.npz
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(*files, board)
+    preparation.check_one_stdin(*files, board.file)
     preparation.check_summary(as_json, output)
-    preparation.check_unit(unit)
+    board.check_unit()
     folder = os.path.isdir(output) or output.endswith(os.sep)
-    preparation.check_outputs((None if folder else output,), (*files, board))
-    of_board = None if square is None and board is None else unit
-    target_board = preparation.given_board(board, cols, rows, square, of_board)
+    preparation.check_outputs(() if folder else (output,), (*files, board.file))
+    described = board.file is not None or board.square is not None
+    target_board = (board if described else replace(board, unit=None)).read()
     from neurocal_cli.io.exchange.camera_set import CameraSet
-    from neurocal_cli.io.files import repeatable_stdin
 
     with repeatable_stdin() if "-" in files else nullcontext():
-        found = _read(files, target_board, unit, image_size)
+        found = _read(files, target_board, board.unit, image_size)
     if isinstance(found, CameraSet):
-        told = _write_cameras(found, target, model, force, output)
-    else:
-        if model is not None:
-            raise UsageError("FILE holds points, which have no distortion model; leave out --model")
+        summary = _write_cameras(found, target, model, force, output)
+    elif model is None:
         options.note_unused("on points", "force")
-        from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
-        from neurocal_cli.io.writing import write_whole
-
-        text = corner_text(found, target, os.path.splitext(output)[1].lower())
-        losses, remarks = points_lost(found, target)
-        note(*remarks)
-        warn(*losses)
-        write_whole(output, text)
-        told = {"to": target, "n_points": len(found), "n_views": found.n_views}
-        told["warnings"] = [*losses, *remarks]
-        if not as_json:
-            say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
+        summary = _write_points(found, target, output)
+    else:
+        raise UsageError("FILE holds points, which have no distortion model; leave out --model")
     if as_json:
-        print_summary(told)
+        print_summary(summary)
+    elif not isinstance(found, CameraSet):
+        say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
+
+
+def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
+    """Write points; return the summary for programs."""
+    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+
+    text = corner_text(points, target, os.path.splitext(output)[1].lower())
+    losses, remarks = points_lost(points, target)
+    note(*remarks)
+    warn(*losses)
+    write_whole(output, text)
+    counts = {"n_points": len(points), "n_views": points.n_views}
+    return {"to": target, **counts, "warnings": [*losses, *remarks]}
 
 
 def _write_cameras(
     cameras: CameraSet, target: str, model: str | None, force: bool, output: str
 ) -> dict[str, Any]:
-    """Write cameras; what there is to say of them, for programs."""
+    """Write cameras; return the summary for programs."""
     from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
     from neurocal_cli.io.exchange.reading import FORMATS
 
@@ -205,16 +206,20 @@ def _read(
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
     from neurocal_cli.io.exchange.reading import read_cameras
 
-    cameras = read_cameras(files)
+    return _completed(read_cameras(files), unit, size)
+
+
+def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
+    """Cameras with the unit and the image size that their file lacks; an InputError if it has others."""
     if unit is not None:
         if cameras.unit not in (None, unit) and cameras.has_lengths:
             raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
         cameras = replace(cameras, unit=unit)
     if size is not None:
         for camera in cameras.cameras:
-            if camera.image_size not in (None, size):
-                stated = f"{camera.image_size[0]} {camera.image_size[1]}" if camera.image_size else ""
-                raise InputError(f"the image size of the file is {stated}; leave out --image-size")
+            if camera.image_size is not None and camera.image_size != size:
+                width, height = camera.image_size
+                raise InputError(f"the image size of the file is {width} {height}; leave out --image-size")
         if any(camera.image_size is None for camera in cameras.cameras):
             sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
             cameras = replace(cameras, cameras=sized, origin=None)
@@ -222,8 +227,6 @@ def _read(
 
 
 def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
-    from neurocal_cli.io.writing import check_places, make_folder, write_whole
-
     if set(contents) == {""}:
         write_whole(output, contents[""])
         return

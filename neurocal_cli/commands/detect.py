@@ -11,24 +11,27 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.frames import of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
 from neurocal_cli.commands.streams import (
     ProgressBar,
     complain,
+    debugging,
     note,
+    note_once,
     one_line,
     print_summary,
     say,
-    some_of,
     warn,
     where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
+from neurocal_cli.io.image_headers import stated_sizes
+from neurocal_cli.io.image_paths import find_images, view_names
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions
-    from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.measuring import Points
     from neurocal_cli.detection.outcome import Outcome
 
@@ -87,11 +90,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
 @options.output("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
-    board: str | None,
-    cols: int | None,
-    rows: int | None,
-    square: float | None,
-    unit: str | None,
+    board: options.BoardOptions,
     points: str,
     gamma: float | None,
     overlay: str | None,
@@ -133,41 +132,40 @@ def detect(
           --cache found --frames 30 -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(*images, board)
+    preparation.check_one_stdin(*images, board.file)
     preparation.check_summary(as_json, output)
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
-    target = preparation.given_board(board, cols, rows, square, unit)
-    if target is None:
-        raise UsageError(preparation.NO_SIZE)
-    if target.distances:
-        scale = target.scale
+    target = _measured(board.read())
+    wanted = _wanted(target, points, gamma, overlay, cache)
+    if watch is None:
+        outcomes = _examined(images, wanted, board.file, output, overlay, jobs, frames)
+    else:
+        outcomes = _watched(images, wanted, board.file, output, watch)
+    outcomes = of_one_size(outcomes)
+    _report(outcomes, target, as_json)
+    from neurocal_cli.detection.detect import gather
+    from neurocal_cli.io.points_csv import format_points
+
+    text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
+    if overlay is not None:
+        _write_overlays(outcomes, overlay)
+    write_whole(output, text)
+
+
+def _measured(board: Board | None) -> Board:
+    """The board in its measured size; a UsageError if there is none."""
+    if board is None:
+        raise UsageError(options.NO_SIZE)
+    if board.distances:
+        scale = board.scale
         said = f"; {scale.contradiction}" if scale.contradiction else ""
         note(
             f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
             f"{100 * scale.std:.2g} %{said}"
         )
-    target = target.as_measured()
-    wanted = _wanted(target, points, gamma, overlay, cache)
-    if watch is None:
-        outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
-    else:
-        outcomes = _watched(images, wanted, board, output, watch)
-    outcomes = of_one_size(outcomes)
-    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
-    _report(outcomes, found, target, as_json)
-    from neurocal_cli.detection.detect import gather
-    from neurocal_cli.io.points_csv import format_points
-    from neurocal_cli.io.writing import make_folder, write_whole
-
-    text = format_points(replace(gather(found, target.unit), distances=target.distances))
-    if overlay is not None:
-        make_folder(overlay)
-        for name, outcome in outcomes.items():
-            if outcome.overlay is not None:
-                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
-    write_whole(output, text)
+    return board.as_measured()
 
 
 def _wanted(
@@ -182,8 +180,7 @@ def _wanted(
     if cache is not None:
         preparation.check_folder("--cache", cache)
         known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
-    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    return DetectionOptions(board, kind, gamma, overlay is not None, strict, known)
+    return DetectionOptions(board, kind, gamma, overlay is not None, debugging(), known)
 
 
 def _examined(
@@ -197,7 +194,6 @@ def _examined(
 ) -> dict[str, Outcome]:
     """Outcomes of all images, by the names of their views."""
     from neurocal_cli.detection.batch import default_jobs, detect_files
-    from neurocal_cli.io.image_paths import find_images, view_names
 
     given = find_images(words)
     view_names(given)  # no name twice
@@ -222,8 +218,6 @@ def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
 ) -> dict[str, Outcome]:
     """Outcomes of the images that have arrived, by the names of their views."""
-    from neurocal_cli.io.image_paths import find_images, view_names
-
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
     preparation.check_outputs((output,), (board_file,))
@@ -234,10 +228,15 @@ def _watched(
     return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
 
 
+def _write_overlays(outcomes: Mapping[str, Outcome], folder: str) -> None:
+    make_folder(folder)
+    for name, outcome in outcomes.items():
+        if outcome.overlay is not None:
+            write_whole(os.path.join(folder, f"{name}.png"), outcome.overlay)
+
+
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Warn of images of different sizes before any work, because one camera has one image size."""
-    from neurocal_cli.io.image_headers import stated_sizes
-
     sizes = Counter(size for size in stated_sizes(paths) if size is not None)
     if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
         return []
@@ -263,10 +262,9 @@ def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     ]
 
 
-def _report(
-    outcomes: Mapping[str, Outcome], found: Mapping[str, Detection], board: Board, as_json: bool
-) -> None:
+def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> None:
     """Report failed images with the reason, and remarks common to several images once."""
+    found = detections(outcomes)
     problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
     for problem in problems.values() if len(outcomes) > 1 else ():
         complain(problem)
@@ -274,7 +272,7 @@ def _report(
     for name, outcome in outcomes.items():
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(*(f"{some_of(names)}: {text}" for text, names in remarks.items()))
+    note_once(remarks)
     warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
     warn(*_mixed_orientations(outcomes.values()))
     warn(*_another_board([_shown(outcome) for outcome in outcomes.values()], board))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
-from neurocal_cli.commands.streams import note, print_summary, show, warn
+from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
 
@@ -78,13 +77,13 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     preparation.check_one_stdin(calibration, points)
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (calibration, points))
-    given = None if points is None else preparation.given_points([points])
+    given = None if points is None else preparation.given_points(points)
     evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
         from neurocal_cli.plots.camera_panels import Subject
         from neurocal_cli.plots.pages import draw_camera
 
-        write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
+        write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     _tell(evaluation)
     from neurocal_cli.report import evaluation_json, evaluation_tables
     from neurocal_cli.verdict.report import verdict_lines
@@ -122,8 +121,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
         (renamed, "other points than the calibration has under this name"),
     ):
         if names:
-            some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-            note(f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed")
+            note(f"{first_of(names)}: {why}; the pose is fitted with the intrinsic parameters fixed")
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
@@ -196,31 +194,37 @@ def stereo(
     preparation.check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
-    given = None
-    if points is not None:
-        from neurocal_cli.io.points_csv import read_points
-
-        notes: list[str] = []
-        given = read_points([points[0]], notes=notes), read_points([points[1]], notes=notes)
-        note(*notes)
+    given = None if points is None else _read_pair(points)
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
-        write_plots(plots, partial(draw_points_in_space, evaluation, rig))
+        write_plots(plots, draw_points_in_space, evaluation, rig)
     from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
     from neurocal_cli.verdict.report import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
-        names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note(f"{names}: the calibrations have no such images; the poses are fitted with the cameras fixed")
+        note(
+            f"{first_of(evaluation.fitted)}: the calibrations have no such images; the poses are fitted with "
+            "the cameras fixed"
+        )
     warn(*evaluation.warnings)
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
         verdict = evaluation.verdict
         show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+
+
+def _read_pair(files: tuple[str, str]) -> tuple[Correspondences, Correspondences]:
+    """Points of the left and of the right camera."""
+    from neurocal_cli.io.points_csv import read_points
+
+    notes: list[str] = []
+    pair = read_points(files[0], notes=notes), read_points(files[1], notes=notes)
+    note(*notes)
+    return pair
 
 
 def _evaluate_stereo(

@@ -6,7 +6,7 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from neurocal_cli.detection.batch import DetectionOptions
+    from neurocal_cli.detection.detect import Detection
     from neurocal_cli.detection.outcome import Outcome
 
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
@@ -61,9 +62,14 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
     return saved
 
 
+def detections(outcomes: Mapping[str, Outcome]) -> dict[str, Detection]:
+    """The boards that were detected, by the names of the outcomes."""
+    return {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+
+
 def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
     """Leave out boards in images whose size differs from the most common one; none if two sizes tie."""
-    found = {name: outcome.detection for name, outcome in outcomes.items() if outcome.detection is not None}
+    found = detections(outcomes)
     sizes = Counter(detection.image_size for detection in found.values()).most_common(2)
     if len(sizes) < 2 or sizes[0][1] == sizes[1][1]:
         return outcomes
@@ -131,14 +137,14 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
     if outcome.detection is None:
         complain(outcome.problem)
         return
-    found = {name: one.detection for name, one in alike.items() if one.detection is not None}
-    name = os.path.basename(path)
+    found = detections(alike)
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.methods import calibrate
     from neurocal_cli.planning.advice import advise
     from neurocal_cli.planning.report import advice_lines
 
-    head = f"{name}: {len(outcome.detection.ids)} points, {len(found)} view{'s' * (len(found) != 1)}"
+    views = "1 view" if len(found) == 1 else f"{len(found)} views"
+    head = f"{os.path.basename(path)}: {len(outcome.detection.ids)} points, {views}"
     try:
         calibration = calibrate(gather(found, options.board.unit))
         verdict = calibration.verdict

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -167,7 +165,7 @@ def fit(
     if plot is not None:
         from neurocal_cli.zoom_lens.plots import draw_lens
 
-        write_plot(plot, partial(draw_lens, learnt))
+        write_plot(plot, draw_lens, learnt)
     write_lens(learnt, output)
     conclude(learnt, as_json, lens_json, lens_report)
 
@@ -257,7 +255,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     preparation.check_one_stdin(lens_file, points)
-    options.check_plot(plot, None)
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
@@ -274,7 +272,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     if plot is not None:
         from neurocal_cli.zoom_lens.plots import draw_evaluation
 
-        write_plot(plot, partial(draw_evaluation, evaluation, learnt.controls))
+        write_plot(plot, draw_evaluation, evaluation, learnt.controls)
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import click
 
 from neurocal_cli import __version__
 from neurocal_cli.commands import options
+from neurocal_cli.io.writing import make_folder, write_whole
 
 _EXIT_STATUS = (
     ("0", "Done."),
@@ -67,8 +69,6 @@ def man(ctx: click.Context, directory: str) -> None:
     Examples:
       neurocal man man
     """  # noqa: D301 - as in the group
-    from neurocal_cli.io.writing import make_folder, write_whole
-
     make_folder(directory)
     for name, page in man_pages(ctx.find_root().command).items():
         write_whole(os.path.join(directory, name), page)
@@ -98,18 +98,18 @@ def _page_name(ctx: click.Context) -> str:
 def _page(ctx: click.Context, names: list[str]) -> str:
     """One man page in the macros of man(7)."""
     summary, description, examples = _split_help(ctx.command.help or "")
-    name = _page_name(ctx)
+    name, brief = _page_name(ctx), summary[:1].lower() + summary[1:].rstrip(".")
     others = [other for other in names if other != name]
     children = [child for child in list(_walk(ctx))[1:] if not isinstance(child.command, click.Group)]
     commands = [(child.command_path, _split_help(child.command.help or "")[0]) for child in children]
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
-        *_section("NAME", _name_lines(name, summary)),
+        *_section("NAME", _wrap(rf"{_escape(name)} \- {_escape(brief)}")),
         *_section("SYNOPSIS", _synopsis(ctx)),
         *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
         *_section("COMMANDS", _terms(commands)),
-        *_section("ARGUMENTS", _terms(_arguments(ctx))),
+        *_section("ARGUMENTS", _terms(options.arguments(ctx.command))),
         *_section("OPTIONS", _terms(_options(ctx))),
         *_section("EXAMPLES", _verbatim(examples)),
         *_section("EXIT STATUS", _terms(_EXIT_STATUS)),
@@ -120,15 +120,8 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _name_lines(name: str, summary: str) -> list[str]:
-    text = rf"{_escape(name)} \- {_escape(summary[:1].lower() + summary[1:].rstrip('.'))}"
-    return textwrap.wrap(text, _WIDTH, break_on_hyphens=False, break_long_words=False)
-
-
 def _split_help(text: str) -> tuple[str, list[str], list[str]]:
     """Summary, paragraphs and lines of examples of a help text."""
-    import inspect
-
     paragraphs = [p for p in re.split(r"\n\s*\n", inspect.cleandoc(text)) if p.strip()]
     examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
     others = [p for p in paragraphs[1:] if p not in examples]
@@ -138,14 +131,10 @@ def _split_help(text: str) -> tuple[str, list[str], list[str]]:
 
 def _synopsis(ctx: click.Context) -> list[str]:
     words = [rf"\fB{_escape(ctx.command_path)}\fR", r"[\fIOPTIONS\fR]"]
-    words += [rf"\fI{_escape(name)}\fR" for name, _ in _arguments(ctx)]
+    words += [rf"\fI{_escape(name)}\fR" for name, _ in options.arguments(ctx.command)]
     if isinstance(ctx.command, click.Group):
         words.append(r"\fICOMMAND\fR ...")
     return [" ".join(words)]
-
-
-def _arguments(ctx: click.Context) -> list[tuple[str, str]]:
-    return [(str(p.metavar), p.description) for p in ctx.command.params if isinstance(p, options.Argument)]
 
 
 def _options(ctx: click.Context) -> list[tuple[str, str]]:
@@ -193,7 +182,7 @@ def _verbatim(text: list[str]) -> list[str]:
     return [".PP", ".nf", ".RS", *lines, ".RE", ".fi"] if lines else []
 
 
-def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
+def _terms(rows: Iterable[tuple[str, str]]) -> list[str]:
     # Lines may break behind each value of a long list.
     named = [(_escape(term).replace("|", r"|\:"), text) for term, text in rows]
     return [line for term, text in named for line in (".TP", rf"\fB{term}\fR", *_fill(text))]
@@ -201,8 +190,11 @@ def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[st
 
 def _fill(text: str) -> list[str]:
     """Wrap running text into lines that troff does not mistake for requests."""
-    lines = textwrap.wrap(_escape(text), _WIDTH, break_long_words=False, break_on_hyphens=False)
-    return [rf"\&{line}" if line.startswith((".", "'")) else line for line in lines]
+    return [rf"\&{line}" if line.startswith((".", "'")) else line for line in _wrap(_escape(text))]
+
+
+def _wrap(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def _escape(text: str) -> str:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from functools import partial
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import partial, wraps
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -17,6 +18,13 @@ from click.types import FloatParamType
 
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.plots.figure import check_available
+
+if TYPE_CHECKING:
+    from neurocal_cli.board import Board
+
+NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 _PICTURES = (".png", ".pdf", ".svg")
 
@@ -72,11 +80,15 @@ class Command(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the arguments, then the options."""
-        rows = [(str(p.metavar), p.description) for p in self.params if isinstance(p, Argument)]
-        if rows:
+        if rows := arguments(self):
             with formatter.section("Arguments"):
                 formatter.write_dl(rows)
         super().format_options(ctx, formatter)
+
+
+def arguments(command: click.Command) -> list[tuple[str, str]]:
+    """The arguments of a command, as they stand in its usage, and their descriptions."""
+    return [(str(p.metavar), p.description) for p in command.params if isinstance(p, Argument)]
 
 
 class FiniteNumber(FloatParamType):
@@ -154,6 +166,26 @@ def _option(
     return click.option(*names, *([] if to is None else [to]), help=help, **attributes)
 
 
+def collected(kind: type, added: Sequence[Callable[[F], F]], to: str) -> Callable[[F], F]:
+    """Add options whose values a command gets as one dataclass, its parameter `to`.
+
+    Fields without an option are None.
+    """
+    names = [field.name for field in fields(kind)]
+
+    def add(command: Any) -> Any:
+        @wraps(command)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            kwargs[to] = kind(**{name: kwargs.pop(name, None) for name in names})
+            return command(*args, **kwargs)
+
+        for option in reversed(added):
+            call = option(call)
+        return call
+
+    return add
+
+
 def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names an input."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
@@ -191,23 +223,54 @@ def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], 
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
 
 
+@frozen_dataclass
+class BoardOptions:
+    """The values of the options of a board, whose file is not read yet."""
+
+    file: str | None
+    cols: int | None
+    rows: int | None
+    square: float | None
+    unit: str | None
+
+    def read(self) -> Board | None:
+        """The board; None if no option describes one, a UsageError if they contradict each other."""
+        from neurocal_cli.board import Board
+
+        self.check_unit()
+        cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
+        if self.file is not None:
+            if (cols, rows, square, unit) != (None,) * 4:
+                raise UsageError(
+                    "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+                )
+            from neurocal_cli.io.board_yaml import read_board
+
+            return read_board(self.file)
+        if (cols, rows, square, unit) == (None,) * 4:
+            return None
+        if cols is None or rows is None or square is None:
+            raise UsageError(NO_SIZE)
+        return Board.single(cols, rows, square, "mm" if unit is None else unit)
+
+    def check_unit(self) -> None:
+        """Refuse a unit that cannot be stored in a file, with a UsageError."""
+        unit = self.unit
+        if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
+            raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
+
+
 def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
-    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `preparation.given_board`."""
+    """Add the options of `BoardOptions`, a command's keyword ``board``."""
     size = partial(count, without="none", least=2, most=1000)
     added = (
-        path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+        path("--board", "BOARD.yaml", "Board file; a board may have several planes.", to="file"),
         size("--cols", "C", "Number of inner vertices in a row of the board."),
         size("--rows", "R", "Number of rows of inner vertices."),
         number("--square", "S", "Side length of a square.", without="none", positive=True),
         click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
     )
-
-    def add(f: F) -> F:
-        for option in reversed(added):
-            f = option(f)
-        return f
-
-    return add
+    return collected(BoardOptions, added, "board")
 
 
 camera_name = click.option(
@@ -282,7 +345,7 @@ def plot(what: str) -> Callable[[F], F]:
     return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
 
 
-def check_plot(plot: str | None, output: str | None = None) -> None:
+def check_plot(plot: str | None, output: str = "-") -> None:
     """Refuse a picture that cannot be drawn, before any work is done."""
     if plot is None:
         return
@@ -290,8 +353,6 @@ def check_plot(plot: str | None, output: str | None = None) -> None:
         raise UsageError(
             f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
         )
-    if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
+    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
         raise UsageError("-o and --plot name the same file; give two different files")
-    from neurocal_cli.plots.figure import check_available
-
     check_available()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
+from neurocal_cli.io.files import read_bytes
+from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
@@ -46,23 +49,21 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     )
 
 
-def check_plots(plots: Plots, output: str | None = None) -> None:
+def check_plots(plots: Plots, output: str = "-") -> None:
     """Refuse pictures that cannot be drawn; see `options.check_plot`."""
     for _, file in plots:
         options.check_plot(file, output)
 
 
-def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
-    """Draw and write all pictures; `draw` gives a picture of a kind ("png") and of a panel."""
+def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write all pictures of a subject; see `write_plot`."""
     for panel, file in plots:
-        write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
+        write_plot(file, partial(draw, panel=panel), *subject)
 
 
-def write_plot(file: str, draw: Callable[[str], bytes]) -> None:
-    """Draw and write a picture of the kind that its name ends in."""
-    from neurocal_cli.io.writing import write_whole
-
-    write_whole(file, draw(os.path.splitext(file)[1][1:].lower()))
+def write_plot(file: str, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write a picture of a subject, of the `kind` that the file's name ends in."""
+    write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
 
 
 html_option = options.path(
@@ -81,8 +82,6 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
 
     from neurocal_cli.html_report.page import Origin, versions
     from neurocal_cli.html_report.reports import calibration_page, rig_page
-    from neurocal_cli.io.files import read_bytes
-    from neurocal_cli.io.writing import write_whole
     from neurocal_cli.stereo.rig import Rig
 
     files = {}

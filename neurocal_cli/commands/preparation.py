@@ -1,30 +1,26 @@
-"""What commands do before their work: check inputs and outputs, and read points, boards and known cameras."""
+"""What commands do before their work: check inputs and outputs, and read points and known cameras."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+from neurocal_cli.io.outputs import held_back
+from neurocal_cli.io.writing import STDOUT_NAMES, check_places
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rig import Rig
 
-NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
-
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
     """Refuse outputs that cannot be written, or that are one of the inputs; see `check_places`."""
-    from neurocal_cli.io.outputs import held_back
-    from neurocal_cli.io.writing import check_places
-
     held = held_back()
     if held is not None:
         held.protect(*inputs)
@@ -52,8 +48,6 @@ def check_one_stdin(*names: str | None) -> None:
 
 def check_summary(as_json: bool, *outputs: str | None) -> None:
     """Refuse a summary and a result on one stream, with a UsageError."""
-    from neurocal_cli.io.writing import STDOUT_NAMES
-
     if as_json and not STDOUT_NAMES.isdisjoint(outputs):
         raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")
 
@@ -68,7 +62,7 @@ def compute_in_one_thread() -> None:
         os.environ.setdefault(name, "1")
 
 
-def given_points(names: str | Sequence[str]) -> Correspondences:
+def given_points(*names: str) -> Correspondences:
     """Read points, and report rows of their files that were left out."""
     from neurocal_cli.io.points_csv import ids_at_two_places, read_points
 
@@ -124,32 +118,3 @@ def warn_of_poor(rig: Rig, so: str = "") -> None:
     verdict = rig.verdict
     if verdict is not None and verdict.word == "poor":
         warn(f"the rig is poor: {'; '.join(verdict.reasons[:1])}{so}")
-
-
-def given_board(
-    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
-) -> Board | None:
-    """Read the board; None if no option describes one, a UsageError if they contradict each other."""
-    from neurocal_cli.board import Board
-
-    check_unit(unit)
-    numbers = (cols, rows, square)
-    if path is not None:
-        if numbers != (None, None, None) or unit is not None:
-            raise UsageError(
-                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
-            )
-        from neurocal_cli.io.board_yaml import read_board
-
-        return read_board(path)
-    if numbers == (None, None, None) and unit is None:
-        return None
-    if cols is None or rows is None or square is None:
-        raise UsageError(NO_SIZE)
-    return Board.single(cols, rows, square, "mm" if unit is None else unit)
-
-
-def check_unit(unit: str | None) -> None:
-    """Refuse a unit that cannot be stored in a file, with a UsageError."""
-    if unit is not None and (unit == "" or unit != unit.strip(" \t,;") or not unit.isprintable()):
-        raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")

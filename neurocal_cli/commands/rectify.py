@@ -13,12 +13,16 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
+from neurocal_cli.io.image_paths import find_images, is_image, view_names
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
+    from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rectified_pair import RectifiedPair, RowError
     from neurocal_cli.stereo.rig import Rig
 
+_Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera
 _SIDES = ("left", "right")
 # Median difference of rows, as a multiple of that of the rig's own points, and in px: 1 for other points of
 # the rig, 5 if one file is given twice; tests/test_cli_rectify.py.
@@ -89,25 +93,15 @@ def rectify(
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     preparation.check_folder("-o", output)
-    from neurocal_cli.io.image_paths import is_image
-
     sides = _sides(files)
     images = bool(files) and is_image(sides[0][0])
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
-    from neurocal_cli.io.exchange.neurocal import as_rig
-    from neurocal_cli.io.exchange.reading import read_cameras
+    _check_folders(output, sides)
     from neurocal_cli.stereo.rectified_pair import rectified_pair
 
-    cameras = read_cameras([rig])
-    if (count := len(cameras.cameras)) != 2:
-        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", rig)
-    found = as_rig(cameras)
+    found = _read_rig(rig)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
@@ -120,10 +114,18 @@ def rectify(
         print_summary(work.summary)
 
 
-def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The files of the left and of the right camera: the first and the second half of the arguments."""
-    from neurocal_cli.io.image_paths import find_images, view_names
+def _read_rig(name: str) -> Rig:
+    from neurocal_cli.io.exchange.neurocal import as_rig
+    from neurocal_cli.io.exchange.reading import read_cameras
 
+    cameras = read_cameras([name])
+    if (count := len(cameras.cameras)) != 2:
+        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", name)
+    return as_rig(cameras)
+
+
+def _sides(files: Sequence[str]) -> _Paths:
+    """Files of the first and of the second half of the arguments."""
     if len(files) % 2:
         raise UsageError(
             f"there are {len(files)} files or patterns; give as many for the right camera as for the left one"
@@ -137,6 +139,14 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
+
+
+def _check_folders(output: str, sides: _Paths) -> None:
+    """Refuse folders of results that are folders of inputs."""
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
 
 
 @dataclass
@@ -181,28 +191,15 @@ class _Work:
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         preparation.warn_of_poor(self.rig)
 
-    def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+    def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
-        from neurocal_cli.calibration import undistorted_before
-        from neurocal_cli.io.points_csv import format_points, read_points
+        from neurocal_cli.io.points_csv import format_points
         from neurocal_cli.report import number_or_none
-        from neurocal_cli.stereo.rectified_pair import rectify_points, row_error
+        from neurocal_cli.stereo.rectified_pair import row_error
 
         if len(sides[0]) > 1:
             raise UsageError("give one CSV file of points for each camera")
-        moved = []
-        for side, (path,) in enumerate(sides):
-            notes: list[str] = []
-            points = read_points(path, notes=notes)
-            if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
-                warn(why)
-            moved.append(rectify_points(self.pair, side, points))
-            if len(moved[-1]) < len(points):
-                notes.append(
-                    f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
-                    "which are 90 degrees from the rectified camera's axis or more"
-                )
-            note(*notes)
+        moved = [self._rectified(side, path) for side, (path,) in enumerate(sides)]
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
@@ -221,7 +218,26 @@ class _Work:
                 "the cameras have not moved, and that the pixels are neither undistorted nor rectified"
             )
 
-    def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+    def _rectified(self, side: int, path: str) -> Correspondences:
+        """Read and rectify the points of one camera, 0 left or 1 right."""
+        from neurocal_cli.calibration import undistorted_before
+        from neurocal_cli.io.points_csv import read_points
+        from neurocal_cli.stereo.rectified_pair import rectify_points
+
+        notes: list[str] = []
+        points = read_points(path, notes=notes)
+        if why := undistorted_before(points, (self.rig.left, self.rig.right)[side]):
+            warn(why)
+        moved = rectify_points(self.pair, side, points)
+        if len(moved) < len(points):
+            notes.append(
+                f"{points.source}: {len(points) - len(moved)} of {len(points)} points are left out, "
+                "which are 90 degrees from the rectified camera's axis or more"
+            )
+        note(*notes)
+        return moved
+
+    def rectify_images(self, sides: _Paths) -> None:
         """Rectify all pairs; those that fail are named and left out."""
         pairs = list(zip(*sides, strict=True))
         done = len(pairs) - len(each_of(pairs, self._rectify_pair, "pairs", "rectified"))
@@ -264,8 +280,6 @@ class _Work:
             say(text)
 
     def _write(self, name: str, content: str | bytes) -> None:
-        from neurocal_cli.io.writing import make_folder, write_whole
-
         place = os.path.join(self.output, name)
         make_folder(os.path.dirname(place))
         write_whole(place, content)

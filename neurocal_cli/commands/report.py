@@ -9,6 +9,9 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.image_paths import photographs_of
+from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
@@ -60,8 +63,6 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     import hashlib
 
     from neurocal_cli.io.file_storage import parse_tree
-    from neurocal_cli.io.files import decode, read_bytes
-    from neurocal_cli.io.writing import write_whole
 
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
@@ -83,7 +84,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         from neurocal_cli.io.rig_yaml import rig_from_field
 
         rig = rig_from_field(root)
-        words = images * (3 - len(images)) if images else ()
+        words = images * (3 - len(images))
         shown = [
             _photographs(camera, word, 2) for camera, word in zip((rig.left, rig.right), words, strict=False)
         ]
@@ -106,7 +107,6 @@ def _versions(root: Field) -> dict[str, str]:
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
     """Thumbnails of the views' photographs, for the page."""
-    from neurocal_cli.io.image_paths import photographs_of
     from neurocal_cli.io.images import thumbnails
 
     views = calibration.points.view_names

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import os
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
-from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
+from neurocal_cli.io.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
+    from neurocal_cli.simulation.starts import StartStudy
 
 _SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
-_DEFAULT_METHODS = "neuro,nonlinear,linear,tsai"
 _FLAT_VIEWS = 10
 _STARTS_SIGMA = 0.5  # px
 
@@ -29,11 +29,11 @@ class _Command(options.Command):
         expanded: list[str] = []
         after = False
         for word in args:
-            if after and _is_number(word) and expanded[-1] != "--sigma":
+            more = after and _is_number(word)
+            if more and expanded[-1] != "--sigma":
                 expanded.append("--sigma")
-            elif not (after and _is_number(word)):
-                after = word == "--sigma"
             expanded.append(word)
+            after = more or word == "--sigma"
         return super().parse_args(ctx, expanded)
 
 
@@ -75,7 +75,7 @@ def _is_number(word: str) -> bool:
     multiple=True,
 )
 @options.count("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
-@options.methods(_DEFAULT_METHODS)
+@options.methods("neuro,nonlinear,linear,tsai")
 @options.count(
     "--random-starts",
     "N",
@@ -160,7 +160,7 @@ def simulate(
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
         preparation.check_folder("--save", save)
-    options.check_plot(plot, "-")
+    options.check_plot(plot)
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
 
@@ -171,31 +171,22 @@ def simulate(
         _rates(data_sets, seed, jobs, plot, as_json)
         return
     scene, paper = _scene(camera, board, views, seed)
+    levels = sorted(set(sigma))
     if save is not None:
-        _save(scene, save, sigma, seed, images)
+        _save(scene, save, levels, seed, images)
+    from neurocal_cli.comparison.report import text_of
     from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json, text_of
-    from neurocal_cli.simulation.starts import study_starts
+    from neurocal_cli.simulation.report import simulation_json, simulation_tables
 
-    levels = tuple(sorted(set(sigma)))
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
-        starts = None
-        if random_starts:
-            try:
-                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
-            except DegenerateGeometryError as error:
-                note(f"no random starts: {error}")
+        starts = _starts(scene, random_starts, seed, jobs, progress)
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_simulation
 
-        write_plot(plot, partial(draw_simulation, study, starts, scene.unit))
+        write_plot(plot, draw_simulation, study, starts, scene.unit)
     if as_json:
-        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
-        found |= noise_json(study)
-        if starts is not None:
-            found["random_starts"] = starts_json(starts)
-        print_summary(found)
+        print_summary(simulation_json(scene, seed, study, starts))
     else:
         click.echo(text_of(*simulation_tables(study, starts, paper)))
 
@@ -206,7 +197,6 @@ def _scene(
     """The scene, and whether it is that of the paper."""
     import numpy as np
 
-    from neurocal_cli.errors import FormatError
     from neurocal_cli.simulation import scenes
 
     if camera_file is None and board_file is None and views is None:
@@ -231,36 +221,51 @@ def _scene(
     return scenes.scene_of(camera, board, poses), False
 
 
+def _starts(
+    scene: SimulatedScene, count: int, seed: int, jobs: int, progress: ProgressBar
+) -> StartStudy | None:
+    """The study of random starts; None without any, or if the points do not determine a camera."""
+    from neurocal_cli.simulation.starts import study_starts
+
+    if not count:
+        return None
+    try:
+        return study_starts(scene, _STARTS_SIGMA, count, seed, jobs, progress)
+    except DegenerateGeometryError as error:
+        note(f"no random starts: {error}")
+        return None
+
+
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
+    from neurocal_cli.comparison.report import text_of
     from neurocal_cli.simulation.rates import study_rates
-    from neurocal_cli.simulation.report import rates_json, rates_tables, text_of
+    from neurocal_cli.simulation.report import rates_json, rates_tables
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     if plot is not None:
         from neurocal_cli.simulation.plots import draw_rates
 
-        write_plot(plot, partial(draw_rates, study))
+        write_plot(plot, draw_rates, study)
     if as_json:
         print_summary(rates_json(study))
     else:
         click.echo(text_of(*rates_tables(study)))
 
 
-def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:
+def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:
     """Write the truth and the data simulated from it; the noisy points are those of the first trial."""
     import numpy as np
 
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.points_csv import write_points
     from neurocal_cli.io.result_files import write_calibration
-    from neurocal_cli.io.writing import make_folder, write_whole
     from neurocal_cli.simulation.scenes import true_calibration
 
     make_folder(folder)
     write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))
     write_points(scene.points(), os.path.join(folder, "exact.csv"))
-    for k, level in enumerate(sorted(set(sigma))):
+    for k, level in enumerate(levels):
         points = scene.points(level, np.random.default_rng((seed, k, 0)))
         name = str(level).removesuffix(".0")  # all digits, so that no two levels share a file
         write_points(points, os.path.join(folder, f"sigma_{name}.csv"))

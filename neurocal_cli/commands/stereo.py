@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,7 +13,11 @@ from neurocal_cli.commands.calibration_options import Estimation, estimation_opt
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.plots import RIG_PANELS
+
+if TYPE_CHECKING:
+    from neurocal_cli.stereo.rig import Rig
 
 
 @click.command(cls=options.Command)
@@ -100,48 +104,48 @@ def stereo(
           -o rig.yaml
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    preparation.check_summary(as_json, output, html, *(ros or ()))
+    ros_files = ros or ()
+    preparation.check_summary(as_json, output, html, *ros_files)
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     if left_intrinsics is not None and right_intrinsics is not None:
         known = ("no_skew", "distortion", "image_center", *(["type"] if estimation.type == "2" else []))
         options.note_unused("on cameras that are known", *known)
-    preparation.check_one_stdin(left, right, left_intrinsics, right_intrinsics)
+    inputs = left, right, left_intrinsics, right_intrinsics
+    preparation.check_one_stdin(*inputs)
     check_plots(plots, output)
-    names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
+    names = [os.path.realpath(name) for name in (output, *ros_files) if name != "-"]
     if len(set(names)) < len(names):
         raise UsageError("-o and --ros name the same file twice; give three different files")
-    inputs = left, right, left_intrinsics, right_intrinsics
-    preparation.check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
+    preparation.check_outputs((output, html, *ros_files, *(file for _, file in plots)), inputs)
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
 
-    prepared = []
-    for name, side in zip((left, right), sides, strict=True):
-        notes: list[str] = []
-        points = read_points(name, notes=notes)
-        note(*notes, *ids_at_two_places(points))
-        prepared.append(side.prepare(points))
+    prepared = [
+        side.prepare(preparation.given_points(name)) for name, side in zip((left, right), sides, strict=True)
+    ]
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     if plots:
         from neurocal_cli.plots.pages import draw_rig
 
-        write_plots(plots, partial(draw_rig, rig))
+        write_plots(plots, draw_rig, rig)
     if ros is not None:
-        from neurocal_cli.io.rig_yaml import format_ros_pair
-        from neurocal_cli.io.writing import write_whole
-
-        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
-            write_whole(name, text)
+        _write_ros(rig, ros, alpha)
     warn(*write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
     note(*views_alone(rig.alone))
     conclude(rig, as_json, rig_json, rig_report)
+
+
+def _write_ros(rig: Rig, files: tuple[str, str], alpha: float | None) -> None:
+    from neurocal_cli.io.rig_yaml import format_ros_pair
+
+    for name, text in zip(files, format_ros_pair(rig, alpha), strict=True):
+        write_whole(name, text)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -58,6 +59,11 @@ def verbose() -> bool:
     return _VERBOSITY.get() > 0
 
 
+def debugging() -> bool:
+    """Whether the user wants to see where an unexpected error arose."""
+    return os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
+
+
 def one_line(text: str) -> str:
     """Put a text on one line, and replace control characters that may come from a file."""
     line = " ".join(text.splitlines())
@@ -93,6 +99,12 @@ def note(*texts: str) -> None:
         say(f"note: {one_line(text)}")
 
 
+def note_once(remarks: Mapping[str, Sequence[str]]) -> None:
+    """Report remarks, each with the first name of those that it is about, and their number."""
+    for text, names in remarks.items():
+        note(f"{names[0]}: {text}" if len(names) == 1 else f"{names[0]} and {len(names) - 1} more: {text}")
+
+
 def warn(*texts: str) -> None:
     """Warn of problems that may make the result worse than it looks."""
     for text in texts:
@@ -123,9 +135,9 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and not stream.closed and stream.isatty()
 
 
-def some_of(names: Sequence[str]) -> str:
-    """List the first names, and the number of further ones."""
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+def first_of(names: Sequence[str]) -> str:
+    """The first five names, and dots for further ones."""
+    return ", ".join([*names[:5], *(["..."] if len(names) > 5 else [])])
 
 
 def print_summary(tree: dict[str, Any]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import click
 
 from neurocal_cli.commands import options, preparation
@@ -53,7 +51,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     if plot is not None:
         from neurocal_cli.target_plot import draw_target
 
-        write_plot(plot, partial(draw_target, calibration.target, calibration.unit))
+        write_plot(plot, draw_target, calibration.target, calibration.unit)
     board = board_of(calibration.target, calibration.unit, calibration.points.distances)
     write_board(board, output)
     if as_json:

@@ -12,6 +12,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.writing import write_chunks
 
 if TYPE_CHECKING:
     from neurocal_cli.io.triangulation_csv import Matches
@@ -93,13 +94,9 @@ def triangulate(
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
     from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
-    from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
-    if sigma is None and math.isnan(rig.sigma):
-        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-        sigma = _USUAL_SIGMA
-    sigma = rig.sigma if sigma is None else sigma
+    sigma = _noise(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
@@ -133,6 +130,14 @@ def _rig(names: tuple[str, ...]) -> Rig:
     return rig
 
 
+def _noise(rig: Rig) -> float:
+    """Standard deviation of the rig's own pixels [px], or an assumed one if it does not state any."""
+    if not math.isnan(rig.sigma):
+        return rig.sigma
+    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+    return _USUAL_SIGMA
+
+
 class _Tally:
     """Triangulates batch by batch and counts what is wrong with the points."""
 
@@ -162,13 +167,11 @@ class _Tally:
         """Report the outcome on stderr, or as JSON on stdout."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
-            one = self.off == 1
-            which = "is more than" if one else "are more than"
-            lines = "its epipolar line" if one else "their epipolar lines"
-            parts.append(f"{self.off} of them {which} {self.limit:.3g} px off {lines}")
+            are, lines = ("is", "its epipolar line") if self.off == 1 else ("are", "their epipolar lines")
+            parts.append(f"{self.off} of them {are} more than {self.limit:.3g} px off {lines}")
         if self.behind:
-            which = "is" if self.behind == 1 else "are"
-            parts.append(f"{self.behind} {which} behind a camera or at infinity")
+            are = "is" if self.behind == 1 else "are"
+            parts.append(f"{self.behind} {are} behind a camera or at infinity")
         if as_json:
             counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
             print_summary({**counts, "n_outside": self.outside, "epipolar_limit_px": self.limit})

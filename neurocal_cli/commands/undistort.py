@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import is_terminal, print_summary, say
+from neurocal_cli.commands.streams import is_terminal, note_once, print_summary, say
 from neurocal_cli.errors import UsageError
+from neurocal_cli.io.image_paths import find_images, is_image
 
 _NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
 
@@ -103,15 +104,7 @@ def undistort(
           --maps maps.npz
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(camera, *files)
-    options.check_alpha(alpha)
-    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
-        raise UsageError(
-            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
-        )
-    most = 170 if shape == "plane" else 360
-    if fov is not None and not 0 < fov <= most:
-        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
-        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
+    _check_view(alpha, shape, fov, size)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     if not files and options.typed("output"):
@@ -120,20 +113,20 @@ def undistort(
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.exchange.reading import read_intrinsics
-    from neurocal_cli.io.image_paths import find_images, is_image
 
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
         options.note_unused("without images", "interpolation")
     folder = _folder(paths, output) if paths else None
     outputs = [output for _ in paths] if folder is None else [_place(folder, path) for path in paths]
-    _check_distinct((camera, *paths), outputs, paths, {"the new camera": new_camera, "the tables": maps})
+    results = *zip(paths, outputs, strict=True), ("the new camera", new_camera), ("the tables", maps)
+    _check_distinct((camera, *paths), results)
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
-    work = Undistorting(original, view, interpolation, folder)
+    work = Undistorting(original, view, interpolation, folder, original.image_size)
     failed = work.correct_all(paths, outputs)
-    work.tell_notes()
+    note_once(work.notes)
     if new_camera is not None:
         work.write_camera(new_camera)
     if maps is not None:
@@ -147,10 +140,21 @@ def undistort(
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
 
 
+def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[int, int] | None) -> None:
+    """Refuse options of the result that are out of range or contradict each other."""
+    options.check_alpha(alpha)
+    if alpha is not None and (shape != "plane" or fov is not None or size is not None):
+        raise UsageError(
+            "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
+        )
+    most = 170 if shape == "plane" else 360
+    if fov is not None and not 0 < fov <= most:
+        more = ", or --to cylinder for more" if shape == "plane" and fov > 0 else ""
+        raise UsageError(f"--fov is {fov:g}; give a number up to {most}{more}")
+
+
 def _folder(paths: Sequence[str], output: str) -> str | None:
     """The output folder, if the output is one."""
-    from neurocal_cli.io.image_paths import is_image
-
     several = len(paths) > 1
     if output == "-":
         if several:
@@ -158,13 +162,14 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
         if is_image(paths[0]) and is_terminal(sys.stdout):
             raise UsageError("an image cannot be shown on a terminal; give a file, -o FILE")
         return None
+    if os.path.isdir(output) or output.endswith(os.sep):
+        return output
     unlike = is_image(paths[0]) and not is_image(output)
-    if not (several or os.path.isdir(output) or output.endswith(os.sep) or unlike):
+    if not (several or unlike):
         return None
-    if os.path.exists(output) and not os.path.isdir(output):
+    if os.path.exists(output):
         raise UsageError(f"-o {output} is a file; give a folder")
-    file = is_image(output) or output.lower().endswith((*_NOT_WRITTEN, ".csv"))
-    if file and not (os.path.isdir(output) or output.endswith(os.sep)):
+    if is_image(output) or output.lower().endswith((*_NOT_WRITTEN, ".csv")):
         raise UsageError(
             f"several files cannot go to one file, {output}; give a folder, -o DIR"
             if several
@@ -176,21 +181,17 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
 
 def _place(folder: str, path: str) -> str:
     """The output of an input in the output folder."""
-    from neurocal_cli.io.image_paths import is_image
-
     name = "points.csv" if path == "-" else os.path.basename(path)
     return os.path.join(folder, os.path.splitext(name)[0] + ".png" if is_image(path) else name)
 
 
-def _check_distinct(
-    inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
-) -> None:
-    """Refuse to overwrite inputs, or to write two results, which a UsageError names, to the same file."""
+def _check_distinct(inputs: Iterable[str], results: Iterable[tuple[str, str | None]]) -> None:
+    """Refuse to overwrite inputs, or to write two results, given as names and places, to the same file."""
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}
-    targets = list(zip(outputs, paths, strict=True))
-    targets += [(place, what) for what, place in others.items() if place is not None]
-    for target, source in targets:
+    for source, target in results:
+        if target is None:
+            continue
         place = os.path.realpath(target) if target != "-" else "-"
         if place in read:
             raise UsageError(f"{target} is an input and would be overwritten; give another output")

@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from neurocal_cli.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.commands.streams import each_of, note, say, some_of, warn
+from neurocal_cli.commands.streams import each_of, note, say, warn
 from neurocal_cli.distortion.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
@@ -29,13 +31,10 @@ class Undistorting:
     view: Callable[[tuple[int, int] | None], Undistorted]  # of the results, from the size of the images
     interpolation: str
     folder: str | None  # output folder, if the output is one
+    size: tuple[int, int] | None  # of the images [px], once it is known
     notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
     left_out: int = 0  # number of points that the result cannot show
-    size: tuple[int, int] | None = None  # of the images [px], once it is known
     remapping: Remapping | None = None
-
-    def __post_init__(self) -> None:
-        self.size = self.camera.image_size
 
     def new(self) -> Undistorted:
         """The camera of the results, once the size of the images is known."""
@@ -62,11 +61,6 @@ class Undistorting:
             self._correct(place)
         return {}
 
-    def tell_notes(self) -> None:
-        """Report the remarks about images, each once."""
-        for text, names in self.notes.items():
-            note(f"{some_of(names)}: {text}")
-
     def tell_loss(self) -> None:
         """Report the part of a wide lens's field of view that the results lose."""
         if not self.camera.distortion.wide or self.size is None:
@@ -89,7 +83,7 @@ class Undistorting:
     def summary(self) -> dict[str, Any]:
         """Summary of the results for programs."""
         shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
-        camera = {key: getattr(x, "tolist", lambda x=x: x)() for key, x in self._described().items()}
+        camera = {key: np.asarray(value).tolist() for key, value in self._described().items()}
         return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
 
     def write_camera(self, path: str) -> None:
@@ -116,7 +110,7 @@ class Undistorting:
         return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
 
     def _described(self) -> dict[str, Any]:
-        """The camera of the results as JSON values."""
+        """The camera of the results by the names of its parts."""
         new = self.new()
         if isinstance(new, Panorama):
             return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}

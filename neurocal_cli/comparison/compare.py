@@ -65,18 +65,16 @@ def compare(
     notes: list[str] = []
     kept: list[Correspondences] = []
     cameras: list[dict[str, Compared]] = []
-    steps, done = len(points) * (1 + len(methods)), 0
-    for one in points:
+    steps = 1 + len(methods)  # for each camera
+    for done, one in enumerate(points):
         first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed, target="given")
         if first.n_rejected:
             notes.append(f"{one.source}: {first.n_rejected} outliers are left out for all methods")
         kept.append(first.points)
-        done += 1
         rows: dict[str, Compared] = {}
-        for method in methods:
-            report(method, done / steps)
+        for step, method in enumerate(methods, start=1):
+            report(method, (done * steps + step) / (len(points) * steps))
             rows[method] = _compared(method, first.points, first.distortion_model, skew, seed)
-            done += 1
         cameras.append(rows)
     stereo = _stereo(cameras, methods, notes) if len(cameras) == 2 else None
     return Comparison(tuple(kept), tuple(cameras), stereo, tuple(notes))

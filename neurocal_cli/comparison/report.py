@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from neurocal_cli.calibration import Calibration
@@ -12,26 +13,26 @@ from neurocal_cli.comparison.compare import Compared, Comparison
 from neurocal_cli.report import align, number_or_none, rounded
 from neurocal_cli.stereo.space_error import SpaceError
 
-_MODELS = {"none": "no distortion"}
 _SIDES = "left", "right"
 
 
 def comparison_report(comparison: Comparison) -> str:
     """Tables of errors and of parameters for each camera; of triangulated points for two."""
-    blocks: list[str] = []
+    tables = []
     for side, camera in enumerate(comparison.cameras):
         points = comparison.points[side]
         name = f"{_SIDES[side]} camera, " if len(comparison.cameras) == 2 else ""
-        blocks.append(_table(f"{name}{len(points)} points in {points.n_views} views", _errors(camera)))
-        blocks.append(_table(f"{name}parameters", _parameters(camera)))
+        tables.append((f"{name}{len(points)} points in {points.n_views} views", _errors(camera)))
+        tables.append((f"{name}parameters", _parameters(camera)))
     if comparison.stereo is not None:
-        blocks.append(_table("both cameras, each calibrated alone", _triangulation(comparison)))
-    blocks.append("\n".join(_below(comparison)))
-    return "\n\n".join(block for block in blocks if block)
+        tables.append(("both cameras, each calibrated alone", _triangulation(comparison)))
+    return text_of(tables, _below(comparison))
 
 
-def _table(title: str, rows: list[list[str]]) -> str:
-    return "\n".join([title, *align(rows)])
+def text_of(tables: Sequence[tuple[str, list[list[str]]]], below: Sequence[str]) -> str:
+    """Format tables with titles as aligned text, and lines below them."""
+    blocks = ["\n".join([title, *align(rows)]) for title, rows in tables]
+    return "\n\n".join([*blocks, *(["\n".join(below)] if below else [])])
 
 
 def _errors(camera: dict[str, Compared]) -> list[list[str]]:
@@ -40,8 +41,8 @@ def _errors(camera: dict[str, Compared]) -> list[list[str]]:
         cells = ["-"] * 4
         if one.calibration is not None:
             model = one.calibration.distortion_model
-            cells = [_px(one.calibration.rmse_px), _px(one.held_out_px), f"{1000 * one.seconds:.0f}"]
-            cells.append(_MODELS.get(model, model))
+            errors = _px(one.calibration.rmse_px), _px(one.held_out_px)
+            cells = [*errors, f"{1000 * one.seconds:.0f}", "no distortion" if model == "none" else model]
         rows.append([method, *cells])
     return rows
 

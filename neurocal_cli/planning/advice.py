@@ -172,9 +172,8 @@ def candidates(calibration: Calibration) -> list[Candidate]:
             points = checked @ np.swapaxes(R, 1, 2) + centre  # (turns, n, 3)
             pixels = camera.project(points)[0]
             with np.errstate(invalid="ignore"):
-                whole = ((pixels >= 0) & (pixels <= size - 1)).all(axis=(1, 2)) & camera.sees(points).all(
-                    axis=1
-                )
+                inside = ((pixels >= 0) & (pixels <= size - 1)).all(axis=(1, 2))
+                whole = inside & camera.sees(points).all(axis=1)
             for k in np.flatnonzero(whole).tolist():
                 pose = Pose(R[k], centre - R[k] @ middle)
                 outline = camera.project(corners @ R[k].T + centre)[0]

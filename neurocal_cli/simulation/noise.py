@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,6 @@ from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 _BLOCK = 5  # trials per task, all with one sigma
-_HALF_TURN = np.pi
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
 
 
@@ -57,12 +57,7 @@ class NoiseStudy:
     apart: dict[tuple[str, str], float] = field(default_factory=dict)
 
 
-@frozen_dataclass(eq=False)
-class _Task:
-    scene: SimulatedScene
-    methods: tuple[str, ...]
-    sigma: float
-    seeds: tuple[tuple[int, ...], ...]  # of each trial; empty for one trial without noise
+_Task = tuple[float, list[tuple[int, ...]]]  # sigma [px], and the seeds of trials
 
 
 def study_noise(
@@ -78,36 +73,33 @@ def study_noise(
 
     The number of processes, `jobs`, does not change the result.
     """
-    chosen = tuple(methods)
-    blocks = [
-        tuple((seed, k, trial) for trial in range(first, min(first + _BLOCK, trials)))
-        for k in range(len(sigma))
-        for first in range(0, trials, _BLOCK)
-    ]
-    tasks = [_Task(scene, chosen, 0.0, ())]
-    tasks += [_Task(scene, chosen, sigma[block[0][1]], block) for block in blocks]
+    tasks: list[_Task] = [(0.0, [(0,)])]
+    for k, level in enumerate(sigma):
+        seeds: list[tuple[int, ...]] = [(seed, k, trial) for trial in range(trials)]
+        tasks += [(level, seeds[first : first + _BLOCK]) for first in range(0, trials, _BLOCK)]
     found = []
-    for result in work_through(_errors, tasks, jobs):
+    for result in work_through(partial(_errors, scene, methods), tasks, jobs):
         found.append(result)
         if progress is not None:
             progress("noise trials", len(found) / len(tasks))
-    exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(chosen), -1)
+    exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(methods), -1)
     fold = _Fold(scene)
-    results = {}
-    for m, method in enumerate(chosen):
-        errors = noisy[:, :, m]
-        results[method] = MethodErrors(
+    errors = {method: noisy[:, :, m] for m, method in enumerate(methods)}
+    results = {
+        method: MethodErrors(
             fold.worst(exact[0, m]),
-            fold.rms(errors),
-            fold.mean(errors),
+            fold.rms(errors[method]),
+            fold.mean(errors[method]),
             fold.bound(cramer_rao(scene, method)),
-            np.isnan(errors[..., 0]).sum(axis=1),
+            np.isnan(errors[method][..., 0]).sum(axis=1),
         )
+        for m, method in enumerate(methods)
+    }
     whole = cramer_rao(scene, "neuro")
     apart = {
-        (a, b): _apart(noisy[:, :, chosen.index(a)], noisy[:, :, chosen.index(b)], np.array(sigma), whole)
+        (a, b): _apart(errors[a], errors[b], np.array(sigma), whole)
         for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
-        if a in chosen and b in chosen and not (results[a].failed + results[b].failed >= trials).any()
+        if a in errors and b in errors and not (results[a].failed + results[b].failed >= trials).any()
     }
     names = *INTRINSIC_NAMES, *coefficient_names(scene.camera.model), *POSE_NAMES
     return NoiseStudy(names, _truth(scene)[: len(names)], np.array(sigma), trials, results, apart)
@@ -142,15 +134,13 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     return np.concatenate([list(std.values()), poses[order].ravel()])
 
 
-def _errors(task: _Task) -> Array:
+def _errors(scene: SimulatedScene, methods: Sequence[str], task: _Task) -> Array:
     """(T, M, 5 + K + 6 V) errors of each trial and method; nan if there is no answer."""
-    scene, model = task.scene, task.scene.camera.model
-    truth = _truth(scene)
-    seeds = task.seeds or ((0,),)
-    errors = np.full((len(seeds), len(task.methods), len(truth)), np.nan)
+    (sigma, seeds), model, truth = task, scene.camera.model, _truth(scene)
+    errors = np.full((len(seeds), len(methods), len(truth)), np.nan)
     for n, seed in enumerate(seeds):
-        points = scene.points(task.sigma, np.random.default_rng(seed) if task.seeds else None)
-        for m, method in enumerate(task.methods):
+        points = scene.points(sigma, np.random.default_rng(seed))
+        for m, method in enumerate(methods):
             try:
                 found = calibrate_with(method, points, model, seed=seed[-1])
             except NeurocalError:
@@ -160,7 +150,7 @@ def _errors(task: _Task) -> Array:
             poses = [found.views[name].pose for name in scene.poses]
             errors[n, m] = _parameters(found.intrinsics, k, poses) - truth
     of_poses = errors[..., -6 * len(scene.poses) :].reshape(*errors.shape[:2], -1, 6)
-    of_poses[..., :3] = (of_poses[..., :3] + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+    of_poses[..., :3] = (of_poses[..., :3] + np.pi) % (2 * np.pi) - np.pi
     return errors
 
 

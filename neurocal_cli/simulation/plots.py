@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.plots.figure import picture, style
+from neurocal_cli.plots.figure import ACCENT, picture, style
 from neurocal_cli.simulation.noise import NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.report import FIG_1
@@ -148,10 +148,7 @@ def _draw_grid(
     axes.set_xticks(range(len(study.rates_gamma)), [f"{rate:g}" for rate in study.rates_gamma])
     axes.set_yticks(range(len(study.rates_weights)), [f"{rate:g}" for rate in study.rates_weights])
     axes.set(xlabel="rate of gamma, alpha_2", ylabel="rate of the weights, alpha_1")
-    place = [
-        int(np.abs(grid - rate).argmin())
-        for grid, rate in zip((study.rates_weights, study.rates_gamma), study.default, strict=True)
-    ]
-    axes.add_patch(
-        Rectangle((place[1] - 0.5, place[0] - 0.5), 1, 1, fill=False, edgecolor="#c0392b", linewidth=2)
-    )
+    grids = zip((study.rates_weights, study.rates_gamma), study.default, strict=True)
+    default_row, default_column = (int(np.abs(grid - rate).argmin()) for grid, rate in grids)
+    corner = default_column - 0.5, default_row - 0.5
+    axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=ACCENT, linewidth=2))

@@ -15,6 +15,7 @@ points on one side of the camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -63,15 +64,6 @@ class RateStudy:
     alpha_u: Array  # errors of alpha_u in these calibrations, in reported standard deviations
 
 
-@frozen_dataclass
-class _Cell:
-    """One pair of rates on all data sets; without rates, `calibrate` on one data set."""
-
-    seed: int
-    sets: range
-    rates: tuple[float, float] | None
-
-
 def study_rates(
     sets: int,
     seed: int = 0,
@@ -86,10 +78,9 @@ def study_rates(
     """
     usual = BackpropOptions()
     grid = list(product(rates_weights, rates_gamma))
-    tasks = [_Cell(seed, range(k, k + 1), None) for k in range(sets)]
-    tasks += [_Cell(seed, range(sets), rates) for rates in grid]
+    tasks = [*((range(k, k + 1), None) for k in range(sets)), *((range(sets), rates) for rates in grid)]
     found = []
-    for result in work_through(_train, tasks, jobs):
+    for result in work_through(partial(_train, seed), tasks, jobs):
         found.append(result)
         if progress is not None:
             progress("learning rates", len(found) / len(tasks))
@@ -133,10 +124,12 @@ def data_set(seed: int, number: int) -> DataSet:
     return DataSet(Correspondences(world, pixels, image_size=(width, height)), K)
 
 
-def _train(cell: _Cell) -> Array:
-    if cell.rates is None:
-        return np.array([_calibrated(data_set(cell.seed, k)) for k in cell.sets])
-    return np.array([_one_start(cell.seed, k, cell.rates) for k in cell.sets])
+def _train(seed: int, task: tuple[range, tuple[float, float] | None]) -> Array:
+    """(S, 2) results on data sets of one start with a pair of rates or, without these, of `calibrate`."""
+    sets, rates = task
+    if rates is None:
+        return np.array([_calibrated(data_set(seed, k)) for k in sets])
+    return np.array([_one_start(seed, k, rates) for k in sets])
 
 
 def _calibrated(data: DataSet) -> tuple[float, float]:

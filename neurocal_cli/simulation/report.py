@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from neurocal_cli.report import align, number_or_none
+from neurocal_cli.report import number_or_none
 from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
+from neurocal_cli.simulation.scenes import SimulatedScene
 from neurocal_cli.simulation.starts import StartStudy
 
 Table = list[list[str]]
@@ -28,12 +29,6 @@ _KINDS = {
 }
 
 
-def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str] = ()) -> str:
-    """Format tables with titles as aligned text, and lines below them."""
-    blocks = ["\n".join([title, *align(rows)]) for title, rows in tables]
-    return "\n\n".join([*blocks, *(["\n".join(below)] if below else [])])
-
-
 def simulation_tables(
     study: NoiseStudy, starts: StartStudy | None, paper: bool
 ) -> tuple[list[tuple[str, Table]], list[str]]:
@@ -41,13 +36,15 @@ def simulation_tables(
 
     For the scene of the `paper`, its printed errors are shown, too.
     """
-    tables = [("error without noise (Table 1)", _exact(study, paper))]
-    if study.trials:
-        tables += [
-            ("rms error over the noise (Fig. 1)", _fig_1(study)),
-            ("rms error of each parameter over its Cramer-Rao bound, at the largest sigma", _ratios(study)),
-            ("mean error of each parameter over its standard error, at the largest sigma", _biases(study)),
-        ]
+    tables = [
+        ("error without noise (Table 1)", _exact(study, paper)),
+        ("rms error over the noise (Fig. 1)", _fig_1(study)),
+    ]
+    for what, cell in (
+        ("rms error of each parameter over its Cramer-Rao bound", _ratio),
+        ("mean error of each parameter over its standard error", _bias),
+    ):
+        tables.append((f"{what}, at the largest sigma", _at_largest_sigma(study, cell)))
     if starts is not None:
         rows = [
             [_KINDS[kind], str(count), str(len(starts.rms[kind]))] for kind, count in starts.reached.items()
@@ -82,29 +79,24 @@ def _fig_1(study: NoiseStudy) -> Table:
     return rows
 
 
-def _ratios(study: NoiseStudy) -> Table:
+def _at_largest_sigma(study: NoiseStudy, cell: Callable[[NoiseStudy, MethodErrors, int], str]) -> Table:
+    """A row for each parameter and a column for each method that estimates it."""
     rows = [["parameter", *study.methods]]
     for p, name in enumerate(study.names):
-        ratios = [
-            "given" if one.bound[p] == 0 else _number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]))
-            for one in study.methods.values()
-        ]
-        rows.append([name, *ratios])
+        cells = [cell(study, one, p) if one.bound[p] != 0 else "given" for one in study.methods.values()]
+        rows.append([name, *cells])
     return rows
 
 
-def _biases(study: NoiseStudy) -> Table:
-    rows = [["parameter", *study.methods]]
-    for p, name in enumerate(study.names):
-        rows.append([name, *(_bias(one, p, study.trials) for one in study.methods.values())])
-    return rows
+def _ratio(study: NoiseStudy, one: MethodErrors, p: int) -> str:
+    """Rms error over its bound."""
+    return _number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]))
 
 
-def _bias(one: MethodErrors, p: int, trials: int) -> str:
+def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
     """Mean error over its standard error."""
-    if one.bound[p] == 0:
-        return "given"
-    spread = np.sqrt(max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0) / max(trials - one.failed[-1], 1))
+    variance = max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0)
+    spread = np.sqrt(variance / max(study.trials - one.failed[-1], 1))
     return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
 
 
@@ -140,8 +132,16 @@ def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
     return [(title, counts), ("median epochs of these", epochs)], below
 
 
+def simulation_json(
+    scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None
+) -> dict[str, Any]:
+    """The studies of noise and starts for JSON; missing numbers are None."""
+    whole = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed, **noise_json(study)}
+    return whole if starts is None else {**whole, "random_starts": starts_json(starts)}
+
+
 def noise_json(study: NoiseStudy) -> dict[str, Any]:
-    """The whole study for JSON; missing numbers are None."""
+    """The study of noise for JSON."""
     return {
         "trials": study.trials,
         "sigma": study.sigma.tolist(),

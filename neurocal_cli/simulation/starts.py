@@ -40,7 +40,6 @@ from neurocal_cli.network import random_weights
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-STARTS = ("lm", "backprop", "weights", "camera")
 _SAME = 1.001  # greatest ratio to the best rms error
 _FLOOR = 1e-9  # px, added to it; without noise the best error is rounding
 _FOCAL = 0.5, 20.0  # half image widths
@@ -69,15 +68,6 @@ def reached(rms: Array, best: float) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(rms) & (rms <= _SAME * best + _FLOOR))
 
 
-@frozen_dataclass(eq=False)
-class _Task:
-    scene: SimulatedScene
-    sigma: float
-    kind: str
-    seed: int
-    starts: range
-
-
 def study_starts(
     scene: SimulatedScene,
     sigma: float,
@@ -94,15 +84,13 @@ def study_starts(
     """
     problem = _problem(scene, sigma, seed)
     check_points(problem)
-    kinds = [kind for kind in STARTS if can_start(problem, kind)]
-    tasks = [
-        _Task(scene, sigma, kind, seed, range(first, min(first + _BLOCK, starts)))
-        for kind in kinds
-        for first in range(0, starts, _BLOCK)
-    ]
+    kinds = [kind for kind in _KINDS if can_start(problem, kind)]
+    numbers = range(starts)
+    tasks = [(kind, numbers[first : first + _BLOCK]) for kind in kinds for first in numbers[::_BLOCK]]
+    results = work_through(partial(_ends, scene, sigma, seed), tasks, jobs)
     found: dict[str, list[float]] = {kind: [] for kind in kinds}
-    for n, (task, ends) in enumerate(zip(tasks, work_through(_ends, tasks, jobs), strict=True), start=1):
-        found[task.kind] += ends
+    for n, ((kind, _), ends) in enumerate(zip(tasks, results, strict=True), start=1):
+        found[kind] += ends
         if progress is not None:
             progress("random starts", n / len(tasks))
     rms = {kind: np.array(ends) for kind, ends in found.items()}
@@ -120,12 +108,12 @@ def _problem(scene: SimulatedScene, sigma: float, seed: int) -> Problem:
     return problem_for(points, 1)
 
 
-def _ends(task: _Task) -> list[float]:
-    problem = _problem(task.scene, task.sigma, task.seed)
-    kind = STARTS.index(task.kind)
+def _ends(scene: SimulatedScene, sigma: float, seed: int, task: tuple[str, range]) -> list[float]:
+    """Final rms errors [px] of starts of a kind, which are counted."""
+    problem, (kind, starts) = _problem(scene, sigma, seed), task
+    number = list(_KINDS).index(kind)
     return [
-        single_start(problem, task.kind, np.random.default_rng((task.seed, _NOISE, kind, start)))
-        for start in task.starts
+        single_start(problem, kind, np.random.default_rng((seed, _NOISE, number, start))) for start in starts
     ]
 
 
@@ -138,7 +126,7 @@ def can_start(problem: Problem, kind: str) -> bool:
 
 
 def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float:
-    """Final rms error [px] of one random start of a kind of `STARTS`; infinite if the result is not a camera.
+    """Final rms error [px] of one random start of a kind; infinite if the result is not a camera.
 
     The problem must be without a distortion.
     """
@@ -170,7 +158,7 @@ def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
         o = Z @ entries.reshape(3, 4).T
         return np.asarray((o[:, :2] / o[:, 2:] - views.pixels).ravel())
 
-    least = least_squares(error, (W @ V)[0].ravel())
+    least = least_squares(error, (W @ V)[0].ravel(), np.zeros(views.pixels.size, dtype=np.intp), 12)
     depth = Z @ least.x.reshape(3, 4)[2]
     if depth.min() * depth.max() <= 0:
         return np.inf

@@ -49,20 +49,20 @@ def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
     A point is visible if nothing hides its plane within the `clearance` [px]; by default three times the blur
     including the pixel.
     """
-    sight = _Sight(scene, 3 * scene.sigma_t if clearance is None else clearance)
-    return Truth(tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets))))
+    clearance = 3 * scene.sigma_t if clearance is None else clearance
+    sights = [_Sight(scene, k, clearance) for k in range(len(scene.targets))]
+    return Truth(tuple(map(_plane_truth, scene.targets, sights)))
 
 
-def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
-    target = scene.targets[index]
+def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
     plane = target.plane
     columns, rows = np.meshgrid(np.arange(plane.cols), np.arange(plane.rows))
     vertex_grid = np.stack([columns, rows], axis=-1).astype(float)
     grid = plane.midpoint_grid()
     half = np.where(grid % 1 > 0, 0.5, 0.0)  # along the edge
-    vertices, vertices_visible = sight.look(index, vertex_grid)
-    midpoints, midpoints_visible = sight.look(index, grid)
-    quarters = [sight.look(index, grid + s * half)[1] for s in (-0.5, 0.5)]
+    vertices, vertices_visible = sight.look(vertex_grid)
+    midpoints, midpoints_visible = sight.look(grid)
+    quarters = [sight.look(grid + s * half)[1] for s in (-0.5, 0.5)]
     first, second = (np.rint(grid + s * half).astype(np.intp) @ [1, plane.cols] for s in (-1, 1))
     visible = vertices_visible.reshape(-1)
     edges_visible = midpoints_visible & visible[first] & visible[second] & quarters[0] & quarters[1]
@@ -77,17 +77,17 @@ def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
         midpoints_visible=midpoints_visible,
         edges_visible=edges_visible,
         ends=np.stack([first, second], axis=-1),
-        normals=_normals(sight, index, grid, half),
+        normals=_normals(sight, grid, half),
         lengths=np.hypot(*chord.T),
         polarity=_polarity(target, grid, half),
     )
 
 
-def _normals(sight: _Sight, index: int, grid: Array, half: Array) -> Array:
+def _normals(sight: _Sight, grid: Array, half: Array) -> Array:
     """Normals of the projected edges, towards the growing other axis."""
     along, across = _STEP * 2 * half, _STEP * (1 - 2 * half)
-    tangent = sight.project(index, grid + along)[0] - sight.project(index, grid - along)[0]
-    side = sight.project(index, grid + across)[0] - sight.project(index, grid - across)[0]
+    tangent = sight.project(grid + along)[0] - sight.project(grid - along)[0]
+    side = sight.project(grid + across)[0] - sight.project(grid - across)[0]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
     normal /= np.hypot(*normal.T)[:, None]
     return np.asarray(normal * np.sign((normal * side).sum(axis=1))[:, None])
@@ -100,24 +100,25 @@ def _polarity(target: Target, grid: Array, half: Array) -> NDArray[np.int64]:
 
 
 class _Sight:
-    """Lines of sight from a camera to the points of its scene."""
+    """Lines of sight from a camera to the points of one target of its scene."""
 
-    def __init__(self, scene: Scene, clearance: float) -> None:
+    def __init__(self, scene: Scene, index: int, clearance: float) -> None:
         self.scene = scene
         self.clearance = clearance
         self.camera = scene.camera
-        self.layers = [BoardLayer.of(scene, target) for target in scene.targets]
+        self.matrix = scene.plane_to_camera(scene.targets[index])
+        self.others = [BoardLayer.of(scene, target) for target in scene.targets]
+        self.layer = self.others.pop(index)
 
-    def project(self, index: int, grid: Array) -> tuple[Array, Mask]:
-        """Pixels of a target's grid coordinates, NaN if the camera does not see them, and which it sees."""
-        matrix = self.scene.plane_to_camera(self.scene.targets[index])
-        points = grid @ matrix[:, :2].T + matrix[:, 2]
+    def project(self, grid: Array) -> tuple[Array, Mask]:
+        """Pixels of grid coordinates, NaN if the camera does not see them, and which it sees."""
+        points = grid @ self.matrix[:, :2].T + self.matrix[:, 2]
         pixels, seen = self.camera.project(points)[0], self.camera.sees(points)
         return np.where(seen[..., None], pixels, np.nan), seen
 
-    def look(self, index: int, grid: Array) -> tuple[Array, Mask]:
-        """Pixels of a target's grid coordinates, and which are visible with clearance."""
-        pixels, seen = self.project(index, grid)
+    def look(self, grid: Array) -> tuple[Array, Mask]:
+        """Pixels of grid coordinates, and which are visible with clearance."""
+        pixels, seen = self.project(grid)
         flat = pixels.reshape(-1, 2)
         width, height = self.scene.size
         room = np.array([width - 1, height - 1]) - self.clearance
@@ -125,22 +126,21 @@ class _Sight:
             framed = ((flat >= self.clearance) & (flat <= room)).all(axis=1)
         visible = framed & seen.reshape(-1)
         at = np.flatnonzero(visible)
-        visible[at] = self._open(index, flat[at])
+        visible[at] = self._open(flat[at])
         return pixels, visible.reshape(seen.shape)
 
-    def _open(self, index: int, pixels: Array) -> Mask:
-        """Whether a plane is not hidden at image points and on a circle around each."""
+    def _open(self, pixels: Array) -> Mask:
+        """Whether the target is not hidden at image points and on a circle around each."""
         angle = np.arange(12) * (np.pi / 6)
         ring = self.clearance * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         around = pixels[:, None] + np.concatenate([np.zeros((1, 2)), ring])
         rays = self.camera.rays(around[..., 0].ravel(), around[..., 1].ravel())
-        _, _, w = self.layers[index].grid(rays)
+        _, _, w = self.layer.grid(rays)
         with np.errstate(divide="ignore"):
             depth = np.where(w > 0, 1 / w, np.inf)
         hidden = np.zeros(len(depth), dtype=bool)
         for occluder in self.scene.occluders:
             hidden |= occluder.cover(rays, _TINY_CELL).alpha > 0
-        for k, layer in enumerate(self.layers):
-            if k != index:
-                hidden |= layer.cover(rays, _TINY_CELL).depth < depth * (1 - 1e-9)
+        for layer in self.others:
+            hidden |= layer.cover(rays, _TINY_CELL).depth < depth * (1 - 1e-9)
         return np.asarray(~hidden.reshape(around.shape[:2]).any(axis=1))
