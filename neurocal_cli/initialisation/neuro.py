@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,9 @@ from neurocal_cli.initialisation.view_networks import (
     refuse_few_conditions,
     train_networks,
 )
+
+if TYPE_CHECKING:
+    from neurocal_cli.initialisation.random_cameras import Found
 
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
@@ -135,22 +139,21 @@ class _Search:
         spare = 2 * int(self.views.distinct.sum()) - problem.n_parameters
         if spare >= _MANY_EQUATIONS and reaches_bound(problem, best, groups):
             return best, record
-        from neurocal_cli.initialisation.random_cameras import find_camera
-
-        found = find_camera(
-            self.views, problem.normalised_entries, problem.free, self.rng, self.options.starts
-        )
+        found = self._random_camera(self.options.starts)
         if found is None:
             return best, record
         record = replace(record, starts=record.starts + found.starts)
         return try_start(problem, best, found.state), record
 
-    def camera_from_few_points(self) -> _Found:
-        """Type 2 with one view of 5 points: random cameras instead of a free product."""
+    def _random_camera(self, starts: int) -> Found | None:
         from neurocal_cli.initialisation.random_cameras import find_camera
 
         problem = self.problem
-        found = find_camera(self.views, problem.normalised_entries, problem.free, self.rng, self.many_starts)
+        return find_camera(self.views, problem.normalised_entries, problem.free, self.rng, starts)
+
+    def camera_from_few_points(self) -> _Found:
+        """Type 2 with one view of 5 points: random cameras instead of a free product."""
+        found = self._random_camera(self.many_starts)
         if found is None:
             raise DegenerateGeometryError(
                 f"no random start found a camera for these {len(self.views.index)} points; give more points"
