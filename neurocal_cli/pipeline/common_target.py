@@ -9,7 +9,6 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
@@ -17,6 +16,7 @@ from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed
+from neurocal_cli.verdict.assessment import stored_state
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
@@ -94,24 +94,15 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
 
 def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
     """The problem that a calibration solves, adjusted to its minimum."""
-    camera, given = calibration.camera, calibration.intrinsics
-    centre = (given.u0, given.v0) if calibration.type == 2 else None
+    given = calibration.intrinsics
     problem = problem_for(
         calibration.points,
         calibration.type,
-        image_center=centre,
+        image_center=(given.u0, given.v0) if calibration.type == 2 else None,
         intrinsics=given if calibration.type == 3 else None,
         skew="theta" not in calibration.fixed or calibration.type == 3,
-        distortion=camera.distortion,
+        distortion=calibration.camera.distortion,
     ).with_seen_pixels()
-    views = [calibration.views[name] for name in problem.views.names]
-    state = CameraState(
-        np.array([camera.entries]),
-        np.stack([view.pose.R for view in views]),
-        np.stack([view.pose.t for view in views]),
-        camera.distortion.model,
-        camera.distortion.coefficients,
-    )
-    fixed = problem.fixed | frozenset(calibration.fixed)
-    problem = replace(problem, fixed=fixed)
+    problem = replace(problem, fixed=problem.fixed | calibration.fixed)
+    state = stored_state(calibration, problem.views.names)
     return problem, problem.adjust(normalised(state, problem.views))

@@ -8,11 +8,11 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import pose_std
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.verdict.assessment import stored_state
 
 
 # Poses that the points do not determine have an infinite std already.
@@ -22,15 +22,11 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
     names, covariance = given.known_covariance
     if not names or not np.isfinite(covariance).all():
         return found
-    points, camera = found.points, found.camera
-    views = arrange(points)
-    poses = [found.views[name].pose for name in views.names]
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    lens = camera.distortion
-    state = normalised(CameraState(np.array([camera.entries]), R, t, lens.model, lens.coefficients), views)
-    entries = entry_covariance(camera.intrinsics, lens.model, names, covariance, views.pixel_scale)
-    block = covariance_by_camera(views, state, entries)
-    added = pose_std(R, (R @ views.centre[..., None])[..., 0], views.scale, block)
+    views = arrange(found.points)
+    state = stored_state(found, views.names)
+    entries = entry_covariance(found.intrinsics, state.model, names, covariance, views.pixel_scale)
+    block = covariance_by_camera(views, normalised(state, views), entries)
+    added = pose_std(state.R, (state.R @ views.centre[..., None])[..., 0], views.scale, block)
     results = dict(found.views)
     for name, more in zip(views.names, added.tolist(), strict=True):
         std = found.views[name].std

@@ -1,22 +1,12 @@
 """Measure the quality of a calibration beyond its reprojection error, and reach a verdict.
 
-Everything is computed from the calibration and its points, so a file can be judged like a fresh result:
-
-* the cross-validation error (`cross_validation`);
-* the noise floor: the error if each view has its own camera, a free network (`outlier_views.free_networks`);
-  a common camera with a much larger error contradicts the data;
-* the difference between two halves of the data, in units of its reported uncertainty;
-* the correlation of neighbouring residuals (`residual_correlation`);
-* two cameras among the views, or a changing focal length (`view_groups`);
-* a board whose axes have different units (`proportions`);
-* coefficients that the chosen distortion model lacks (`missing_coefficients`);
-* given parameters that the points contradict (`given_parameters`);
-* the coverage of the image and of directions by the points (`coverage`);
-* the uncertainty of projected pixels (`projection_uncertainty`).
+All measures (`Evidence`) are computed from the calibration and its points, so a file can be judged like a
+fresh result.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -112,6 +102,13 @@ def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | 
     return _AtMinimum(calibration).projection()
 
 
+def stored_state(calibration: Calibration, names: Sequence[str]) -> CameraState:
+    """The camera of a calibration and its poses of the named views, in pixels and world units."""
+    poses, camera = [calibration.views[name].pose for name in names], calibration.camera
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    return CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
+
+
 def _has_points(calibration: Calibration) -> bool:
     return bool(calibration.views) and set(calibration.points.view_names) == set(calibration.views)
 
@@ -125,11 +122,11 @@ def _views_behind(calibration: Calibration) -> int:
     poses = [calibration.views[name].pose for name in points.view_names]
     if calibration.camera.distortion.wide:
         seen = calibration.camera.sees(in_cameras(poses, points.world, points.view_index))
-        return int(np.count_nonzero(np.bincount(points.view_index[~seen])))
-    axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
-    depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
-    behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
-    return int(np.count_nonzero(np.bincount(behind)))
+    else:
+        axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
+        depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
+        seen = depth > _IN_PLANE * np.abs(depth).max()
+    return len(np.unique(points.view_index[~seen]))
 
 
 class _AtMinimum:
@@ -138,14 +135,7 @@ class _AtMinimum:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
         views = [calibration.views[name] for name in self.points.view_names]
-        self.camera = calibration.camera
-        self.given = CameraState(
-            np.array([self.camera.entries]),
-            np.stack([view.pose.R for view in views]),
-            np.stack([view.pose.t for view in views]),
-            self.camera.distortion.model,
-            self.camera.distortion.coefficients,
-        )
+        self.camera, self.given = calibration.camera, stored_state(calibration, self.points.view_names)
         self.views = self._arranged(self.points)
         self.free = estimated_parameters(calibration)
         if xi_is_flat(calibration.distortion_model, calibration.distortion):
@@ -178,10 +168,17 @@ class _AtMinimum:
 
     def _covariance_of_given(self) -> Array:
         """(5 + K, 5 + K) covariance of a given camera, normalised."""
-        c, model = self.calibration, self.state.model
-        return entry_covariance(
-            c.intrinsics, model, c.given_names, c.given_covariance, self.views.pixel_scale
-        )
+        return self._of_entries(self.calibration.given_names, self.calibration.given_covariance)
+
+    def _of_entries(self, names: tuple[str, ...], covariance: Array) -> Array:
+        c, px = self.calibration, self.views.pixel_scale
+        return entry_covariance(c.intrinsics, c.distortion_model, names, covariance, px)
+
+    def _stored(self) -> tuple[NDArray[np.bool_], Array]:
+        """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
+        c = self.calibration
+        free = free_entries(c)
+        return free, self._of_entries(c.covariance_names, c.covariance)[np.ix_(free, free)]
 
     def _arranged(self, points: Correspondences) -> Views:
         """The points, at these or other world coordinates, with the weights that the residuals bear out."""
@@ -285,7 +282,7 @@ class _AtMinimum:
         At the minimum the gradients of points and prior cancel. Without a fold F of the views the minimum is
         at -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
         """
-        free, shared = _stored(self.calibration, self.views.pixel_scale)
+        free, shared = self._stored()
         q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
         S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
         inverse = shared / self.variance
@@ -378,7 +375,7 @@ class _AtMinimum:
             m = replace(m, state=lens.state(m.state), normal=self.wide.normal, free=lens.free)
             camera = replace(camera, distortion=Distortion(lens.model, lens.k))
         if camera.distortion.model == "rich":
-            free, shared = _stored(self.calibration, self.views.pixel_scale)
+            free, shared = self._stored()
             m = replace(m, free=free)
         if self.calibration.given_names:
             given = self._covariance_of_given()
@@ -386,16 +383,3 @@ class _AtMinimum:
             m, shared = replace(m, free=free), given[np.ix_(free, free)]
         pixels = image_grid(self.points.image_size)
         return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
-
-
-def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
-    """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
-    block = entry_covariance(
-        calibration.intrinsics,
-        calibration.distortion_model,
-        calibration.covariance_names,
-        calibration.covariance,
-        pixel_scale,
-    )
-    free = free_entries(calibration)
-    return free, np.asarray(block[np.ix_(free, free)])
