@@ -12,6 +12,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
@@ -53,10 +54,15 @@ def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
         return False
     if choice == "auto" and any(camera.type != 1 for camera in cameras):
         return False  # a wrong given parameter would be absorbed by the target's shape
-    known = cameras[0].target
-    given, label, point = distinct_points([camera.points for camera in cameras])
+    n_views = sum(len(camera.views) for camera in cameras)
+    return views_suffice([camera.points for camera in cameras], cameras[0].target, n_views)
+
+
+def views_suffice(points: Sequence[Correspondences], known: Target | None, n_different: int) -> bool:
+    """Whether enough different views show most points of a target, which is known if it was estimated."""
+    given, label, point = distinct_points(points)
     plane = planes_of(given, point) if known is None else known.plane
-    return enough_views(label, sum(len(camera.views) for camera in cameras), int(plane.max()) + 1)
+    return enough_views(label, n_different, int(plane.max()) + 1)
 
 
 def _surveyed(cameras: Sequence[Calibration]) -> Target | None:

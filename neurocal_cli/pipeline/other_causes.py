@@ -15,6 +15,7 @@ from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
+from neurocal_cli.pipeline.point_errors import places_of_views
 from neurocal_cli.target_shape.find import Found, evidence_as_given
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
 from neurocal_cli.verdict.given_parameters import (
@@ -56,8 +57,7 @@ def contradicts_sigma(solution: Solution) -> bool:
     problem, points = solution.problem, solution.problem.points
     if points.covariance is None:
         return False
-    place = np.array([problem.views.names.index(name) for name in points.view_names])
-    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, places_of_views(solution, points))
     alike = correlation(problem.views, point_residuals(problem.views, solution.state))
     return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
@@ -18,7 +17,6 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     with_scale,
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.solution import Solution, TargetPosterior
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -46,10 +44,9 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    errors, repeated = solution.residuals, solution.repeated
     known = camera_covariance(
         CameraSeen(
-            views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
+            views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
             problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
             solution.shared, solution.by_prior, solution.target_kept,
             solution.covariance if solution.target is None else None,
@@ -65,7 +62,7 @@ def calibration_of(
     entries = _entries(problem, known, solution.ambiguity)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
-    squared = (errors**2).sum(axis=1) * views.pixel_scale**2
+    squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
     free = [n for n, parameter in enumerate(std) if parameter not in fixed]
     reason = StopReason.CONVERGED
@@ -102,12 +99,8 @@ def calibration_of(
         would_take=solution.would_take,
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
-            *_xi_warning(solution.ambiguity, problem.distortion.model),
-            *_corner_warning(problem),
-            *(() if chosen else _undetermined_warning(problem, adjusted)),
-            *(() if normalised(problem.points) else _repeated_warning(repeated)),
-            *filter(None, [scale_of(problem.points).contradiction]),
-            *_mirrored_warning(seen_from_behind(views, state)),
+            *_lens_warnings(solution),
+            *_view_warnings(solution),
             *_rejection_warnings(rejected, len(problem.points)),
         ),
     )
@@ -178,71 +171,58 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
     )
 
 
-def _xi_warning(ambiguity: Ambiguity | None, model: str) -> tuple[str, ...]:
-    """Warn if a wide range of xi explains the points equally well, each value with its own alpha."""
-    if ambiguity is None or np.diff(ambiguity.range)[0] < _TOLD:
-        return ()
-    first, last = ambiguity.range
-    with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
-    return (
-        f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
-        f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, and "
-        "the verdict gives its std",
-    )
-
-
-def _corner_warning(problem: Problem) -> tuple[str, ...]:
-    """Warn if the distortion had to be kept monotonic in corners of the image without points."""
-    if problem.penalty is None or problem.distortion.model == "rich":
-        return ()
-    return (
-        f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
-        "two directions to one pixel) in the image's corners, where there are no points; the best monotonic "
-        "fit is used, which is a guess in the corners; add views that show the board there",
-    )
-
-
-def _undetermined_warning(problem: Problem, adjusted: Adjusted) -> tuple[str, ...]:
-    """Warn of a named model with coefficients that the points do not determine.
-
-    Those of eucm do not show it by their standard deviations: without distortion its alpha is 0, and beta has
-    no effect.
-    """
+def _lens_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of a distortion that the points determine in part."""
+    problem, ambiguity = solution.problem, solution.ambiguity
     model = problem.distortion.model
-    if not problem.free_distortion or model == "rich" or (adjusted.converged and model != "eucm"):
-        return ()
-    return tuple(filter(None, [undetermined_coefficients(problem, adjusted)]))
+    if ambiguity is not None and not np.diff(ambiguity.range)[0] < _TOLD:
+        first, last = ambiguity.range
+        with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
+        yield (
+            f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
+            f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, "
+            "and the verdict gives its std"
+        )
+    if model == "rich":
+        return
+    if problem.penalty is not None:
+        yield (
+            f"the distortion model {model} that fits the points best is not monotonic (maps two directions "
+            "to one pixel) in the image's corners, where there are no points; the best monotonic fit is "
+            "used, which is a guess in the corners; add views that show the board there"
+        )
+    # The standard deviations of eucm do not show it: without distortion alpha is 0, and beta has no effect.
+    doubtful = not solution.adjusted.converged or model == "eucm"
+    if doubtful and solution.model_errors is None and problem.free_distortion:
+        yield from filter(None, [undetermined_coefficients(problem, solution.adjusted)])
 
 
-def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
-    """Warn if views repeat a pose."""
-    if repeated.none:
-        return ()
-    return (
-        f"{len(repeated.group)} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
-        "views that repeat a pose count as one",
-    )
+def _view_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
+    points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
+    if not (repeated.none or normalised(points)):
+        yield (
+            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
+            "views that repeat a pose count as one"
+        )
+    yield from filter(None, [scale_of(points).contradiction])
+    # The camera is right nevertheless.
+    mirrored = seen_from_behind(views, solution.state)
+    if mirrored:
+        more = f" and {len(mirrored) - _NAMED} more" if len(mirrored) > _NAMED else ""
+        yield (
+            f"the target appears mirrored in {', '.join(map(repr, mirrored[:_NAMED]))}{more}, so the poses "
+            "of these views are wrong; check the order of their points"
+        )
 
 
-def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
-    """Warn of views in which a flat target is mirrored: the camera is right, but these poses are wrong."""
-    if not views:
-        return ()
-    names = ", ".join(map(repr, views[:_NAMED])) + (
-        f" and {len(views) - _NAMED} more" * (len(views) > _NAMED)
-    )
-    return (
-        f"the target appears mirrored in {names}, so the poses of these views are wrong; check the order of "
-        "their points",
-    )
-
-
-def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
+def _rejection_warnings(rejected: Rejected, kept: int) -> Iterator[str]:
     """Name the views left out with their reasons, and the first outliers by line and id."""
-    lines = [f"view {name!r} is left out: {reason}" for name, reason in rejected.views.items()]
+    for name, reason in rejected.views.items():
+        yield f"view {name!r} is left out: {reason}"
     points = rejected.points
     if points is None:
-        return tuple(lines)
+        return
     single = np.flatnonzero([points.view_names[v] not in rejected.views for v in points.view_index])
     if single.size:
         places = []
@@ -251,5 +231,4 @@ def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
             places.append(f"{points.place(int(row))}{label}")
         more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
         share = f"{single.size} of {kept + len(rejected)} points"
-        lines.append(f"{share} are outliers and are left out: {', '.join(places)}{more}")
-    return tuple(lines)
+        yield f"{share} are outliers and are left out: {', '.join(places)}{more}"

@@ -56,9 +56,7 @@ def with_rich_lens(
     if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return solution, rejected
     repeated = solution.repeated
-    if repeated.n_poses < _FEWEST:
-        return solution, rejected
-    rich = _rich(solution, repeated)
+    rich = None if repeated.n_poses < _FEWEST else _rich(solution, repeated)
     if rich is None or not _is_the_lens(rich, solution, repeated):
         return solution, rejected
     found = {**(solution.model_errors or {}), "rich": _held_out_rms(rich, repeated)}

@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
@@ -28,6 +27,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.odd_points import units_mixed
+from neurocal_cli.verdict.view_groups import variance_of_views
 
 # tests/test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
@@ -228,6 +228,5 @@ def _is_noise(fit: _Fit | None) -> bool:
     if fit is None:
         return False
     views, state, cost = fit
-    unknowns = 6 * views.n_views + int(conditions_on_views(views, state).sum())
-    own = float(free_networks(views, state).sum()) / max(views.n_equations - unknowns, 1)
-    return cost / max(views.n_equations - 7 - 6 * views.n_views, 1) < _FLOOR * own
+    variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
+    return variance < _FLOOR * variance_of_views(views, state)
