@@ -47,12 +47,13 @@ _STEPS = 150  # many, because the coefficients are nearly degenerate
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
 _DECISIVE = 10.0  # difference of the criterion: odds of 150
 
+Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem
 
-def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Solution:
+
+def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     """The better of a solution and the results of other starts, if it may be a local minimum.
 
-    A solution without an estimated distortion is returned unchanged. `more_starts` yields other starting
-    states for a problem.
+    A solution without an estimated distortion is returned unchanged.
     """
     problem = solution.problem
     # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
@@ -71,7 +72,7 @@ def _may_be_local(solution: Solution) -> bool:
     return not correlation(solution.problem.views, solution.residuals) < _CORRELATED
 
 
-def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Adjusted:
+def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     """The lowest minimum of the wanted model from all starts."""
     # Imported here, because most calibrations need no other starts.
     from neurocal_cli.distortion.candidate_models import fit_candidates

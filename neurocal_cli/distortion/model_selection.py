@@ -18,16 +18,13 @@ alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, held_out_views
-from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
@@ -43,10 +40,8 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.given_model import FEW_VIEWS
+from neurocal_cli.distortion.given_model import FEW_VIEWS, Starts
 from neurocal_cli.geometry import Array
-
-Starts = Callable[[Problem], Iterable[CameraState]]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
@@ -66,10 +61,9 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which anothe
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
     """Fit all models, starting from a solution with any of them, and select one.
 
-    `more_starts` yields other starting states for a problem, in case the first leads to a local minimum. The
-    `preferred` model is selected unless another predicts decidedly better. The result has the
-    cross-validation errors of all fitted models. It is a refusal if the distortion is strong and the model
-    that fits is not monotonic inside the image.
+    `more_starts` are tried in case the first one leads to a local minimum. The `preferred` model is selected
+    unless another predicts decidedly better. The result has the cross-validation errors of all fitted models.
+    It is a refusal if the distortion is strong and the model that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)

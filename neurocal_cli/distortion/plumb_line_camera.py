@@ -74,9 +74,8 @@ def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspo
     observed = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
     weighed = whitening = views.whitening
     if weighed is not None:
-        rows = np.arange(len(points)) if views.order is None else views.order
         whitening = np.empty_like(weighed)
-        whitening[rows] = rounded(weighed, views.across)
+        whitening[order] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
     start = replace(start, model=MODEL, k=_in_camera_terms(start.entries[0], observed.pixels, views.pixels))

@@ -60,20 +60,17 @@ class Consensus:
     looseness: float
 
 
-def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
-    """Find the points of each view that agree with one network.
-
-    `flat` (V,) says which views' networks take their target as a plane.
-    """
+def find_consensus(views: Views, rng: np.random.Generator) -> Consensus:
+    """Find the points of each view that agree with one network; nearly flat targets are taken as planes."""
     kept = np.ones(len(views.index), dtype=bool)
     hopeless = np.zeros(views.n_views, dtype=bool)
     loose = np.full(views.n_views, np.nan)
-    for kind in (True, False):
-        members = np.flatnonzero((flat == kind) & (views.distinct >= _FEWEST[kind]))
+    for flat in (True, False):
+        members = np.flatnonzero((views.nearly_flat == flat) & (views.distinct >= _FEWEST[flat]))
         at_once = max(1, _NETWORKS_AT_ONCE // _STARTS)
         for first in range(0, len(members), at_once):
             some = members[first : first + at_once]
-            search = _Search(views, some, kind, rng)
+            search = _Search(views, some, flat, rng)
             search.run()
             hopeless[some] = search.judge(kept)
             # If all pixels of a view coincide, its scatter is undefined.
@@ -89,7 +86,7 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
 
 
 def find_consensus_through_wide_lens(
-    pinhole: Consensus, views: Views, flat: NDArray[np.bool_], middle: Array, rng: np.random.Generator
+    pinhole: Consensus, views: Views, middle: Array, rng: np.random.Generator
 ) -> Consensus:
     """The same through a wide lens, which displaces points by more than outliers do.
 
@@ -105,7 +102,7 @@ def find_consensus_through_wide_lens(
         theta = radius * (half_angle / radius.max())
         rays = np.column_stack([away * np.sinc(theta / np.pi)[:, None], np.cos(theta)])
         rays[:, :2] *= half_angle / radius.max()
-        consensus = find_consensus(replace(views, rays=rays), flat, rng)
+        consensus = find_consensus(replace(views, rays=rays), rng)
         if consensus.looseness < most:
             best, most = consensus, consensus.looseness
     return pinhole if best is None or best.hopeless.sum() > pinhole.hopeless.sum() else best

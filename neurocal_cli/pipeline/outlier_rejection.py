@@ -115,10 +115,10 @@ class _Search:
         """
         views = arrange(self.points)
         rng = np.random.default_rng(self.options.seed)
-        consensus = find_consensus(views, views.nearly_flat, rng)
+        consensus = find_consensus(views, rng)
         if consensus.hopeless.any() and self._may_be_wide():
             middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
-            consensus = find_consensus_through_wide_lens(consensus, views, views.nearly_flat, middle, rng)
+            consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
         self._keep(views, consensus)
         if self.kept.all():
             if first is None:
@@ -136,7 +136,7 @@ class _Search:
         for _ in range(_LOOKS):
             if not self.solution.state.distortion.wide:
                 break
-            again = find_consensus(replace(views, rays=self._rays(views)), views.nearly_flat, rng)
+            again = find_consensus(replace(views, rays=self._rays(views)), rng)
             if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
                 break
             self._keep(views, again)

@@ -185,8 +185,7 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     """Findings about views in which the points are spaced wider or closer than in most views."""
     if points.n_views < 2:
         return
-    order = np.argsort(points.view_index, kind="stable")
-    worlds = np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
+    worlds = _worlds(points)
     step = _steps(worlds)
     # The spacing that most views have; of two equally common ones, the first view's.
     alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
@@ -221,8 +220,7 @@ def view_of_another_unit(points: Correspondences) -> str:
 
     The targets of the views may differ in size.
     """
-    order = np.argsort(points.view_index, kind="stable")
-    step = _steps(np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1]))
+    step = _steps(_worlds(points))
     ratio = step / median(step)
     odd = int(np.argmax(np.abs(np.log(ratio))))
     factor = float(max(ratio[odd], 1 / ratio[odd]))
@@ -232,6 +230,12 @@ def view_of_another_unit(points: Correspondences) -> str:
     return f"the points of {points.view_names[odd]} lie {factor:.2g} times {how} than in most views" + (
         f", as with {unit} mixed" if unit else ""
     )
+
+
+def _worlds(points: Correspondences) -> list[Array]:
+    """World points of each view."""
+    order = np.argsort(points.view_index, kind="stable")
+    return np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
 
 
 def _steps(worlds: list[Array]) -> Array:

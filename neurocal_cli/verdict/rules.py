@@ -216,7 +216,7 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    if calibration.type in (3,):
+    if calibration.type == 3:
         return
     cover = e.coverage
     if np.isfinite(cover.image):
