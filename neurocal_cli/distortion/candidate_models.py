@@ -157,7 +157,9 @@ class _Chain:
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         """Fit all models that the points support, each from the best of the simpler ones."""
         fitted: dict[str, Candidate] = {}
-        least = self._cost(state)
+        least = np.inf  # any fit replaces a pinhole
+        if state.model != "none":
+            least = float((point_residuals(self.problem.views, state) ** 2).sum())
         for model in ("none", *_CHAIN):
             problem = supported(self.problem, model)
             if problem is None or (model == "rational" and self._promises_little(problem, fitted)):
@@ -196,12 +198,6 @@ class _Chain:
         return (
             gain < _PROMISING * _LEAST_PENALTY * _NEW["rational"] * simpler.cost / rational.views.n_equations
         )
-
-    def _cost(self, state: CameraState) -> float:
-        """Squared error of a state with distortion; infinite for a pinhole, so that any fit replaces it."""
-        if state.model == "none":
-            return np.inf
-        return float((point_residuals(self.problem.views, state) ** 2).sum())
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """Fit a model again from the next richer one if it is missing or far worse than that."""

@@ -30,7 +30,6 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back
@@ -76,6 +75,7 @@ def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     """The lowest minimum of the wanted model from all starts."""
     # Imported here, because most calibrations need no other starts.
     from neurocal_cli.distortion.candidate_models import fit_candidates
+    from neurocal_cli.distortion.similar_lens import similar_states
 
     problem, best = solution.problem, solution.adjusted
     wanted = problem.distortion.model
@@ -84,23 +84,16 @@ def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
         if found is None or (fitted == wanted and not found.cost < _cost(best)):
             continue
-        same = [problem.adjust(near) for near in _as(wanted, found.adjusted, problem.views)]
-        best = min([best, *same], key=_cost)
+        near, state = [found.adjusted], found.adjusted.state
+        if fitted != wanted:
+            similar = similar_states(state, wanted, farthest_angle(problem.views, state))
+            near = [replace(found.adjusted, state=one) for one in similar]
+        best = min([best, *map(problem.adjust, near)], key=_cost)
     return best
 
 
 def _cost(adjusted: Adjusted) -> float:
     return float(adjusted.cost.sum())
-
-
-def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:
-    """The fit itself if it has the wanted model, else the most similar lenses of that model."""
-    if found.state.model == wanted:
-        return [found]
-    from neurocal_cli.distortion.similar_lens import similar_states
-
-    starts = similar_states(found.state, wanted, farthest_angle(views, found.state))
-    return [replace(found, state=start) for start in starts]
 
 
 def with_denominator_if_supported(solution: Solution) -> Solution:

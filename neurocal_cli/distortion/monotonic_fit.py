@@ -160,7 +160,8 @@ def _with_slope(
     least, beyond, guess = least_slope
     weight = float(np.sqrt(found.cost.sum() / problem.views.n_equations)) / _SLACK
     corner = beyond * _farthest(problem, found.state)
-    adjusted, last = found, min(_turn(found.state), corner)
+    lens = found.state.distortion
+    adjusted, last = found, min(largest_angle(lens) if lens.wide else monotonic_radius(lens), corner)
     last += max(corner - _distorted(found.state, last), 0.0) / guess
     for _ in range(_ROUNDS):
         if found.state.model == "fisheye":
@@ -178,12 +179,6 @@ def _with_slope(
         corner = beyond * _farthest(problem, state)
         last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
     return None
-
-
-def _turn(state: CameraState) -> float:
-    """Undistorted radius, or a wide lens's angle, up to which the distortion is monotonic."""
-    distortion = state.distortion
-    return largest_angle(distortion) if distortion.wide else monotonic_radius(distortion)
 
 
 def _distorted(state: CameraState, last: float) -> float:

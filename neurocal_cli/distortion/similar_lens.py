@@ -40,8 +40,9 @@ def similar_states(
     The state is of one camera, and angles up to the `farthest` [rad] are compared. If values of xi are given,
     there is one state for each of them, in their order, without those that have no similar lens.
     """
-    if (same := _with_more_coefficients(state, model)) is not None:
-        return [same]
+    own = coefficient_names(state.model)
+    if model not in WIDE and state.model != model and coefficient_names(model)[: len(own)] == own:
+        return [state.with_model(model)]
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
     good: NDArray[np.bool_] = np.isfinite(radius)
@@ -63,14 +64,6 @@ def similar_states(
         linear = solution[g, 1:, 0] / scale[g]
         found.append(_with(state, model, float(scale[g]), grid[g], linear))
     return found
-
-
-def _with_more_coefficients(state: CameraState, model: str) -> CameraState | None:
-    """The same lens in a model whose first coefficients are the same; None if there is none."""
-    own, names = coefficient_names(state.model), coefficient_names(model)
-    if model in WIDE or state.model == model or names[: len(own)] != own:
-        return None
-    return replace(state, model=model, k=np.concatenate([state.k, np.zeros(len(names) - len(own))]))
 
 
 def tilted_states(state: CameraState) -> list[CameraState]:

@@ -116,7 +116,8 @@ class _Search:
         views = arrange(self.points)
         rng = np.random.default_rng(self.options.seed)
         consensus = find_consensus(views, rng)
-        if consensus.hopeless.any() and self._may_be_wide():
+        may_be_wide = self.options.distortion == "auto" or self.problem.distortion.wide
+        if may_be_wide and consensus.hopeless.any():
             middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
             consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
         self._keep(views, consensus)
@@ -154,10 +155,6 @@ class _Search:
         self.wrong_views = {}
         for view in np.flatnonzero(consensus.hopeless):
             self._drop(views.names[view], "its pixels do not match its points")
-
-    def _may_be_wide(self) -> bool:
-        """Whether the lens may be a wide one."""
-        return self.options.distortion == "auto" or self.problem.distortion.wide
 
     def _drop(self, name: str, reason: str) -> None:
         self.wrong_views[name] = reason
