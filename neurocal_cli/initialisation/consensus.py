@@ -134,7 +134,7 @@ class _Search:
 
     def _round(self, which: NDArray[np.intp]) -> None:
         product = self._few_points(which)  # (K', S, 3, I)
-        scale = self._scale(self._errors(which, product), self.real[which][:, None])
+        scale = _scale(self._errors(which, product), self.real[which][:, None])
         order = np.argsort(scale, axis=1, kind="stable")[:, :_FINALISTS]
         product = np.take_along_axis(product, order[..., None, None], axis=1)
         product, scale, near = self._learn_on(which, product)
@@ -167,7 +167,7 @@ class _Search:
         real = self.real[which][:, None]
         for _ in range(_PASSES):
             error = self._errors(which, product)
-            scale = self._scale(error, real)
+            scale = _scale(error, real)
             before, near = near, real & (error < _FAR * scale[..., None])
             if (near == before).all():
                 break
@@ -175,7 +175,7 @@ class _Search:
             flat = product.reshape(K * S, 3, -1)
             product = _trained(replace(patterns, weights=weights), flat, options).reshape(product.shape)
         error = self._errors(which, product)
-        scale = self._scale(error, real)
+        scale = _scale(error, real)
         return product, scale, real & (error < _FAR * scale[..., None])
 
     def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
@@ -207,10 +207,6 @@ class _Search:
                 error = np.where(same_side, error, np.nan)
         return np.where(np.isfinite(error), error, 1e9)
 
-    def _scale(self, error: Array, real: NDArray[np.bool_]) -> Array:
-        """Robust standard deviation from the median length, which is 1.18 sigma for two coordinates."""
-        return _median(error, np.broadcast_to(real, error.shape)) / 1.1774 + 1e-9
-
     def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Write the points near their network into `kept`; return the views that are wrong as a whole."""
         hopeless = np.zeros(len(self.members), dtype=bool)
@@ -237,8 +233,11 @@ def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
     return train_lm(Task(patterns, W, product, *free), options).product
 
 
-def _median(values: Array, real: NDArray[np.bool_]) -> Array:
-    """Median over the last axis of the real entries."""
-    ordered = np.sort(np.where(real, values, np.inf), axis=-1)
-    middle = (real.sum(axis=-1) - 1) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0])
+def _scale(error: Array, real: NDArray[np.bool_]) -> Array:
+    """Robust standard deviation over the last axis of the real entries.
+
+    It is from the median length, which is 1.18 sigma for two coordinates.
+    """
+    ordered = np.sort(np.where(real, error, np.inf), axis=-1)
+    middle = (np.broadcast_to(real, error.shape).sum(axis=-1, keepdims=True) - 1) // 2
+    return np.asarray(np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     first = _first_solution(problem, options)
     if options.distortion == "auto":
         return _finished(first, options)
-    solution = with_more_starts(first, lambda some: _distorted_starts(some, options))
+    solution = with_more_starts(first, partial(_distorted_starts, options=options))
     # For several views that share a camera, the first solution has tried the mirrored poses already.
     if solution is not first or problem.type == 3 or problem.views.n_views == 1:
         solution = _turned(solution)
@@ -90,10 +91,7 @@ def _with_selected_model(solution: Solution, options: Options, only_from_here: b
 
     if only_from_here:
         return select_model(solution, preferred=options.preferred)
-
-    def more_starts(problem: Problem) -> Iterator[CameraState]:
-        return _distorted_starts(problem, options)
-
+    more_starts = partial(_distorted_starts, options=options)
     found = select_model(solution, more_starts, options.preferred)
     turned = _turned(found)
     if turned is found:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.covariance import Covariance
+from neurocal_cli.bundle_adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
@@ -16,19 +17,18 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     pose_std,
     with_scale,
 )
-from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.solution import Solution, TargetPosterior
-from neurocal_cli.bundle_adjustment.units import translations
+from neurocal_cli.bundle_adjustment.units import normalised, translations
+from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
-from neurocal_cli.verdict.odd_points import normalised
-
-if TYPE_CHECKING:
-    from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
+from neurocal_cli.verdict.assessment import stored_state
+from neurocal_cli.verdict.odd_points import are_normalised
 
 _XI = 5  # index of xi, after A's five entries
 _TOLD = 0.1  # width of the range of xi from which on a warning is given
@@ -59,7 +59,7 @@ def calibration_of(
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
     else:
         intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
-    entries = _entries(problem, known, solution.ambiguity)
+    entries = _entries(solution, known)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
     squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
@@ -106,18 +106,38 @@ def calibration_of(
     )
 
 
+# Poses that the points do not determine have an infinite std already.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def with_given_covariance(found: Calibration, given: Calibration) -> Calibration:
+    """A calibration of type 3 whose poses have the uncertainty of the given camera, as far as it is known."""
+    names, covariance = given.known_covariance
+    if not names or not np.isfinite(covariance).all():
+        return found
+    views = arrange(found.points)
+    state = stored_state(found, views.names)
+    entries = entry_covariance(found.intrinsics, state.model, names, covariance, views.pixel_scale)
+    block = covariance_by_camera(views, normalised(state, views), entries)
+    added = pose_std(state.R, (state.R @ views.centre[..., None])[..., 0], views.scale, block)
+    results = dict(found.views)
+    for name, more in zip(views.names, added.tolist(), strict=True):
+        std = found.views[name].std
+        both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
+        results[name] = replace(found.views[name], std=both)
+    return replace(found, views=results, given_covariance=covariance, given_names=names)
+
+
 def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
     """The posterior of the target for a variance, unless the camera has been adjusted again."""
     adjusted, posterior = solution.target_posterior or (None, None)
     return posterior if adjusted is solution.adjusted else None
 
 
-def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | None) -> Array:
+def _entries(solution: Solution, known: CameraCovariance) -> Array:
     """(5 + K, 5 + K) covariance of A's entries and the distortion coefficients, normalised; 0 if given.
 
     It includes the spread of other cameras that explain the points equally well (`ambiguity`).
     """
-    free = problem.free_camera
+    free, ambiguity = solution.problem.free_camera, solution.ambiguity
     entries = np.zeros((len(free), len(free)))
     entries[np.ix_(free, free)] = known.found.entries
     if ambiguity is None:
@@ -200,7 +220,7 @@ def _lens_warnings(solution: Solution) -> Iterator[str]:
 def _view_warnings(solution: Solution) -> Iterator[str]:
     """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
     points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
-    if not (repeated.none or normalised(points)):
+    if not (repeated.none or are_normalised(points)):
         yield (
             f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
             "views that repeat a pose count as one"

@@ -177,13 +177,11 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
     (problem, adjusted), new = found.fits[0], again.problem
     if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
         return False
-    same = np.array_equal(problem.points.pixels, new.points.pixels)
+    if not np.array_equal(problem.points.pixels, new.points.pixels):
+        return False
     cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
-    return (
-        same
-        and np.array_equal(problem.free_camera, new.free_camera)
-        and bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
-    )
+    stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    return stays and np.array_equal(problem.free_camera, new.free_camera)
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:

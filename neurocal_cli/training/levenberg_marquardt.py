@@ -67,14 +67,9 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
         raise InputError("the hidden weights must be either all free or all given")
     networks = _Networks(_Normal(patterns, free), product, 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2)
     networks.train(options)
-    product = networks.product
-    if task.free_V.all():
-        W, V = _split(task.W, product)
-    else:
-        W, V = product, task.V
-    iterations, settled = networks.iterations, networks.settled
-    curve = networks.curve(options.max_iterations)
-    return Trained(W, V, networks.normal.gamma(product), networks.loss, iterations, settled, curve)
+    W, V = _split(task.W, networks.product) if task.free_V.all() else (networks.product, task.V)
+    gamma, curve = networks.normal.gamma(networks.product), networks.curve(options.max_iterations)
+    return Trained(W, V, gamma, networks.loss, networks.iterations, networks.settled, curve)
 
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:

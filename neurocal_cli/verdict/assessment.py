@@ -37,7 +37,7 @@ from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covar
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import pixel_spread
+from neurocal_cli.verdict.findings import pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import (
     Doubt,
     Reestimated,
@@ -85,12 +85,8 @@ def assess(calibration: Calibration) -> Verdict | None:
         return None
     behind = _views_behind(calibration)
     if behind:
-        return Verdict(
-            "poor",
-            (f"points lie behind the camera in {behind} of {len(calibration.views)} views",),
-            ("calibrate again, because the poses of these views were changed",),
-            {},
-        )
+        reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
+        return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
     return reach_verdict(calibration, gather_evidence(calibration))
 
 
@@ -271,9 +267,7 @@ class _AtMinimum:
         return free_networks(self.views, self.state)
 
     def _held_out(self) -> float:
-        lost = held_out(self.minimum)
-        if self.camera.distortion.model == "rich":
-            lost = self._held_out_with_prior()
+        lost = self._held_out_with_prior() if self.state.model == "rich" else held_out(self.minimum)
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _held_out_with_prior(self) -> Array:

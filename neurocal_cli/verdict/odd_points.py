@@ -58,14 +58,14 @@ def odd_points(calibration: Calibration) -> Iterator[Finding]:
     yield from views_of_another_scale(calibration.points)
 
 
-def normalised(points: Correspondences) -> bool:
+def are_normalised(points: Correspondences) -> bool:
     """Whether the pixels are normalised coordinates."""
     return bool(np.abs(points.pixels).max() < _NORMALISED)
 
 
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     """Findings about the pixels as numbers."""
-    if normalised(points):
+    if are_normalised(points):
         yield (
             2,
             "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",
@@ -110,9 +110,8 @@ def _outside(points: Correspondences) -> Iterator[Finding]:
     count = int(_beyond(points.pixels, size).sum())
     if count == 0:
         return
-    few = count <= _SOME * len(points)
     text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
-    if few:
+    if count <= _SOME * len(points):
         yield 1, text, "correct or leave out these points"
     elif not _beyond(points.pixels, size[::-1]).any():
         yield (
@@ -294,10 +293,9 @@ def _rejected_points(calibration: Calibration) -> Iterator[Finding]:
         where.append(f"{len(rejected.views) - 2} more views")
     if views:
         where.append(", ".join(f"{count} in {name}" for name, count in list(views.items())[:3]))
-    if targets:
-        where.append(f"{name_some(targets)} in most views")
     advice = "look at the points and views that are listed as outliers"
     if targets:
+        where.append(f"{name_some(targets)} in most views")
         advice = "check X,Y,Z of the points that are outliers in most views"
     yield (
         max(_OUTLIERS.grade(len(lost) / total), int(bool(where))),

@@ -22,7 +22,7 @@ from neurocal_cli.verdict.findings import (
     verdict_of,
 )
 from neurocal_cli.verdict.given_parameters import Doubt, Reestimated, told_apart
-from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
+from neurocal_cli.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.verdict.proportions import MEASURE_AXES, unlike_axes
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
@@ -80,7 +80,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
-    if normalised(calibration.points):  # the other rules are in pixels
+    if are_normalised(calibration.points):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
     if _oblong(calibration):  # a target stretched in one direction makes views differ as well
