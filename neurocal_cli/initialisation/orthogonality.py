@@ -42,11 +42,7 @@ class SharedIntrinsics:
 
 
 def shared_intrinsics(
-    solid: Array,
-    flat: Array,
-    given: Array,
-    free: NDArray[np.bool_],
-    rng: np.random.Generator,
+    solid: Array, flat: Array, given: Array, free: NDArray[np.bool_], rng: np.random.Generator
 ) -> SharedIntrinsics:
     """Estimate W from the products of all views.
 

@@ -79,14 +79,12 @@ def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondence
     yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1])
     for scale, name in ((2.0, "half"), (0.5, "twice")):
         yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5)
-    for axis, name in ((0, "u"), (1, "v")):
-        stretched = pixels * np.where(np.arange(2) == axis, 2.0, 1.0)
-        yield f"its {name} is of half resolution, as in interlaced images", replace(points, pixels=stretched)
+    for factors, name in (([2.0, 1.0], "u"), ([1.0, 2.0], "v")):
+        stretched = replace(points, pixels=pixels * factors)
+        yield f"its {name} is of half resolution, as in interlaced images", stretched
     for shift in (1, -1):
-        yield (
-            "its rows are shifted by one against its pixels",
-            replace(points, world=np.roll(world, shift, axis=0)),
-        )
+        shifted = replace(points, world=np.roll(world, shift, axis=0))
+        yield "its rows are shifted by one against its pixels", shifted
 
 
 def _pose(points: Correspondences, camera: Camera) -> CameraState | None:

@@ -28,7 +28,6 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
@@ -114,15 +113,14 @@ def _views_behind(calibration: Calibration) -> int:
 
     For a wide lens: with points outside the domain of its model.
     """
-    points = calibration.points
-    poses = [calibration.views[name].pose for name in points.view_names]
+    points, view = calibration.points, calibration.points.view_index
+    state = stored_state(calibration, points.view_names)
     if calibration.camera.distortion.wide:
-        seen = calibration.camera.sees(in_cameras(poses, points.world, points.view_index))
+        seen = calibration.camera.sees((state.R[view] @ points.world[..., None])[..., 0] + state.t[view])
     else:
-        axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
-        depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
+        depth = (points.world * state.R[view, 2]).sum(axis=1) + state.t[view, 2]
         seen = depth > _IN_PLANE * np.abs(depth).max()
-    return len(np.unique(points.view_index[~seen]))
+    return len(np.unique(view[~seen]))
 
 
 class _AtMinimum:

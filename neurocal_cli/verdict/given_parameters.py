@@ -105,11 +105,7 @@ def reestimate_given(
 
 
 def reestimate_centre(
-    views: Views,
-    state: CameraState,
-    given: frozenset[str],
-    free_poses: bool,
-    variance: float,
+    views: Views, state: CameraState, given: frozenset[str], free_poses: bool, variance: float
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre without tangential distortion, on the target as given.
 
@@ -127,11 +123,7 @@ def reestimate_centre(
 
 
 def reestimate_centre_and_target(
-    points: Correspondences,
-    views: Views,
-    state: CameraState,
-    given: frozenset[str],
-    variance: float,
+    points: Correspondences, views: Views, state: CameraState, given: frozenset[str], variance: float
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre together with the target, if that is decidedly more probable.
 
