@@ -42,7 +42,7 @@ _AGREED = 0.97  # share of points on which two starts have to agree
 # of the view's size.
 _MAJORITY, _TIGHT = 0.5, 0.05
 _LOOSE, _LOOSER = 0.01, 10.0  # or if it exceeds this share, and so many times the median of the views
-_NETWORKS_AT_ONCE = 20_000
+_AT_ONCE = 20_000 // _STARTS  # views: 20,000 networks fit into memory
 # Trial angles of the farthest point from the axis [rad], and the factor by which a lens must reduce the
 # scatter. A board covers a small part of the image, where a lens that is 20 % off displaces points by 1 %.
 _HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
@@ -67,9 +67,8 @@ def find_consensus(views: Views, rng: np.random.Generator) -> Consensus:
     loose = np.full(views.n_views, np.nan)
     for flat in (True, False):
         members = np.flatnonzero((views.nearly_flat == flat) & (views.distinct >= _FEWEST[flat]))
-        at_once = max(1, _NETWORKS_AT_ONCE // _STARTS)
-        for first in range(0, len(members), at_once):
-            some = members[first : first + at_once]
+        for first in range(0, len(members), _AT_ONCE):
+            some = members[first : first + _AT_ONCE]
             search = _Search(views, some, flat, rng)
             search.run()
             hopeless[some] = search.judge(kept)

@@ -184,7 +184,7 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     """Findings about views in which the points are spaced wider or closer than in most views."""
     if points.n_views < 2:
         return
-    worlds = _worlds(points)
+    worlds = worlds_by_view(points)
     step = _steps(worlds)
     # The spacing that most views have; of two equally common ones, the first view's.
     alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
@@ -219,7 +219,7 @@ def view_of_another_unit(points: Correspondences) -> str:
 
     The targets of the views may differ in size.
     """
-    step = _steps(_worlds(points))
+    step = _steps(worlds_by_view(points))
     ratio = step / median(step)
     odd = int(np.argmax(np.abs(np.log(ratio))))
     factor = float(max(ratio[odd], 1 / ratio[odd]))
@@ -231,7 +231,7 @@ def view_of_another_unit(points: Correspondences) -> str:
     )
 
 
-def _worlds(points: Correspondences) -> list[Array]:
+def worlds_by_view(points: Correspondences) -> list[Array]:
     """World points of each view."""
     order = np.argsort(points.view_index, kind="stable")
     return np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])

@@ -26,7 +26,7 @@ from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.points import Correspondences
-from neurocal_cli.verdict.odd_points import units_mixed
+from neurocal_cli.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.verdict.view_groups import variance_of_views
 
 # tests/test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
@@ -99,11 +99,8 @@ def _axes(points: Correspondences) -> tuple[int, int] | None:
     if points.n_views < _FEWEST_VIEWS or np.bincount(points.view_index).min() < _FEWEST_POINTS:
         return None
     first, second = sorted(order[1:].tolist())
-    for k in range(points.n_views):
-        rows = points.view_index == k
-        if not (np.ptp(points.world[rows][:, [first, second]], axis=0) > 0).all():
-            return None
-    return (first, second) if points.pixels.std() > 0 else None
+    extents = np.array([np.ptp(world[:, [first, second]], axis=0) for world in worlds_by_view(points)])
+    return (first, second) if (extents > 0).all() and points.pixels.std() > 0 else None
 
 
 _Fit = tuple[Views, CameraState, float]  # the points, the camera with its poses, the squared error
