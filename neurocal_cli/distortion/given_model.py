@@ -12,8 +12,7 @@ ordinary lens they are nearly degenerate with k1, k2 and k3. So they stay 0 unle
 criterion decidedly favours them.
 
 Given distortion. The networks model a pinhole. A given distortion is removed from the pixels before training
-(`Problem`), and the final bundle adjustment uses the observed pixels. An estimated distortion is part of the
-bundle adjustment (`Problem.adjust`).
+(`Problem`), and the final bundle adjustment uses the observed pixels.
 """
 
 from __future__ import annotations

@@ -163,12 +163,11 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)
-    rows = zip(R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    rows = zip(views.names, R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    given = not problem.free_poses
     return {
-        name: ViewResult(
-            Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not problem.free_poses
-        )
-        for name, (R_k, t_k, sigma, n, r) in zip(views.names, rows, strict=True)
+        name: ViewResult(Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, given)
+        for name, R_k, t_k, sigma, n, r in rows
     }
 
 

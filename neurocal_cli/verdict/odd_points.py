@@ -144,23 +144,15 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     view = points.view_index[first]
     n_twice = np.bincount(view, different > 1, points.n_views)
     n_points = np.bincount(view, minlength=points.n_views)
-    names = np.array(points.view_names)
     whole = 2 * n_twice > n_points
-    if whole.any():
-        yield (
-            1,
-            f"{name_some(names[whole])}: most points are given twice with different pixels, as of two images "
-            "under one name",
-            "give each image a name of its own",
-        )
     some = (n_twice > 0) & ~whole
-    if some.any():
-        yield (
-            1,
-            f"{name_some(names[some])}: {int(n_twice[some].sum())} points are given twice with different "
-            "pixels",
-            "check the ids and X,Y,Z of these points",
-        )
+    twice = "points are given twice with different pixels"
+    for which, reason, advice in (
+        (whole, f"most {twice}, as of two images under one name", "give each image a name of its own"),
+        (some, f"{int(n_twice[some].sum())} {twice}", "check the ids and X,Y,Z of these points"),
+    ):
+        if which.any():
+            yield 1, f"{name_some(np.array(points.view_names)[which])}: {reason}", advice
 
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
