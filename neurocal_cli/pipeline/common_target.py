@@ -14,7 +14,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target, distinct_points, planes_of
-from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
+from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed
 from neurocal_cli.verdict.assessment import stored_state
@@ -37,14 +37,20 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         fits = [_fit(camera) for camera in cameras]
     except NeurocalError:
         return None
-    chosen = known is None and all(camera.lens_choice for camera in cameras)
-    found = (find_lens_and_target if chosen else find_target)(
-        fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
-    )
+    named = not all(camera.lens_choice for camera in cameras)
+    found = find_shape(fits, choice, known, named)
     if found is None:
         return None
-    named = known is None and not chosen and choice == "auto"
-    return None if named and named_lens_is_too_simple(fits, found) else found.target
+    doubtful = named and known is None and choice == "auto"
+    return None if doubtful and named_lens_is_too_simple(fits, found) else found.target
+
+
+def find_shape(
+    fits: Sequence[tuple[Problem, Adjusted]], choice: str, known: Target | None, named: bool
+) -> Found | None:
+    """Estimate the target as chosen, starting from a known one; only a lens that is not named may change."""
+    find = find_target if named or known is not None else find_lens_and_target
+    return find(fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf)
 
 
 def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:

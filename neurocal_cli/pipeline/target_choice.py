@@ -18,7 +18,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.pipeline.common_target import views_suffice
+from neurocal_cli.pipeline.common_target import find_shape, views_suffice
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
@@ -27,7 +27,6 @@ from neurocal_cli.pipeline.point_errors import rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
-from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.target_shape.view_bends import find_bends
 from neurocal_cli.verdict.view_groups import OWN_STEPS, variance_of_views
 
@@ -116,12 +115,12 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
     The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
     """
     problem = solution.problem.with_model(_OF_LINES)
-    fit = problem, problem.adjust(solution.adjusted)
+    adjusted = problem.adjust(solution.adjusted)
     _, label, _ = distinct_points([problem.points])
     if not problem.free_poses or not enough_views(label, problem.views.n_views):
         return ""
-    found = find_target([fit], least_gain=LEAST_GAIN)
-    if found is None or has_other_cause(replace(solution, problem=fit[0], adjusted=fit[1]), found):
+    found = find_target([(problem, adjusted)], least_gain=LEAST_GAIN)
+    if found is None or has_other_cause(replace(solution, problem=problem, adjusted=adjusted), found):
         return ""
     target = found.target
     off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
@@ -137,15 +136,14 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
 
     Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
     """
-    fit = solution.problem, solution.adjusted
-    found = find_bends(fit, common)
+    given = solution.problem, solution.adjusted
+    found = find_bends(given, common)
     if found is None or found.target.bends is None:
         return found
-    before, after = fit if common is None else common.fits[0], found.fits[0]
-    least = variance_of_views(after[0].views, after[1].state)
-    given = _noise(*before, 0.0)
+    before, after = given if common is None else common.fits[0], found.fits[0]
+    least, flat = variance_of_views(after[0].views, after[1].state), _noise(*before, 0.0)
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
-    if bent > _NOISE * least and given - bent < _SHARE * (given - least):
+    if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     # No two cameras of this lens can fit better than a camera for each view.
     least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
@@ -185,10 +183,7 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    # The lens may change only if the user named none.
-    find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
-    least = LEAST_GAIN if choice == "auto" else -np.inf
-    return find([(solution.problem, solution.adjusted)], choice == "flat", known, least)
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
 
 
 def _fitted_to(
