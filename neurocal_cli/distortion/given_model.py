@@ -43,7 +43,7 @@ _LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # many, because the coefficients are nearly degenerate
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
-_DECISIVE = 10.0  # difference of the criterion: odds of 150
+DECISIVE = 10.0  # difference of the criterion: odds of 150
 
 Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem
 
@@ -105,7 +105,7 @@ def with_denominator_if_supported(solution: Solution) -> Solution:
     alike = correlation(views, point_residuals(views, found.state))
     n = effective_number(views.n_equations, alike)
     before, after = (max(float(a.cost.sum()), 1e-300) for a in (solution.adjusted, found))
-    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + _DECISIVE
+    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + DECISIVE
     better = told and folds_back(problem, found.state) is None
     if not better and folds_back(problem, solution.state) is None:
         return solution

@@ -40,7 +40,7 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.given_model import FEW_VIEWS, Starts
+from neurocal_cli.distortion.given_model import DECISIVE, FEW_VIEWS, Starts
 from neurocal_cli.geometry import Array
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
@@ -53,7 +53,6 @@ _DECIDEDLY = 1.03
 _FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
-_DECISIVE = 10.0  # difference of the criterion: odds of 150
 _CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
 _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
 
@@ -164,7 +163,7 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
     """Whether neither a sound distortion model nor a camera for each view explains decidedly more."""
     n, pinhole = worth(views, fitted.values()), fitted["none"]
     lowest = min((c.criterion(n) for c in fitted.values() if c.sound), default=np.inf)
-    return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
+    return pinhole.criterion(n) < lowest + DECISIVE and not falls_short(views, [pinhole])
 
 
 def _best(
@@ -219,7 +218,7 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     return {
         name: c
         for name, c in fitted.items()
-        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
+        if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
 
 

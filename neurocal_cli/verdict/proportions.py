@@ -40,7 +40,7 @@ _REFINED = (0.03, 0.005, 0.001)  # distances in log s of three errors, for the m
 _FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
-# Rows and columns of omega's entries, and the weights of their products.
+# Rows and columns of omega's entries.
 _ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
@@ -123,11 +123,9 @@ class _Board:
         h = self.homographies[..., :2] / [s, 1.0]
         h /= np.linalg.norm(h, axis=(1, 2), keepdims=True)
         h1, h2 = h[..., 0], h[..., 1]
-        rows = np.concatenate([_product_of(h1, h2), _product_of(h1, h1) - _product_of(h2, h2)])
+        rows = np.concatenate([product_of(h1, h2), product_of(h1, h1) - product_of(h2, h2)])
         values, vectors = np.linalg.svd(rows, full_matrices=False)[1:]
-        omega = np.zeros((3, 3))
-        omega[_ROW, _COLUMN] = omega[_COLUMN, _ROW] = vectors[-1] * np.sign(vectors[-1, 0])
-        return omega, float(values[-1])
+        return omega_of(vectors[-1]), float(values[-1])
 
     def linear(self) -> float | None:
         """The s of least residual; None if there is a camera for none."""
@@ -214,10 +212,17 @@ def _homography(plane: Array, pixels: Array) -> Array:
     return H
 
 
-def _product_of(a: Array, b: Array) -> Array:
-    """Coefficients (V, 6) of a . omega b."""
+def product_of(a: Array, b: Array) -> Array:
+    """Coefficients (V, 6) of a . omega b, for omega's entries 11, 12, 22, 13, 23, 33."""
     other = np.where(_ROW == _COLUMN, 0.0, 1.0)
     return np.asarray(a[:, _ROW] * b[:, _COLUMN] + other * a[:, _COLUMN] * b[:, _ROW])
+
+
+def omega_of(entries: Array) -> Array:
+    """The matrix omega (3, 3) from these entries up to sign; the first one becomes positive."""
+    omega = np.zeros((3, 3))
+    omega[_ROW, _COLUMN] = omega[_COLUMN, _ROW] = entries * np.sign(entries[0])
+    return omega
 
 
 def _is_noise(fit: _Fit | None) -> bool:
