@@ -59,7 +59,7 @@ def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
         return solution
     few = of_few_views(solution, FEW_VIEWS)
     certain = few is solution or is_elsewhere(few, solution)
-    if certain or _cost(_lowest(few, more_starts)) < _LOWER * _cost(few.adjusted):
+    if certain or total_cost(_lowest(few, more_starts)) < _LOWER * total_cost(few.adjusted):
         return replace(solution, adjusted=_lowest(solution, more_starts))
     return solution
 
@@ -81,17 +81,18 @@ def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
     for start in (best.state, *more_starts(problem)):
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
-        if found is None or (fitted == wanted and not found.cost < _cost(best)):
+        if found is None or (fitted == wanted and not found.cost < total_cost(best)):
             continue
         near, state = [found.adjusted], found.adjusted.state
         if fitted != wanted:
             similar = similar_states(state, wanted, farthest_angle(problem.views, state))
             near = [replace(found.adjusted, state=one) for one in similar]
-        best = min([best, *map(problem.adjust, near)], key=_cost)
+        best = min([best, *map(problem.adjust, near)], key=total_cost)
     return best
 
 
-def _cost(adjusted: Adjusted) -> float:
+def total_cost(adjusted: Adjusted) -> float:
+    """Squared error of all views."""
     return float(adjusted.cost.sum())
 
 
@@ -104,7 +105,7 @@ def with_denominator_if_supported(solution: Solution) -> Solution:
     found = richer.adjust(solution.adjusted, _STEPS)
     alike = correlation(views, point_residuals(views, found.state))
     n = effective_number(views.n_equations, alike)
-    before, after = (max(float(a.cost.sum()), 1e-300) for a in (solution.adjusted, found))
+    before, after = (max(total_cost(a), 1e-300) for a in (solution.adjusted, found))
     told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + DECISIVE
     better = told and folds_back(problem, found.state) is None
     if not better and folds_back(problem, solution.state) is None:

@@ -20,6 +20,7 @@ from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.given_model import (
     DENOMINATOR,
     check_distortion,
+    total_cost,
     with_denominator_if_supported,
     with_more_starts,
 )
@@ -138,11 +139,11 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
         )
     if problem.distortion.model == "tilted" and problem.free_poses and problem.free[3:].all():
         for _ in range(_TILT_ROUNDS):
-            lowest = min(found, key=lambda a: float(a.cost.sum()))
+            lowest = min(found, key=total_cost)
             found += [
                 problem.adjust(replace(lowest, state=s), _TILT_STEPS) for s in tilted_states(lowest.state)
             ]
-    best = min(found, key=lambda a: float(a.cost.sum()))
+    best = min(found, key=total_cost)
     problem, best = with_xi_held_if_flat(problem, best)
     return _turned(replace(simpler, problem=problem, adjusted=best))
 
