@@ -133,7 +133,7 @@ class _Search:
 
     def _round(self, which: NDArray[np.intp]) -> None:
         product = self._few_points(which)  # (K', S, 3, I)
-        scale = _scale(self._errors(which, product), self.real[which][:, None])
+        scale, _ = self._near(which, product)
         order = np.argsort(scale, axis=1, kind="stable")[:, :_FINALISTS]
         product = np.take_along_axis(product, order[..., None, None], axis=1)
         product, scale, near = self._learn_on(which, product)
@@ -159,23 +159,17 @@ class _Search:
     def _learn_on(self, which: NDArray[np.intp], product: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Train repeatedly on all points near each network."""
         K, S = product.shape[:2]
-        view = np.repeat(which, S)
-        patterns = self.patterns.take(view)
+        patterns = self.patterns.take(np.repeat(which, S))
         options = LMOptions(stiffness=(0.0,), tolerance=1e-3, damping=1e-6, max_iterations=15)
         near = np.zeros((K, S, patterns.weights.shape[1]), dtype=bool)
-        real = self.real[which][:, None]
         for _ in range(_PASSES):
-            error = self._errors(which, product)
-            scale = _scale(error, real)
-            before, near = near, real & (error < _FAR * scale[..., None])
+            before, (_, near) = near, self._near(which, product)
             if (near == before).all():
                 break
             weights = np.where(near.reshape(K * S, -1), patterns.weights, 0.0)
             flat = product.reshape(K * S, 3, -1)
             product = _trained(replace(patterns, weights=weights), flat, options).reshape(product.shape)
-        error = self._errors(which, product)
-        scale = _scale(error, real)
-        return product, scale, real & (error < _FAR * scale[..., None])
+        return product, *self._near(which, product)
 
     def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
         """Compare one start of each view with the best so far, and keep the one with the lower median."""
@@ -187,10 +181,16 @@ class _Search:
         won = which[better]
         self.product[won], self.scale[won], self.near[won] = product[better], scale[better], near[better]
 
-    def _errors(self, which: NDArray[np.intp], product: Array) -> Array:
-        """Distance between each point and the output of its networks; (K', S, n)."""
+    def _near(self, which: NDArray[np.intp], product: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Robust standard deviation (K', S) of the points from their networks; the points near (K', S, n)."""
         o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
-        return self._distance(o, self.patterns.targets[which][:, None])
+        distance = self._distance(o, self.patterns.targets[which][:, None])
+        real = np.broadcast_to(self.real[which][:, None], distance.shape)
+        ordered = np.sort(np.where(real, distance, np.inf), axis=-1)
+        middle = (real.sum(axis=-1, keepdims=True) - 1) // 2
+        # The median length of two normal errors is 1.18 sigma.
+        scale = np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9
+        return scale, real & (distance < _FAR * scale[..., None])
 
     def _distance(self, o: Array, targets: Array) -> Array:
         """Between outputs and targets: in the image, or the sine of the angle between rays."""
@@ -230,13 +230,3 @@ def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
     W = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
     free = np.ones((3, 3), dtype=bool), np.ones((3, inputs), dtype=bool)
     return train_lm(Task(patterns, W, product, *free), options).product
-
-
-def _scale(error: Array, real: NDArray[np.bool_]) -> Array:
-    """Robust standard deviation over the last axis of the real entries.
-
-    It is from the median length, which is 1.18 sigma for two coordinates.
-    """
-    ordered = np.sort(np.where(real, error, np.inf), axis=-1)
-    middle = (np.broadcast_to(real, error.shape).sum(axis=-1, keepdims=True) - 1) // 2
-    return np.asarray(np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9)
