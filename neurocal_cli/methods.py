@@ -19,8 +19,7 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choic
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options, Progress, options_for
 from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.pipeline.given_camera import with_given_covariance
-from neurocal_cli.pipeline.result import calibration_of
+from neurocal_cli.pipeline.result import calibration_of, with_given_covariance
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess

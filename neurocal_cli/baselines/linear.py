@@ -39,6 +39,7 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
 from neurocal_cli.initialisation.view_networks import Group, begin_flat
+from neurocal_cli.verdict.proportions import omega_of, product_of
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
 _SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
@@ -115,10 +116,6 @@ def _refuse_mirrored(problem: Problem, groups: list[Group]) -> None:
             )
 
 
-# Rows and columns of omega's entries 11, 12, 22, 13, 23, 33.
-_ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
-
-
 def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     """A's normalised entries (5,) from the products of all views."""
     centre = np.where(problem.free[3:], 0.0, problem.normalised_entries[3:])
@@ -130,8 +127,8 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
         # Normalise, so that the weight of a view does not depend on the scale of its product.
         columns = columns / np.sqrt((columns**2).sum(axis=(1, 2), keepdims=True))
         pairs = [(0, 1)] if group.flat else [(0, 1), (0, 2), (1, 2)]
-        equations += [_product_of(columns[:, a], columns[:, b]) for a, b in pairs]
-        square = [_product_of(columns[:, a], columns[:, a]) for a in range(columns.shape[1])]
+        equations += [product_of(columns[:, a], columns[:, b]) for a, b in pairs]
+        square = [product_of(columns[:, a], columns[:, a]) for a in range(columns.shape[1])]
         equations += [square[0] - one for one in square[1:]]
     unknown = np.array([True, problem.free[1], True, problem.free[3], problem.free[4], True])
     rows = np.concatenate(equations)[:, unknown]
@@ -143,18 +140,10 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     return np.asarray(np.where(problem.free, entries, problem.normalised_entries))
 
 
-def _product_of(a: Array, b: Array) -> Array:
-    """Coefficients (K, 6) of a.omega.b."""
-    other = np.where(_ROW == _COLUMN, 0.0, 1.0)
-    return np.asarray(a[:, _ROW] * b[:, _COLUMN] + other * a[:, _COLUMN] * b[:, _ROW])
-
-
 def _upper_factor(omega: Array) -> Array:
     """A of ``omega = A^-T A^-1``, with A[2, 2] = 1."""
-    matrix = np.zeros((3, 3))
-    matrix[_ROW, _COLUMN] = matrix[_COLUMN, _ROW] = omega * np.sign(omega[0])
     try:
-        L = np.linalg.cholesky(matrix)  # omega = L L^T, so A^-1 is L^T
+        L = np.linalg.cholesky(omega_of(omega))  # omega = L L^T, so A^-1 is L^T
     except np.linalg.LinAlgError as error:
         raise DegenerateGeometryError(
             "no camera solves the linear equations of these points; tilt the boards more, give more views, "

@@ -128,7 +128,7 @@ def fit_candidates(
     Cross-validation holds out views or points. If only one model is wanted, the others serve as starts and
     need not be monotonic.
     """
-    return _Chain(problem, by_views, radius(problem.views, state), wanted=wanted).all_from(state)
+    return _Chain(problem, by_views, radius(problem.views, state), wanted).all_from(state)
 
 
 def judged_again(
@@ -138,8 +138,8 @@ def judged_again(
     again = {}
     for model, candidate in fitted.items():
         reach = radius(candidate.problem.views, candidate.adjusted.state)
-        chain = _Chain(candidate.problem, by_views, reach, repeated)
-        if (found := chain.assessed(candidate.problem, candidate.adjusted)) is not None:
+        found = _assessed(candidate.problem, candidate.adjusted, by_views, reach, repeated)
+        if found is not None:
             again[model] = found
     return again
 
@@ -151,13 +151,14 @@ class _Chain:
     problem: Problem
     by_views: bool
     reach: float  # normalised radius of the farthest point
-    repeated: RepeatedPoses | None = None
-    wanted: str | None = None
+    wanted: str | None
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         """Fit all models that the points support, each from the best of the simpler ones."""
         fitted: dict[str, Candidate] = {}
-        least = self._cost(state)
+        least = np.inf  # any fit replaces a pinhole
+        if state.model != "none":
+            least = float((point_residuals(self.problem.views, state) ** 2).sum())
         for model in ("none", *_CHAIN):
             problem = supported(self.problem, model)
             if problem is None or (model == "rational" and self._promises_little(problem, fitted)):
@@ -196,12 +197,6 @@ class _Chain:
         return (
             gain < _PROMISING * _LEAST_PENALTY * _NEW["rational"] * simpler.cost / rational.views.n_equations
         )
-
-    def _cost(self, state: CameraState) -> float:
-        """Squared error of a state with distortion; infinite for a pinhole, so that any fit replaces it."""
-        if state.model == "none":
-            return np.inf
-        return float((point_residuals(self.problem.views, state) ** 2).sum())
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """Fit a model again from the next richer one if it is missing or far worse than that."""
@@ -246,7 +241,7 @@ class _Chain:
     def _made_monotonic(self, candidate: Candidate) -> Candidate:
         found = fit_monotonic(candidate.problem, candidate.adjusted)
         if found is not None:
-            return self.assessed(*found) or candidate
+            return _assessed(*found, self.by_views, self.reach) or candidate
         # The image circle of a wide lens may end within the image.
         return replace(candidate, not_monotonic=None) if candidate.problem.distortion.wide else candidate
 
@@ -261,28 +256,31 @@ class _Chain:
         adjusted = problem.adjust(start, steps)
         if not adjusted.converged and model != "none":
             return None
-        return self.assessed(problem, adjusted)
+        return _assessed(problem, adjusted, self.by_views, self.reach)
 
-    def assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
-        """A fit with the measures for the selection; None if a part of the data is indispensable."""
-        views, state, free = problem.views, adjusted.state, problem.free_camera
-        held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
-        if self.by_views:
-            lost = held_out_views(adjusted.normal, free, problem.free_poses, held, self.repeated)
-        else:
-            lost = held_out_points(views, state, free, problem.free_poses, held)
-        if not np.isfinite(lost).all():
-            if state.model != "none":
-                return None
-            lost = np.full_like(lost, np.inf)
-        given = adjusted.normal, free, problem.free_poses, views.n_equations
-        cov = covariance(*given)
-        if self.repeated is not None:
-            cov = counting_views(cov, *given, self.repeated)
-        noise = _noise(problem.distortion.model, state, self.reach, cov.entries)
-        bad = folds_back(problem, state)
-        determined = _determined(problem, state, cov)
-        return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
+
+def _assessed(
+    problem: Problem, adjusted: Adjusted, by_views: bool, reach: float, repeated: RepeatedPoses | None = None
+) -> Candidate | None:
+    """A fit with the measures for the selection; None if a part of the data is indispensable."""
+    views, state, free = problem.views, adjusted.state, problem.free_camera
+    held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
+    if by_views:
+        lost = held_out_views(adjusted.normal, free, problem.free_poses, held, repeated)
+    else:
+        lost = held_out_points(views, state, free, problem.free_poses, held)
+    if not np.isfinite(lost).all():
+        if state.model != "none":
+            return None
+        lost = np.full_like(lost, np.inf)
+    given = adjusted.normal, free, problem.free_poses, views.n_equations
+    cov = covariance(*given)
+    if repeated is not None:
+        cov = counting_views(cov, *given, repeated)
+    noise = _noise(problem.distortion.model, state, reach, cov.entries)
+    bad = folds_back(problem, state)
+    determined = _determined(problem, state, cov)
+    return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
 
 
 def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:

@@ -23,6 +23,7 @@ _FEWEST_OF_EDGES = 3  # the same for points that are measured across edges, on l
 _TOLERANCE = 1e-5
 _LINES_A_POINT = 4  # rows, columns and diagonals of a board
 _OF_EDGES = 8  # the same where only lines along edges are used
+_NEARLY_0 = 1e-3  # component of a direction
 _ALONG = 0.25  # largest sine of the angle between an edge and the line along it
 _ALL_PAIRS = 700  # largest target of which all pairs are compared
 _MOST_PAIRS = 500_000  # pairs of some points with all others, for larger targets
@@ -140,7 +141,9 @@ def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Inde
     """Lines that several pairs of points have in common: line and point of each member, directions."""
     along = target[b] - target[a]
     along /= np.linalg.norm(along, axis=1)[:, None]
-    along *= _sign(along)[:, None]
+    # Opposite directions are the same: the first component that is not nearly 0 becomes positive.
+    leading = np.take_along_axis(along, (np.abs(along) > _NEARLY_0).argmax(axis=1)[:, None], axis=1)
+    along *= np.where(leading < 0, -1.0, 1.0)
     offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
     by_direction = _clusters(along @ _OF_DIRECTION, _TOLERANCE)
     place = offset @ _OF_PLACE
@@ -152,14 +155,6 @@ def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Inde
     key = np.unique(np.concatenate([labels, labels]) * len(target) + np.concatenate([a, b]))
     line, member = np.divmod(key, len(target))
     return _checked(line, member, target, labels, along, fewest)
-
-
-def _sign(along: Array) -> Array:
-    """Sign that makes the first nonzero component positive."""
-    x, y, z = along.T
-    small = 1e-3
-    leading = np.where(np.abs(x) > small, x, np.where(np.abs(y) > small, y, z))
-    return np.where(leading < 0, -1.0, 1.0)
 
 
 def _checked(

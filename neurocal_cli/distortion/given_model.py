@@ -12,8 +12,7 @@ ordinary lens they are nearly degenerate with k1, k2 and k3. So they stay 0 unle
 criterion decidedly favours them.
 
 Given distortion. The networks model a pinhole. A given distortion is removed from the pixels before training
-(`Problem`), and the final bundle adjustment uses the observed pixels. An estimated distortion is part of the
-bundle adjustment (`Problem.adjust`).
+(`Problem`), and the final bundle adjustment uses the observed pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back
@@ -45,14 +43,15 @@ _LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # many, because the coefficients are nearly degenerate
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
-_DECISIVE = 10.0  # difference of the criterion: odds of 150
+DECISIVE = 10.0  # difference of the criterion: odds of 150
+
+Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem
 
 
-def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Solution:
+def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     """The better of a solution and the results of other starts, if it may be a local minimum.
 
-    A solution without an estimated distortion is returned unchanged. `more_starts` yields other starting
-    states for a problem.
+    A solution without an estimated distortion is returned unchanged.
     """
     problem = solution.problem
     # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
@@ -60,7 +59,7 @@ def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterab
         return solution
     few = of_few_views(solution, FEW_VIEWS)
     certain = few is solution or is_elsewhere(few, solution)
-    if certain or _cost(_lowest(few, more_starts)) < _LOWER * _cost(few.adjusted):
+    if certain or total_cost(_lowest(few, more_starts)) < _LOWER * total_cost(few.adjusted):
         return replace(solution, adjusted=_lowest(solution, more_starts))
     return solution
 
@@ -71,35 +70,30 @@ def _may_be_local(solution: Solution) -> bool:
     return not correlation(solution.problem.views, solution.residuals) < _CORRELATED
 
 
-def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Adjusted:
+def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
     """The lowest minimum of the wanted model from all starts."""
     # Imported here, because most calibrations need no other starts.
     from neurocal_cli.distortion.candidate_models import fit_candidates
+    from neurocal_cli.distortion.similar_lens import similar_states
 
     problem, best = solution.problem, solution.adjusted
     wanted = problem.distortion.model
     fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
     for start in (best.state, *more_starts(problem)):
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
-        if found is None or (fitted == wanted and not found.cost < _cost(best)):
+        if found is None or (fitted == wanted and not found.cost < total_cost(best)):
             continue
-        same = [problem.adjust(near) for near in _as(wanted, found.adjusted, problem.views)]
-        best = min([best, *same], key=_cost)
+        near, state = [found.adjusted], found.adjusted.state
+        if fitted != wanted:
+            similar = similar_states(state, wanted, farthest_angle(problem.views, state))
+            near = [replace(found.adjusted, state=one) for one in similar]
+        best = min([best, *map(problem.adjust, near)], key=total_cost)
     return best
 
 
-def _cost(adjusted: Adjusted) -> float:
+def total_cost(adjusted: Adjusted) -> float:
+    """Squared error of all views."""
     return float(adjusted.cost.sum())
-
-
-def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:
-    """The fit itself if it has the wanted model, else the most similar lenses of that model."""
-    if found.state.model == wanted:
-        return [found]
-    from neurocal_cli.distortion.similar_lens import similar_states
-
-    starts = similar_states(found.state, wanted, farthest_angle(views, found.state))
-    return [replace(found, state=start) for start in starts]
 
 
 def with_denominator_if_supported(solution: Solution) -> Solution:
@@ -111,8 +105,8 @@ def with_denominator_if_supported(solution: Solution) -> Solution:
     found = richer.adjust(solution.adjusted, _STEPS)
     alike = correlation(views, point_residuals(views, found.state))
     n = effective_number(views.n_equations, alike)
-    before, after = (max(float(a.cost.sum()), 1e-300) for a in (solution.adjusted, found))
-    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + _DECISIVE
+    before, after = (max(total_cost(a), 1e-300) for a in (solution.adjusted, found))
+    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + DECISIVE
     better = told and folds_back(problem, found.state) is None
     if not better and folds_back(problem, solution.state) is None:
         return solution

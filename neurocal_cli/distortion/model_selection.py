@@ -18,16 +18,13 @@ alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, held_out_views
-from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
@@ -43,10 +40,8 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.given_model import FEW_VIEWS
+from neurocal_cli.distortion.given_model import DECISIVE, FEW_VIEWS, Starts
 from neurocal_cli.geometry import Array
-
-Starts = Callable[[Problem], Iterable[CameraState]]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
@@ -58,7 +53,6 @@ _DECIDEDLY = 1.03
 _FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
-_DECISIVE = 10.0  # difference of the criterion: odds of 150
 _CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
 _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
 
@@ -66,10 +60,9 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which anothe
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
     """Fit all models, starting from a solution with any of them, and select one.
 
-    `more_starts` yields other starting states for a problem, in case the first leads to a local minimum. The
-    `preferred` model is selected unless another predicts decidedly better. The result has the
-    cross-validation errors of all fitted models. It is a refusal if the distortion is strong and the model
-    that fits is not monotonic inside the image.
+    `more_starts` are tried in case the first one leads to a local minimum. The `preferred` model is selected
+    unless another predicts decidedly better. The result has the cross-validation errors of all fitted models.
+    It is a refusal if the distortion is strong and the model that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
@@ -170,7 +163,7 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
     """Whether neither a sound distortion model nor a camera for each view explains decidedly more."""
     n, pinhole = worth(views, fitted.values()), fitted["none"]
     lowest = min((c.criterion(n) for c in fitted.values() if c.sound), default=np.inf)
-    return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
+    return pinhole.criterion(n) < lowest + DECISIVE and not falls_short(views, [pinhole])
 
 
 def _best(
@@ -225,7 +218,7 @@ def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate
     return {
         name: c
         for name, c in fitted.items()
-        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
+        if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
     }
 
 

@@ -25,7 +25,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted, Penalty
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
-from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part
 from neurocal_cli.camera.monotonic import (
     largest_angle,
     monotonic_radius,
@@ -52,7 +52,6 @@ _GUESS = 0.5  # slope with which a corner's radius is corrected
 _ROUNDS, _STEPS, _MORE_STEPS = 12, 60, 600
 _CHANCE = 10.8  # chi-squared of one condition, exceeded in one case of a thousand
 _TIE = 0.009  # negligible relative increase of the rms error
-
 
 # Steps that run into a pole get an infinite cost and are rejected.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -161,7 +160,8 @@ def _with_slope(
     least, beyond, guess = least_slope
     weight = float(np.sqrt(found.cost.sum() / problem.views.n_equations)) / _SLACK
     corner = beyond * _farthest(problem, found.state)
-    adjusted, last = found, min(_turn(found.state), corner)
+    lens = found.state.distortion
+    adjusted, last = found, min(largest_angle(lens) if lens.wide else monotonic_radius(lens), corner)
     last += max(corner - _distorted(found.state, last), 0.0) / guess
     for _ in range(_ROUNDS):
         if found.state.model == "fisheye":
@@ -181,18 +181,11 @@ def _with_slope(
     return None
 
 
-def _turn(state: CameraState) -> float:
-    """Undistorted radius, or a wide lens's angle, up to which the distortion is monotonic."""
-    distortion = state.distortion
-    return largest_angle(distortion) if distortion.wide else monotonic_radius(distortion)
-
-
 def _distorted(state: CameraState, last: float) -> float:
     """Distorted radius of an undistorted one, or of a fisheye's angle."""
     if state.model == "fisheye":
         return float(last * (1 + state.k @ last ** np.array([2.0, 4.0, 6.0, 8.0])))
-    k = state.k.copy()
-    k[2:4] = k[8:] = 0.0
+    k = radial_part(state.model, state.k)
     return float(distort(state.model, k, np.array([last]), np.zeros(1))[0][0])
 
 

@@ -17,13 +17,11 @@ Covariance, to first order and in whitened pixels of noise. The lines' equations
 have the variance M = sum_i G_i^T G_i, with G_i = sum nu dr/dk over the lines through a point i. The points'
 equations, reduced to A, are Q_AA dA + Q_Ak dk = g, and g has the variance S = J^T J, reduced. A and the
 poses move points along images of straight lines while the distortion is fixed, so s and g are independent.
-With
-B = [[Q_AA, Q_Ak], [H_kA, H_kk]],
+With B = [[Q_AA, Q_Ak], [H_kA, H_kk]],
 
     cov(A, k) = B^-1 [[S, 0], [0, M]] B^-T.
 
-The poses' follows as in `bundle_adjustment.covariance`. Each set
-estimates the noise from its own residuals.
+The poses' follows as in `bundle_adjustment.covariance`. Each set estimates the noise from its own residuals.
 """
 
 from __future__ import annotations
@@ -74,9 +72,8 @@ def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspo
     observed = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
     weighed = whitening = views.whitening
     if weighed is not None:
-        rows = np.arange(len(points)) if views.order is None else views.order
         whitening = np.empty_like(weighed)
-        whitening[rows] = rounded(weighed, views.across)
+        whitening[order] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
     start = replace(start, model=MODEL, k=_in_camera_terms(start.entries[0], observed.pixels, views.pixels))

@@ -99,14 +99,13 @@ class Remapping:
         for start in range(0, height, rows):
             part = slice(start, min(start + rows, height))
             u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(part.start, part.stop, dtype=float))
-            places = [
-                np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE)
+            u, v = (
+                np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE).astype(np.float32)
                 for s in sources(self.camera, self.new, u, v, self.R)
-            ]
-            block = (part, places[0].astype(np.float32), places[1].astype(np.float32))
+            )
             if keep:
-                blocks.append(block)
-            yield block
+                blocks.append((part, u, v))
+            yield part, u, v
         self._kept = blocks
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +39,11 @@ def similar_states(
     """States of another model with nearly the same image, the most similar first; same poses and centre.
 
     The state is of one camera, and angles up to the `farthest` [rad] are compared. If values of xi are given,
-    there is one state for each of them, in their order, without those that have no similar lens.
+    there is one state for each of them, in rising order, without those that have no similar lens.
     """
-    if (same := _with_more_coefficients(state, model)) is not None:
-        return [same]
+    own = coefficient_names(state.model)
+    if model not in WIDE and state.model != model and coefficient_names(model)[: len(own)] == own:
+        return [state.with_model(model)]
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
     good: NDArray[np.bool_] = np.isfinite(radius)
@@ -58,19 +60,12 @@ def similar_states(
     error = ((columns @ solution - radius[:, None]) ** 2).sum(axis=(1, 2))
     scale = solution[:, 0, 0]
     error = np.where(usable & (scale > 0), error, np.inf)
-    found = []
-    for g in _lowest(model, error, grid) if xi is None else _of_each(error, grid, xi):
-        linear = solution[g, 1:, 0] / scale[g]
-        found.append(_with(state, model, float(scale[g]), grid[g], linear))
-    return found
-
-
-def _with_more_coefficients(state: CameraState, model: str) -> CameraState | None:
-    """The same lens in a model whose first coefficients are the same; None if there is none."""
-    own, names = coefficient_names(state.model), coefficient_names(model)
-    if model in WIDE or state.model == model or names[: len(own)] != own:
-        return None
-    return replace(state, model=model, k=np.concatenate([state.k, np.zeros(len(names) - len(own))]))
+    if xi is not None:
+        best = _lowest(error, grid[:, 0])
+    else:
+        part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid))
+        best = sorted(_lowest(error, part), key=lambda g: float(error[g]))
+    return [_with(state, model, float(scale[g]), grid[g], solution[g, 1:, 0] / scale[g]) for g in best]
 
 
 def tilted_states(state: CameraState) -> list[CameraState]:
@@ -142,16 +137,9 @@ def _linear_names(model: str) -> list[str]:
     )
 
 
-def _lowest(model: str, error: Array, grid: Array) -> list[int]:
-    """Indices of the lowest errors (for models with xi, one in each part of its range), the best first."""
-    part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid), dtype=np.intp)
+def _lowest(error: Array, part: NDArray[Any]) -> list[int]:
+    """Index of the lowest error in each part of the grid, if it is finite; by the numbers of the parts."""
     best = [int(np.argmin(np.where(part == n, error, np.inf))) for n in np.unique(part)]
-    return sorted((g for g in best if np.isfinite(error[g])), key=lambda g: float(error[g]))
-
-
-def _of_each(error: Array, grid: Array, xi: Array) -> list[int]:
-    """Indices of the lowest error for each xi."""
-    best = [int(np.argmin(np.where(grid[:, 0] == value, error, np.inf))) for value in xi]
     return [g for g in best if np.isfinite(error[g])]
 
 

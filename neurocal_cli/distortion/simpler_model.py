@@ -12,11 +12,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.residual_correlation import (
-    correlation,
-    effective_number,
-    point_residuals,
-)
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.distortion.monotonic_fit import folds_back

@@ -127,13 +127,12 @@ class Field(NamedTuple):
 
 def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
     """The field of view of images of some size; an InputError if that row or column has no rays."""
-    u0, v0 = _axis(camera, size)
-    share, ends = np.linspace(0, 1, _ALONG), []
-    for row in (True, False):
-        along = share * size[0 if row else 1] - 0.5
-        line = np.column_stack([along, 0 * along + v0] if row else [0 * along + u0, along])
-        X, Y, Z = camera.unproject(line).T
-        angle = np.arctan2(X if row else Y, Z)
+    ends = []
+    for axis in (0, 1):  # the row, then the column
+        line = np.tile(_axis(camera, size), (_ALONG, 1))
+        line[:, axis] = np.linspace(0, 1, _ALONG) * size[axis] - 0.5
+        rays = camera.unproject(line)
+        angle = np.arctan2(rays[:, axis], rays[:, 2])
         angle = angle[np.isfinite(angle)]
         if not len(angle):
             raise InputError("the camera sees nothing in the middle of its image; correct the camera")

@@ -23,6 +23,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
+from neurocal_cli.distortion.given_model import total_cost
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, unit_diagonal
@@ -79,7 +80,7 @@ class _Profile:
         self.problem, self.best = problem, adjusted
         self.held = replace(problem, fixed=problem.fixed | {"xi"})
         freedom = problem.views.n_equations - problem.n_parameters
-        self.variance = max(float(adjusted.cost.sum()), 1e-300) / max(freedom, 1)
+        self.variance = max(total_cost(adjusted), 1e-300) / max(freedom, 1)
         tried = (self.held.adjust(start, _STEPS) for start in self._starts(adjusted.state))
         self.tried = [a for a in tried if a.converged and _is_lens(a)]
         self._descend()
@@ -98,7 +99,7 @@ class _Profile:
         return [
             replace(start, entries=a.state.entries, k=a.state.k)
             for start, a in zip(starts, found, strict=True)
-            if share * (float(a.cost.sum()) - least) < _NEAR
+            if share * (total_cost(a) - least) < _NEAR
         ]
 
     def _excess(self, adjusted: Adjusted) -> float:
@@ -107,7 +108,7 @@ class _Profile:
     def _descend(self) -> None:
         """Descend from the lowest points of the grid to the minima."""
         tried = list(self.tried)
-        costs = [np.inf, *map(_cost, tried), np.inf]
+        costs = [np.inf, *map(total_cost, tried), np.inf]
         minima = []
         for n, start in enumerate(tried):
             if costs[n + 1] > min(costs[n], costs[n + 2]) or self._excess(start) > _NEAR:
@@ -117,11 +118,11 @@ class _Profile:
                 minima.append(found)
         if _is_lens(self.best):
             minima.append(self.best)
-        lowest = min((_cost(a) for a in minima), default=np.inf)
+        lowest = min((total_cost(a) for a in minima), default=np.inf)
         # If the lowest valley leads out of the model's range, keep the last cameras within it.
-        self.at_the_end = [a for a in tried if _cost(a) < (1 - _SAME) * lowest]
+        self.at_the_end = [a for a in tried if total_cost(a) < (1 - _SAME) * lowest]
         minima = [*minima, *self.at_the_end] or [self.best]
-        self.best = min(minima, key=_cost)
+        self.best = min(minima, key=total_cost)
         self._add(minima)
 
     def _add(self, more: list[Adjusted]) -> None:
@@ -190,10 +191,6 @@ def _is_lens(adjusted: Adjusted) -> bool:
     state = adjusted.state
     low, high = _GRID[state.model][[0, -1]]
     return bool(low <= state.k[0] <= high and (state.model != "double_sphere" or 0 <= state.k[1] <= 1))
-
-
-def _cost(adjusted: Adjusted) -> float:
-    return float(adjusted.cost.sum())
 
 
 def _xi(adjusted: Adjusted) -> float:

@@ -42,7 +42,7 @@ _AGREED = 0.97  # share of points on which two starts have to agree
 # of the view's size.
 _MAJORITY, _TIGHT = 0.5, 0.05
 _LOOSE, _LOOSER = 0.01, 10.0  # or if it exceeds this share, and so many times the median of the views
-_NETWORKS_AT_ONCE = 20_000
+_AT_ONCE = 20_000 // _STARTS  # views: 20,000 networks fit into memory
 # Trial angles of the farthest point from the axis [rad], and the factor by which a lens must reduce the
 # scatter. A board covers a small part of the image, where a lens that is 20 % off displaces points by 1 %.
 _HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
@@ -60,20 +60,16 @@ class Consensus:
     looseness: float
 
 
-def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
-    """Find the points of each view that agree with one network.
-
-    `flat` (V,) says which views' networks take their target as a plane.
-    """
+def find_consensus(views: Views, rng: np.random.Generator) -> Consensus:
+    """Find the points of each view that agree with one network; nearly flat targets are taken as planes."""
     kept = np.ones(len(views.index), dtype=bool)
     hopeless = np.zeros(views.n_views, dtype=bool)
     loose = np.full(views.n_views, np.nan)
-    for kind in (True, False):
-        members = np.flatnonzero((flat == kind) & (views.distinct >= _FEWEST[kind]))
-        at_once = max(1, _NETWORKS_AT_ONCE // _STARTS)
-        for first in range(0, len(members), at_once):
-            some = members[first : first + at_once]
-            search = _Search(views, some, kind, rng)
+    for flat in (True, False):
+        members = np.flatnonzero((views.nearly_flat == flat) & (views.distinct >= _FEWEST[flat]))
+        for first in range(0, len(members), _AT_ONCE):
+            some = members[first : first + _AT_ONCE]
+            search = _Search(views, some, flat, rng)
             search.run()
             hopeless[some] = search.judge(kept)
             # If all pixels of a view coincide, its scatter is undefined.
@@ -89,7 +85,7 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
 
 
 def find_consensus_through_wide_lens(
-    pinhole: Consensus, views: Views, flat: NDArray[np.bool_], middle: Array, rng: np.random.Generator
+    pinhole: Consensus, views: Views, middle: Array, rng: np.random.Generator
 ) -> Consensus:
     """The same through a wide lens, which displaces points by more than outliers do.
 
@@ -105,7 +101,7 @@ def find_consensus_through_wide_lens(
         theta = radius * (half_angle / radius.max())
         rays = np.column_stack([away * np.sinc(theta / np.pi)[:, None], np.cos(theta)])
         rays[:, :2] *= half_angle / radius.max()
-        consensus = find_consensus(replace(views, rays=rays), flat, rng)
+        consensus = find_consensus(replace(views, rays=rays), rng)
         if consensus.looseness < most:
             best, most = consensus, consensus.looseness
     return pinhole if best is None or best.hopeless.sum() > pinhole.hopeless.sum() else best
@@ -137,7 +133,7 @@ class _Search:
 
     def _round(self, which: NDArray[np.intp]) -> None:
         product = self._few_points(which)  # (K', S, 3, I)
-        scale = self._scale(self._errors(which, product), self.real[which][:, None])
+        scale, _ = self._near(which, product)
         order = np.argsort(scale, axis=1, kind="stable")[:, :_FINALISTS]
         product = np.take_along_axis(product, order[..., None, None], axis=1)
         product, scale, near = self._learn_on(which, product)
@@ -163,23 +159,17 @@ class _Search:
     def _learn_on(self, which: NDArray[np.intp], product: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Train repeatedly on all points near each network."""
         K, S = product.shape[:2]
-        view = np.repeat(which, S)
-        patterns = self.patterns.take(view)
+        patterns = self.patterns.take(np.repeat(which, S))
         options = LMOptions(stiffness=(0.0,), tolerance=1e-3, damping=1e-6, max_iterations=15)
         near = np.zeros((K, S, patterns.weights.shape[1]), dtype=bool)
-        real = self.real[which][:, None]
         for _ in range(_PASSES):
-            error = self._errors(which, product)
-            scale = self._scale(error, real)
-            before, near = near, real & (error < _FAR * scale[..., None])
+            before, (_, near) = near, self._near(which, product)
             if (near == before).all():
                 break
             weights = np.where(near.reshape(K * S, -1), patterns.weights, 0.0)
             flat = product.reshape(K * S, 3, -1)
             product = _trained(replace(patterns, weights=weights), flat, options).reshape(product.shape)
-        error = self._errors(which, product)
-        scale = self._scale(error, real)
-        return product, scale, real & (error < _FAR * scale[..., None])
+        return product, *self._near(which, product)
 
     def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
         """Compare one start of each view with the best so far, and keep the one with the lower median."""
@@ -191,10 +181,16 @@ class _Search:
         won = which[better]
         self.product[won], self.scale[won], self.near[won] = product[better], scale[better], near[better]
 
-    def _errors(self, which: NDArray[np.intp], product: Array) -> Array:
-        """Distance between each point and the output of its networks; (K', S, n)."""
+    def _near(self, which: NDArray[np.intp], product: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Robust standard deviation (K', S) of the points from their networks; the points near (K', S, n)."""
         o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
-        return self._distance(o, self.patterns.targets[which][:, None])
+        distance = self._distance(o, self.patterns.targets[which][:, None])
+        real = np.broadcast_to(self.real[which][:, None], distance.shape)
+        ordered = np.sort(np.where(real, distance, np.inf), axis=-1)
+        middle = (real.sum(axis=-1, keepdims=True) - 1) // 2
+        # The median length of two normal errors is 1.18 sigma.
+        scale = np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9
+        return scale, real & (distance < _FAR * scale[..., None])
 
     def _distance(self, o: Array, targets: Array) -> Array:
         """Between outputs and targets: in the image, or the sine of the angle between rays."""
@@ -209,10 +205,6 @@ class _Search:
                 same_side = along[..., 0] * along.sum(axis=-2) > 0
                 error = np.where(same_side, error, np.nan)
         return np.where(np.isfinite(error), error, 1e9)
-
-    def _scale(self, error: Array, real: NDArray[np.bool_]) -> Array:
-        """Robust standard deviation from the median length, which is 1.18 sigma for two coordinates."""
-        return _median(error, np.broadcast_to(real, error.shape)) / 1.1774 + 1e-9
 
     def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Write the points near their network into `kept`; return the views that are wrong as a whole."""
@@ -238,10 +230,3 @@ def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
     W = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
     free = np.ones((3, 3), dtype=bool), np.ones((3, inputs), dtype=bool)
     return train_lm(Task(patterns, W, product, *free), options).product
-
-
-def _median(values: Array, real: NDArray[np.bool_]) -> Array:
-    """Median over the last axis of the real entries."""
-    ordered = np.sort(np.where(real, values, np.inf), axis=-1)
-    middle = (real.sum(axis=-1) - 1) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0])

@@ -29,7 +29,10 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     mirrored camera.
     """
     views = problem.views
-    R, t = _normalised_poses(problem)
+    assert problem.poses is not None  # type 4
+    poses = [problem.poses[name] for name in views.names]
+    R = np.stack([pose.R for pose in poses])
+    t = translations_normalised(views, R, np.stack([pose.t for pose in poses]))
     wide = problem.distortion.wide
     if not wide:
         _check_in_front(views, R, t)
@@ -83,12 +86,3 @@ def _check_in_front(views: Views, R: Array, t: Array) -> None:
             "it must map world to camera, Xc = R M + t, z forward, with t in the unit of X,Y,Z; a lens that "
             "sees 90 degrees from its axis and more needs --distortion fisheye"
         )
-
-
-def _normalised_poses(problem: Problem) -> tuple[Array, Array]:
-    """The given R (V, 3, 3), and t (V, 3) of each view's centroid in units of its S2."""
-    views, poses = problem.views, problem.poses
-    assert poses is not None  # type 4
-    R = np.stack([poses[name].R for name in views.names])
-    t = np.stack([poses[name].t for name in views.names])
-    return R, translations_normalised(views, R, t)

@@ -120,10 +120,8 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
         if found is None:
             return adjusted
         turned, others = found
-        if turned is not None:
-            adjusted = turned
-            continue
-        turned = _flip_with_camera(problem, adjusted, others)
+        if turned is None:
+            turned = _flip_with_camera(problem, adjusted, others)
         if turned is None:
             return adjusted
         adjusted = turned
@@ -144,11 +142,12 @@ def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, 
     # Points behind the camera's plane lie far from their pixels, or are nan.
     cost = squared_errors(views.batches, replace(state, R=R, t=t))
     near = cost < _FLIP_RANGE**2 * adjusted.cost + 1e-20
-    candidates = np.flatnonzero(near & views.nearly_flat)
+    candidates, no_camera = np.flatnonzero(near & views.nearly_flat), np.zeros(5 + len(state.k), dtype=bool)
     for steps in (_FLIP_STEPS, 200):
         if not candidates.size:
             return None
-        posed = _pose_alone(problem, replace(state, R=R[candidates], t=t[candidates]), candidates, steps)
+        mirrored = replace(state, R=R[candidates], t=t[candidates])
+        posed = adjust(views.subset(candidates).batches, mirrored, no_camera, max_iterations=steps)
         R[candidates], t[candidates] = posed.state.R, posed.state.t
         close = posed.cost < _FLIP_CLOSE**2 * adjusted.cost[candidates] + 1e-20
         if steps == _FLIP_STEPS:
@@ -161,7 +160,7 @@ def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, 
 def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
     """Flip the view with the largest predicted gain if the camera is adjusted, too; None if none improves."""
     views, posed = second
-    if not problem.free_camera.any() or not problem.free_poses or problem.penalty is not None:
+    if not problem.free_camera.any() or problem.penalty is not None:
         return None
     free = problem.free if adjusted.state.model == "none" else problem.free_camera
     one, two = (reduced(normal, free, True) for normal in (adjusted.normal, posed.normal))
@@ -187,12 +186,6 @@ def _with_poses(
     R[views], t[views] = posed.state.R[rows], posed.state.t[rows]
     again = try_start(problem, adjusted, replace(state, R=R, t=t))
     return again if again.cost.sum() < adjusted.cost.sum() * (1 - 1e-9) else None
-
-
-def _pose_alone(problem: Problem, state: CameraState, views: NDArray[np.intp], steps: int) -> Adjusted:
-    """Refine some views' poses with the current camera."""
-    batches = problem.views.subset(views).batches
-    return adjust(batches, state, np.zeros(5 + len(state.k), dtype=bool), max_iterations=steps)
 
 
 def _mirrored(R: Array, t: Array, basis: Array) -> Array:

@@ -33,14 +33,14 @@ class Options:
     # Trains the best start on `MOST_POINTS` points; None if the starts used them already.
     finish: Trainer | None
     starts: int  # most random starts for each network
+    # "auto": select the model; "plumb-line": estimate it from straight lines first; else the problem's.
+    distortion: str
+    preferred: str  # with "auto", the model to select unless another predicts decidedly better
+    seed: int  # of the random weights
+    progress: Progress
     # Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None if bundle
     # adjustment alone imposes the constraints.
     constrained: Callable[[Task, float], Trained] | None = None
-    # "auto": select the model; "plumb-line": estimate it from straight lines first; else the problem's.
-    distortion: str = ""
-    preferred: str = ""  # with "auto", the model to select unless another predicts decidedly better
-    seed: int = 0  # of the random weights
-    progress: Progress = lambda stage, share: None
 
 
 def options_for(

@@ -42,11 +42,7 @@ class SharedIntrinsics:
 
 
 def shared_intrinsics(
-    solid: Array,
-    flat: Array,
-    given: Array,
-    free: NDArray[np.bool_],
-    rng: np.random.Generator,
+    solid: Array, flat: Array, given: Array, free: NDArray[np.bool_], rng: np.random.Generator
 ) -> SharedIntrinsics:
     """Estimate W from the products of all views.
 
@@ -55,8 +51,10 @@ def shared_intrinsics(
     the values of `given` (5,). W11 and W22 stay positive.
     """
     conditions = _Conditions(solid, flat, free)
-    p = np.where(free, rng.uniform(-1, 1, (_STARTS, 5)), _to_log(given))
-    p[:, [0, 2]] = np.where(free[[0, 2]], np.log(np.abs(p[:, [0, 2]]) + 1e-3), p[:, [0, 2]])
+    p = np.where(free, rng.uniform(-1, 1, (_STARTS, 5)), given)
+    # The logarithms of W11 and W22 keep them positive.
+    random, known = np.log(np.abs(p[:, [0, 2]]) + 1e-3), np.log(np.maximum(given[[0, 2]], 1e-300))
+    p[:, [0, 2]] = np.where(free[[0, 2]], random, known)
     p, loss = _minimum(conditions, p)
     order = np.argsort(loss, kind="stable")
     p, loss = p[order], loss[order]
@@ -69,13 +67,6 @@ def shared_intrinsics(
         if apart[n, distinct].all():
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
-
-
-def _to_log(entries: Array) -> Array:
-    """Replace W11 and W22 by their logarithms, which keeps them positive."""
-    p = entries.astype(float).copy()
-    p[[0, 2]] = np.log(np.maximum(p[[0, 2]], 1e-300))
-    return p
 
 
 class _Conditions:
@@ -190,10 +181,7 @@ def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
         while descent.active.size:
             descent.step()
-            if (
-                len(descent.active) <= len(p) - _ENOUGH
-                and _same_lowest(starts.loss, descent.active) >= _ENOUGH
-            ):
+            if _same_lowest(starts.loss, descent.active) >= _ENOUGH:
                 break
     return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
 

@@ -29,7 +29,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.local_minima import try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options, options_for
-from neurocal_cli.initialisation.radial_step import radial_coefficients
+from neurocal_cli.initialisation.radial_step import even_polynomial, radial_coefficients
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
@@ -126,7 +126,7 @@ class _Radial:
         variance = self.magnification(strength)
         seen = Correspondences(
             points.world,
-            self.middle + (points.pixels - self.middle) / _divisor(strength, self._share())[:, None],
+            self.middle + (points.pixels - self.middle) / even_polynomial(strength, self._share())[:, None],
             points.view,
             covariance=np.column_stack([variance, np.zeros_like(variance), variance]),
         )
@@ -135,7 +135,7 @@ class _Radial:
     def magnification(self, strength: Array) -> Array:
         """(N,) magnification of area by undistortion: radial times tangential."""
         share = self._share()
-        D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
+        D, slope = _divisor_with_slope(strength, share)
         return np.asarray((D - 2 * share * slope) / D**3)
 
     def _share(self) -> Array:
@@ -143,15 +143,15 @@ class _Radial:
         return np.asarray(((self.problem.points.pixels - self.middle) ** 2).sum(axis=1) / self.reach**2)
 
 
-def _divisor(strength: Array, share: Array) -> Array:
-    """Divisor of the division model, given squared radii in units of the squared reach."""
-    return np.asarray(1 + share * (strength[0] + strength[1] * share))
+def _divisor_with_slope(strength: Array, share: Array) -> tuple[Array, Array]:
+    """Divisor of the division model and its derivative, given squared radii as `even_polynomial`."""
+    return even_polynomial(strength, share), strength[0] + 2 * strength[1] * share
 
 
 def _one_to_one(strength: Array) -> bool:
     """Whether the undistorted radius grows with the distorted one up to the farthest point."""
     share = np.linspace(0.0, 1.0, 20)
-    D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
+    D, slope = _divisor_with_slope(strength, share)
     return bool((D > 0).all() and (2 * share * slope < D).all())
 
 
@@ -162,7 +162,7 @@ def _distorted(state: CameraState, strength: Array, reach: float) -> CameraState
     model is used.
     """
     distorted = np.linspace(0.02, 1, 60) * reach / float(np.sqrt(state.entries[0, 0] * state.entries[0, 2]))
-    straight = distorted / _divisor(strength, (distorted / distorted[-1]) ** 2)
+    straight = distorted / even_polynomial(strength, (distorted / distorted[-1]) ** 2)
     best = (np.inf, state)
     for model in ("plumb_bob", "fisheye"):
         k, error = radial_coefficients(model, straight, distorted)

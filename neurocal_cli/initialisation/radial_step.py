@@ -42,7 +42,7 @@ class RadialStep:
     def bent(self, state: CameraState, model: str) -> CameraState:
         """The pinhole camera of these networks with the distortion as coefficients of a model."""
         distorted = _RADII * self.reach / float(np.sqrt(state.entries[0, 0] * state.entries[0, 2]))
-        k, _ = radial_coefficients(model, distorted * _stretch(self.strength, _RADII**2), distorted)
+        k, _ = radial_coefficients(model, distorted * even_polynomial(self.strength, _RADII**2), distorted)
         return replace(state, model=model, k=k)
 
 
@@ -98,6 +98,6 @@ def radial_coefficients(model: str, straight: Array, distorted: Array) -> tuple[
     return k, float(np.abs(powers @ k[radial] - (distorted - argument)).max())
 
 
-def _stretch(strength: Array, share: Array) -> Array:
-    """Undistorted radii over distorted ones, given squared radii in units of the squared reach."""
+def even_polynomial(strength: Array, share: Array) -> Array:
+    """The factor 1 + strength[0] s + strength[1] s^2, given squared radii s in units of the squared reach."""
     return np.asarray(1 + share * (strength[0] + strength[1] * share))

@@ -89,11 +89,7 @@ def find_camera(
         if not np.isfinite(total[n]):
             continue
         if total[n] < cost * (1 - _TIE) - 1e-20:
-            chosen = slice(n, n + 1)
-            best = CameraState(
-                trained.state.entries[chosen], trained.state.R[chosen], trained.state.t[chosen]
-            )
-            cost, agreed = float(total[n]), 0
+            best, cost, agreed = trained.state.of_view(n), float(total[n]), 0
         agreed += int((total <= cost * (1 + _TIE) + 1e-20).sum())
     if best is None:
         return None

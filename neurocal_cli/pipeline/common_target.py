@@ -9,14 +9,15 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target, distinct_points, planes_of
-from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
+from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed
+from neurocal_cli.verdict.assessment import stored_state
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
@@ -36,14 +37,20 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         fits = [_fit(camera) for camera in cameras]
     except NeurocalError:
         return None
-    chosen = known is None and all(camera.lens_choice for camera in cameras)
-    found = (find_lens_and_target if chosen else find_target)(
-        fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
-    )
+    named = not all(camera.lens_choice for camera in cameras)
+    found = find_shape(fits, choice, known, named)
     if found is None:
         return None
-    named = known is None and not chosen and choice == "auto"
-    return None if named and named_lens_is_too_simple(fits, found) else found.target
+    doubtful = named and known is None and choice == "auto"
+    return None if doubtful and named_lens_is_too_simple(fits, found) else found.target
+
+
+def find_shape(
+    fits: Sequence[tuple[Problem, Adjusted]], choice: str, known: Target | None, named: bool
+) -> Found | None:
+    """Estimate the target as chosen, starting from a known one; only a lens that is not named may change."""
+    find = find_target if named or known is not None else find_lens_and_target
+    return find(fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf)
 
 
 def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
@@ -53,10 +60,15 @@ def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
         return False
     if choice == "auto" and any(camera.type != 1 for camera in cameras):
         return False  # a wrong given parameter would be absorbed by the target's shape
-    known = cameras[0].target
-    given, label, point = distinct_points([camera.points for camera in cameras])
+    n_views = sum(len(camera.views) for camera in cameras)
+    return views_suffice([camera.points for camera in cameras], cameras[0].target, n_views)
+
+
+def views_suffice(points: Sequence[Correspondences], known: Target | None, n_different: int) -> bool:
+    """Whether enough different views show most points of a target, which is known if it was estimated."""
+    given, label, point = distinct_points(points)
     plane = planes_of(given, point) if known is None else known.plane
-    return enough_views(label, sum(len(camera.views) for camera in cameras), int(plane.max()) + 1)
+    return enough_views(label, n_different, int(plane.max()) + 1)
 
 
 def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
@@ -94,24 +106,15 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
 
 def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
     """The problem that a calibration solves, adjusted to its minimum."""
-    camera, given = calibration.camera, calibration.intrinsics
-    centre = (given.u0, given.v0) if calibration.type == 2 else None
+    given = calibration.intrinsics
     problem = problem_for(
         calibration.points,
         calibration.type,
-        image_center=centre,
+        image_center=(given.u0, given.v0) if calibration.type == 2 else None,
         intrinsics=given if calibration.type == 3 else None,
         skew="theta" not in calibration.fixed or calibration.type == 3,
-        distortion=camera.distortion,
+        distortion=calibration.camera.distortion,
     ).with_seen_pixels()
-    views = [calibration.views[name] for name in problem.views.names]
-    state = CameraState(
-        np.array([camera.entries]),
-        np.stack([view.pose.R for view in views]),
-        np.stack([view.pose.t for view in views]),
-        camera.distortion.model,
-        camera.distortion.coefficients,
-    )
-    fixed = problem.fixed | frozenset(calibration.fixed)
-    problem = replace(problem, fixed=fixed)
+    problem = replace(problem, fixed=problem.fixed | calibration.fixed)
+    state = stored_state(calibration, problem.views.names)
     return problem, problem.adjust(normalised(state, problem.views))

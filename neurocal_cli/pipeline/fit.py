@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.given_model import (
     DENOMINATOR,
     check_distortion,
+    total_cost,
     with_denominator_if_supported,
     with_more_starts,
 )
@@ -51,7 +53,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     first = _first_solution(problem, options)
     if options.distortion == "auto":
         return _finished(first, options)
-    solution = with_more_starts(first, lambda some: _distorted_starts(some, options))
+    solution = with_more_starts(first, partial(_distorted_starts, options=options))
     # For several views that share a camera, the first solution has tried the mirrored poses already.
     if solution is not first or problem.type == 3 or problem.views.n_views == 1:
         solution = _turned(solution)
@@ -90,10 +92,7 @@ def _with_selected_model(solution: Solution, options: Options, only_from_here: b
 
     if only_from_here:
         return select_model(solution, preferred=options.preferred)
-
-    def more_starts(problem: Problem) -> Iterator[CameraState]:
-        return _distorted_starts(problem, options)
-
+    more_starts = partial(_distorted_starts, options=options)
     found = select_model(solution, more_starts, options.preferred)
     turned = _turned(found)
     if turned is found:
@@ -140,11 +139,11 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
         )
     if problem.distortion.model == "tilted" and problem.free_poses and problem.free[3:].all():
         for _ in range(_TILT_ROUNDS):
-            lowest = min(found, key=lambda a: float(a.cost.sum()))
+            lowest = min(found, key=total_cost)
             found += [
                 problem.adjust(replace(lowest, state=s), _TILT_STEPS) for s in tilted_states(lowest.state)
             ]
-    best = min(found, key=lambda a: float(a.cost.sum()))
+    best = min(found, key=total_cost)
     problem, best = with_xi_held_if_flat(problem, best)
     return _turned(replace(simpler, problem=problem, adjusted=best))
 

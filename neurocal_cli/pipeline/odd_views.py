@@ -19,12 +19,12 @@ from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import pixel_spread
 
 _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
@@ -45,31 +45,26 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
         return otherwise
     limit = _HOLDS * rmse_px
     for reason, changed in _other_points(points):
-        fitted = _fit(changed, _pose(changed, camera))
-        if fitted is not None and fitted.rmse < limit:
+        if _fit(changed, _pose(changed, camera))[0] < limit:
             return reason
     start = _pose(points, camera)
-    plain = _fit(points, start)
-    if plain is None:
+    plain, _ = _fit(points, start)
+    if plain == np.inf:
         return otherwise
-    zoomed = _fit(points, start, _FOCAL)
-    if zoomed is not None and zoomed.rmse < limit:
-        scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
+    zoomed, entries = _fit(points, start, _FOCAL)
+    if zoomed < limit:
+        scale = entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
-            return f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
-    moved = _fit(points, start, _CENTRE)
-    if moved is not None and moved.rmse < limit:
-        u0, v0 = moved.entries[[3, 4]]
-        return f"it fits another camera or crop: the image centre ({u0:.0f}, {v0:.0f})"
-    free = _fit(points, start, (*_FOCAL, *_CENTRE))
-    spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
-    if free is None or free.rmse > _BLURRED * spread:
+            return f"it fits another zoom or focus: a focal length of {entries[0]:.5g} px"
+    moved, entries = _fit(points, start, _CENTRE)
+    if moved < limit:
+        return f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
+    free, _ = _fit(points, start, (*_FOCAL, *_CENTRE))
+    if free > _BLURRED * pixel_spread(points):
         return otherwise
-    if plain.rmse < _HOLDS * free.rmse:
-        return (
-            f"its rms error is {plain.rmse:.2g} px, {plain.rmse / rmse_px:.2g} times that of the others: "
-            "blurred, or bent"
-        )
+    if plain < _HOLDS * free:
+        times = f"{plain / rmse_px:.2g} times that of the others"
+        return f"its rms error is {plain:.2g} px, {times}: blurred, or bent"
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
 
 
@@ -89,20 +84,12 @@ def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondence
         )
     for scale, name in ((2.0, "half"), (0.5, "twice")):
         yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5)
-    for axis, name in ((0, "u"), (1, "v")):
-        stretched = pixels * np.where(np.arange(2) == axis, 2.0, 1.0)
-        yield f"its {name} is of half resolution, as in interlaced images", replace(points, pixels=stretched)
+    for factors, name in (([2.0, 1.0], "u"), ([1.0, 2.0], "v")):
+        stretched = replace(points, pixels=pixels * factors)
+        yield f"its {name} is of half resolution, as in interlaced images", stretched
     for shift in (1, -1):
-        yield (
-            "its rows are shifted by one against its pixels",
-            replace(points, world=np.roll(world, shift, axis=0)),
-        )
-
-
-@frozen_dataclass(eq=False)
-class _Fit:
-    rmse: float  # px
-    entries: Array  # (5,) px
+        shifted = replace(points, world=np.roll(world, shift, axis=0))
+        yield "its rows are shifted by one against its pixels", shifted
 
 
 def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
@@ -118,16 +105,22 @@ def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
     return in_pixels(problem, state)
 
 
-def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()) -> _Fit | None:
-    """Adjust a view's pose and the free entries of its camera; None without a start or if that fails."""
+def _fit(
+    points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()
+) -> tuple[float, Array]:
+    """Rms error and A's entries (5,) [px] after adjustment of a view's pose and the free entries.
+
+    The error is infinite without a start or if that fails.
+    """
+    failed = np.inf, np.full(5, np.nan)
     if start is None:
-        return None
+        return failed
     views = arrange(points)
     moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
     try:
         adjusted = adjust(views.batches, normalised(start, views), moving, True, _STEPS)
     except (np.linalg.LinAlgError, FloatingPointError):
-        return None
+        return failed
     rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale
     entries = views.pixel_scale * adjusted.state.entries[0] + np.array([0, 0, 0, *views.pixel_centre])
-    return _Fit(rmse, entries) if np.isfinite(rmse) else None
+    return (rmse, entries) if np.isfinite(rmse) else failed

@@ -15,10 +15,12 @@ from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
+from neurocal_cli.pipeline.point_errors import places_of_views
 from neurocal_cli.target_shape.find import Found, evidence_as_given
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
 from neurocal_cli.verdict.given_parameters import (
     AS_WELL,
+    TOLD_APART,
     other_distortion_explains,
     reestimate_centre,
     reestimate_given,
@@ -27,7 +29,6 @@ from neurocal_cli.verdict.noise import stated_noise
 from neurocal_cli.verdict.view_change import view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
-_TOLD_APART = 5.0  # standard deviations, as for the verdict
 _OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
 # The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
 _SURELY = 0.5
@@ -56,8 +57,7 @@ def contradicts_sigma(solution: Solution) -> bool:
     problem, points = solution.problem, solution.problem.points
     if points.covariance is None:
         return False
-    place = np.array([problem.views.names.index(name) for name in points.view_names])
-    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, places_of_views(solution, points))
     alike = correlation(problem.views, point_residuals(problem.views, solution.state))
     return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 
@@ -65,16 +65,16 @@ def contradicts_sigma(solution: Solution) -> bool:
 def _given_is_wrong(solution: Solution, found: Found) -> bool:
     """Whether other values of the given parameters explain the points as well as the found target does."""
     problem, (_, after) = solution.problem, found.fits[0]
-    views, given, free_poses = problem.views, problem.fixed, problem.free_poses
+    views, given = problem.views, problem.fixed
     unknowns = int(problem.free_camera.sum()) + 6 * views.n_views
     variance = float(after.cost.sum()) / max(views.n_equations - unknowns, 1)
     for asked in (
-        reestimate_given(views, solution.state, given, free_poses, variance=AS_WELL * variance),
-        reestimate_centre(views, solution.state, given, free_poses, variance),
+        reestimate_given(views, solution.state, given, True, variance=AS_WELL * variance),
+        reestimate_centre(views, solution.state, given, True, variance),
     ):
-        if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
+        if any(abs(a.found - a.given) > TOLD_APART * a.std for a in asked):
             return True
-    return free_poses and other_distortion_explains(views, solution.state, given, AS_WELL * variance)
+    return other_distortion_explains(views, solution.state, given, AS_WELL * variance)
 
 
 def _are_two_cameras(solution: Solution, found: Found, own: float) -> bool:

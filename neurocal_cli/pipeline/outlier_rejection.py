@@ -34,6 +34,7 @@ from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.pipeline.other_causes import contradicts_sigma
 from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import pixel_spread
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
@@ -114,10 +115,11 @@ class _Search:
         """
         views = arrange(self.points)
         rng = np.random.default_rng(self.options.seed)
-        consensus = find_consensus(views, views.nearly_flat, rng)
-        if consensus.hopeless.any() and self._may_be_wide():
+        consensus = find_consensus(views, rng)
+        may_be_wide = self.options.distortion == "auto" or self.problem.distortion.wide
+        if may_be_wide and consensus.hopeless.any():
             middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
-            consensus = find_consensus_through_wide_lens(consensus, views, views.nearly_flat, middle, rng)
+            consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
         self._keep(views, consensus)
         if self.kept.all():
             if first is None:
@@ -135,7 +137,7 @@ class _Search:
         for _ in range(_LOOKS):
             if not self.solution.state.distortion.wide:
                 break
-            again = find_consensus(replace(views, rays=self._rays(views)), views.nearly_flat, rng)
+            again = find_consensus(replace(views, rays=self._rays(views)), rng)
             if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
                 break
             self._keep(views, again)
@@ -154,13 +156,13 @@ class _Search:
         for view in np.flatnonzero(consensus.hopeless):
             self._drop(views.names[view], "its pixels do not match its points")
 
-    def _may_be_wide(self) -> bool:
-        """Whether the lens may be a wide one."""
-        return self.options.distortion == "auto" or self.problem.distortion.wide
-
     def _drop(self, name: str, reason: str) -> None:
         self.wrong_views[name] = reason
-        self.kept &= self.points.view_index != self.points.view_names.index(name)
+        self.kept &= ~self._of_view(name)
+
+    def _of_view(self, name: str) -> NDArray[np.bool_]:
+        """(N,) which points are of a view."""
+        return self.points.view_index == self.points.view_names.index(name)
 
     def _enough(self, failure: DegenerateGeometryError | None = None) -> None:
         share = self.kept.mean()
@@ -199,7 +201,7 @@ class _Search:
     def _readmit(self, names: list[str]) -> None:
         """Take back views that fit the camera once it has a distortion model."""
         for name in names:
-            kept = self.kept | (self.points.view_index == self.points.view_names.index(name))
+            kept = self.kept | self._of_view(name)
             with suppress(DegenerateGeometryError):
                 solution = self._fit(kept, self.options)
                 if not solution.refusal and rms(solution) <= NO_WORSE * rms(self.solution):
@@ -256,8 +258,7 @@ class _Search:
         if contradicts_sigma(self.solution):
             return
         for name, reason in self.wrong_views.items():
-            rows = self.points.view_index == self.points.view_names.index(name)
-            plain = replace(self.points.select(rows), covariance=None, across=None)
+            plain = replace(self.points.select(self._of_view(name)), covariance=None, across=None)
             self.wrong_views[name] = why_odd(plain, self.solution.camera, rms(self.solution), reason)
 
 
@@ -273,7 +274,6 @@ def _suspicious(solution: Solution) -> bool:
     everything = np.ones(len(points), dtype=bool)
     if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
         return True
-    spread = np.sqrt(points.pixels.var(axis=0).sum())
-    if np.sqrt((error**2).mean()) > _ROUGH * spread:
+    if np.sqrt((error**2).mean()) > _ROUGH * pixel_spread(points):
         return True
     return find_outlier_view(solution) is not None

@@ -17,6 +17,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import pixel_spread
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong; clean data
 # are the same to the last bit with and without the rejection).
@@ -47,8 +48,7 @@ class PointErrors:
 
 def point_errors(solution: Solution, points: Correspondences) -> PointErrors:
     """Errors of some points of a solution's views, by its camera."""
-    place = {name: k for k, name in enumerate(solution.problem.views.names)}
-    view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
+    view = places_of_views(solution, points)
     predicted, in_front = predicted_pixels(solution.in_pixels, points.world, np.maximum(view, 0))
     residuals = predicted - points.pixels
     stated = None
@@ -61,6 +61,12 @@ def point_errors(solution: Solution, points: Correspondences) -> PointErrors:
     length = _lengths(residuals, stated, points.across)
     length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
     return PointErrors(length, _parts(length, residuals, points.across))
+
+
+def places_of_views(solution: Solution, points: Correspondences) -> NDArray[np.intp]:
+    """(N,) place of each point's view among those of a solution; -1 if it is not there."""
+    place = {name: k for k, name in enumerate(solution.problem.views.names)}
+    return np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
 
 
 def _borne_out(covariance: Array, residuals: Array) -> float:
@@ -133,7 +139,6 @@ def largest_expected(errors: PointErrors, kept: NDArray[np.bool_], points: Corre
 
     The noise level is estimated per view, because all errors of a blurred view are larger.
     """
-    spread = np.sqrt(points.pixels.var(axis=0).sum())
     rows = np.flatnonzero(kept)
     overall = errors.sigma(rows)
     by_view = np.full(points.n_views, overall)
@@ -143,7 +148,7 @@ def largest_expected(errors: PointErrors, kept: NDArray[np.bool_], points: Corre
     for view, piece in enumerate(pieces):
         if len(piece) >= _ENOUGH:
             by_view[view] = errors.sigma(piece)
-    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * spread
+    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * pixel_spread(points)
     return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance
+from neurocal_cli.bundle_adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
@@ -17,20 +17,18 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     pose_std,
     with_scale,
 )
-from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.solution import Solution, TargetPosterior
-from neurocal_cli.bundle_adjustment.units import translations
+from neurocal_cli.bundle_adjustment.units import normalised, translations
+from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
-from neurocal_cli.verdict.odd_points import normalised
-
-if TYPE_CHECKING:
-    from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
+from neurocal_cli.verdict.assessment import stored_state
+from neurocal_cli.verdict.odd_points import are_normalised
 
 _XI = 5  # index of xi, after A's five entries
 _TOLD = 0.1  # width of the range of xi from which on a warning is given
@@ -46,10 +44,9 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    errors, repeated = solution.residuals, solution.repeated
     known = camera_covariance(
         CameraSeen(
-            views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
+            views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
             problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
             solution.shared, solution.by_prior, solution.target_kept,
             solution.covariance if solution.target is None else None,
@@ -62,10 +59,10 @@ def calibration_of(
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
     else:
         intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
-    entries = _entries(problem, known, solution.ambiguity)
+    entries = _entries(solution, known)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
-    squared = (errors**2).sum(axis=1) * views.pixel_scale**2
+    squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
     free = [n for n, parameter in enumerate(std) if parameter not in fixed]
     reason = StopReason.CONVERGED
@@ -102,15 +99,31 @@ def calibration_of(
         would_take=solution.would_take,
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
-            *_xi_warning(solution.ambiguity, problem.distortion.model),
-            *_corner_warning(problem),
-            *(() if chosen else _undetermined_warning(problem, adjusted)),
-            *(() if normalised(problem.points) else _repeated_warning(repeated)),
-            *filter(None, [scale_of(problem.points).contradiction]),
-            *_mirrored_warning(seen_from_behind(views, state)),
+            *_lens_warnings(solution),
+            *_view_warnings(solution),
             *_rejection_warnings(rejected, len(problem.points)),
         ),
     )
+
+
+# Poses that the points do not determine have an infinite std already.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def with_given_covariance(found: Calibration, given: Calibration) -> Calibration:
+    """A calibration of type 3 whose poses have the uncertainty of the given camera, as far as it is known."""
+    names, covariance = given.known_covariance
+    if not names or not np.isfinite(covariance).all():
+        return found
+    views = arrange(found.points)
+    state = stored_state(found, views.names)
+    entries = entry_covariance(found.intrinsics, state.model, names, covariance, views.pixel_scale)
+    block = covariance_by_camera(views, normalised(state, views), entries)
+    added = pose_std(state.R, (state.R @ views.centre[..., None])[..., 0], views.scale, block)
+    results = dict(found.views)
+    for name, more in zip(views.names, added.tolist(), strict=True):
+        std = found.views[name].std
+        both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
+        results[name] = replace(found.views[name], std=both)
+    return replace(found, views=results, given_covariance=covariance, given_names=names)
 
 
 def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
@@ -119,12 +132,12 @@ def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
     return posterior if adjusted is solution.adjusted else None
 
 
-def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | None) -> Array:
+def _entries(solution: Solution, known: CameraCovariance) -> Array:
     """(5 + K, 5 + K) covariance of A's entries and the distortion coefficients, normalised; 0 if given.
 
     It includes the spread of other cameras that explain the points equally well (`ambiguity`).
     """
-    free = problem.free_camera
+    free, ambiguity = solution.problem.free_camera, solution.ambiguity
     entries = np.zeros((len(free), len(free)))
     entries[np.ix_(free, free)] = known.found.entries
     if ambiguity is None:
@@ -150,12 +163,11 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)
-    rows = zip(R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    rows = zip(views.names, R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    given = not problem.free_poses
     return {
-        name: ViewResult(
-            Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not problem.free_poses
-        )
-        for name, (R_k, t_k, sigma, n, r) in zip(views.names, rows, strict=True)
+        name: ViewResult(Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, given)
+        for name, R_k, t_k, sigma, n, r in rows
     }
 
 
@@ -178,71 +190,58 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
     )
 
 
-def _xi_warning(ambiguity: Ambiguity | None, model: str) -> tuple[str, ...]:
-    """Warn if a wide range of xi explains the points equally well, each value with its own alpha."""
-    if ambiguity is None or np.diff(ambiguity.range)[0] < _TOLD:
-        return ()
-    first, last = ambiguity.range
-    with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
-    return (
-        f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
-        f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, and "
-        "the verdict gives its std",
-    )
-
-
-def _corner_warning(problem: Problem) -> tuple[str, ...]:
-    """Warn if the distortion had to be kept monotonic in corners of the image without points."""
-    if problem.penalty is None or problem.distortion.model == "rich":
-        return ()
-    return (
-        f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
-        "two directions to one pixel) in the image's corners, where there are no points; the best monotonic "
-        "fit is used, which is a guess in the corners; add views that show the board there",
-    )
-
-
-def _undetermined_warning(problem: Problem, adjusted: Adjusted) -> tuple[str, ...]:
-    """Warn of a named model with coefficients that the points do not determine.
-
-    Those of eucm do not show it by their standard deviations: without distortion its alpha is 0, and beta has
-    no effect.
-    """
+def _lens_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of a distortion that the points determine in part."""
+    problem, ambiguity = solution.problem, solution.ambiguity
     model = problem.distortion.model
-    if not problem.free_distortion or model == "rich" or (adjusted.converged and model != "eucm"):
-        return ()
-    return tuple(filter(None, [undetermined_coefficients(problem, adjusted)]))
+    if ambiguity is not None and not np.diff(ambiguity.range)[0] < _TOLD:
+        first, last = ambiguity.range
+        with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
+        yield (
+            f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
+            f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, "
+            "and the verdict gives its std"
+        )
+    if model == "rich":
+        return
+    if problem.penalty is not None:
+        yield (
+            f"the distortion model {model} that fits the points best is not monotonic (maps two directions "
+            "to one pixel) in the image's corners, where there are no points; the best monotonic fit is "
+            "used, which is a guess in the corners; add views that show the board there"
+        )
+    # The standard deviations of eucm do not show it: without distortion alpha is 0, and beta has no effect.
+    doubtful = not solution.adjusted.converged or model == "eucm"
+    if doubtful and solution.model_errors is None and problem.free_distortion:
+        yield from filter(None, [undetermined_coefficients(problem, solution.adjusted)])
 
 
-def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
-    """Warn if views repeat a pose."""
-    if repeated.none:
-        return ()
-    return (
-        f"{len(repeated.group)} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
-        "views that repeat a pose count as one",
-    )
+def _view_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
+    points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
+    if not (repeated.none or are_normalised(points)):
+        yield (
+            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
+            "views that repeat a pose count as one"
+        )
+    yield from filter(None, [scale_of(points).contradiction])
+    # The camera is right nevertheless.
+    mirrored = seen_from_behind(views, solution.state)
+    if mirrored:
+        more = f" and {len(mirrored) - _NAMED} more" if len(mirrored) > _NAMED else ""
+        yield (
+            f"the target appears mirrored in {', '.join(map(repr, mirrored[:_NAMED]))}{more}, so the poses "
+            "of these views are wrong; check the order of their points"
+        )
 
 
-def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
-    """Warn of views in which a flat target is mirrored: the camera is right, but these poses are wrong."""
-    if not views:
-        return ()
-    names = ", ".join(map(repr, views[:_NAMED])) + (
-        f" and {len(views) - _NAMED} more" * (len(views) > _NAMED)
-    )
-    return (
-        f"the target appears mirrored in {names}, so the poses of these views are wrong; check the order of "
-        "their points",
-    )
-
-
-def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
+def _rejection_warnings(rejected: Rejected, kept: int) -> Iterator[str]:
     """Name the views left out with their reasons, and the first outliers by line and id."""
-    lines = [f"view {name!r} is left out: {reason}" for name, reason in rejected.views.items()]
+    for name, reason in rejected.views.items():
+        yield f"view {name!r} is left out: {reason}"
     points = rejected.points
     if points is None:
-        return tuple(lines)
+        return
     single = np.flatnonzero([points.view_names[v] not in rejected.views for v in points.view_index])
     if single.size:
         places = []
@@ -251,5 +250,4 @@ def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
             places.append(f"{points.place(int(row))}{label}")
         more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
         share = f"{single.size} of {kept + len(rejected)} points"
-        lines.append(f"{share} are outliers and are left out: {', '.join(places)}{more}")
-    return tuple(lines)
+        yield f"{share} are outliers and are left out: {', '.join(places)}{more}"

@@ -56,12 +56,11 @@ def with_rich_lens(
     if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return solution, rejected
     repeated = solution.repeated
-    if repeated.n_poses < _FEWEST:
-        return solution, rejected
-    rich = _rich(solution, repeated)
+    rich = None if repeated.n_poses < _FEWEST else _rich(solution, repeated)
     if rich is None or not _is_the_lens(rich, solution, repeated):
         return solution, rejected
-    found = {**(solution.model_errors or {}), "rich": _held_out_rms(rich, repeated)}
+    rms = float(np.sqrt(_lost(rich, repeated).sum() / len(views.index))) * rich.problem.views.pixel_scale
+    found = {**(solution.model_errors or {}), "rich": rms}
     if len(rejected):
         rich, rejected = judged_again(problem, rich, rejected, options)
     return replace(rich, model_errors=found), rejected
@@ -90,11 +89,6 @@ def _is_the_lens(rich: Solution, other: Solution, repeated: RepeatedPoses) -> bo
     if correlation(views, point_residuals(views, state)) > _NOISE:
         return False
     return view_groups(views, state, rich.adjusted.normal, rich.problem.free_of_prior) is None
-
-
-def _held_out_rms(solution: Solution, repeated: RepeatedPoses) -> float:
-    views = solution.problem.views
-    return float(np.sqrt(_lost(solution, repeated).sum() / len(views.index))) * views.pixel_scale
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:

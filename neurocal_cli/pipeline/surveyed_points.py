@@ -21,7 +21,7 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
-from neurocal_cli.pipeline.point_errors import squared_whitened
+from neurocal_cli.pipeline.point_errors import places_of_views, squared_whitened
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
@@ -82,9 +82,7 @@ def _with_places(solution: Solution, points: Correspondences, factor: float) -> 
     """
     own = np.array([1.0, 0.0, 1.0]) if points.covariance is None else points.covariance
     own = np.broadcast_to(own, (len(points), 3))
-    names = {name: k for k, name in enumerate(solution.problem.views.names)}
-    view = np.array([names.get(name, -1) for name in points.view_names])[points.view_index]
-    state = solution.in_pixels
+    state, view = solution.in_pixels, places_of_views(solution, points)
     in_camera = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
     J = solution.camera.project_jacobian(in_camera)[1] @ state.R[view]
     assert points.world_std is not None

@@ -12,23 +12,23 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
-from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
+from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
+from neurocal_cli.pipeline.common_target import find_shape, views_suffice
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.pipeline.point_errors import rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
-from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target import Target, distinct_points
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
-from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.target_shape.view_bends import find_bends
-from neurocal_cli.verdict.view_groups import OWN_STEPS
+from neurocal_cli.verdict.view_groups import OWN_STEPS, variance_of_views
 
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
@@ -79,41 +79,34 @@ def _searched(
         found = _with_bends(solution, found)
     if found is not None and choice == "auto" and has_other_cause(solution, found):
         return solution, rejected
-    kept = replace(solution, target_kept=choice == "auto")
-    best: tuple[Solution, Rejected] = kept, rejected
+    best = replace(solution, target_kept=choice == "auto")
     for _ in range(_ROUNDS):
         if found is None:
             break
         (new, adjusted), *_ = found.fits
+        lens = new.distortion.model
         # Views that contradicted only the given target have come back, so the record is the latest one.
-        start = replace(solution, problem=new, adjusted=adjusted, record=best[0].record)
-        again = _fitted_to(problem, found.target, (start, best[1]), options)
+        start = replace(solution, problem=new, adjusted=adjusted, record=best.record)
+        again = _fitted_to(problem, found.target, start, rejected, options)
         if again is None:
             break
-        lens = new.distortion.model
-        known = found.target
-        same_views = again[0].problem.views.names == solution.problem.views.names
-        if not (same_views or _can_tell(again[0], choice, known)):
+        fitted, outliers = again
+        same_views = fitted.problem.views.names == solution.problem.views.names
+        if not (same_views or _can_tell(fitted, choice, found.target)):
             break
-        if not _is_where_it_was(found, again[0]):
-            found = _found(again[0], choice, known)
+        if not _is_where_it_was(found, fitted):
+            found = _found(fitted, choice, found.target)
         if found is None:
             break
         (new, adjusted), *_ = found.fits
-        known_there = None if found.posterior is None else (adjusted, found.posterior)
-        best = (
-            replace(
-                again[0],
-                problem=new,
-                adjusted=adjusted,
-                target=found.target,
-                target_posterior=known_there,
-            ),
-            again[1],
+        posterior = None if found.posterior is None else (adjusted, found.posterior)
+        best = replace(
+            fitted, problem=new, adjusted=adjusted, target=found.target, target_posterior=posterior
         )
+        rejected = outliers
         if new.distortion.model == lens:
             break
-    return best
+    return best, rejected
 
 
 def lines_that_are_bent(solution: Solution, unit: str) -> str:
@@ -122,12 +115,12 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
     The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
     """
     problem = solution.problem.with_model(_OF_LINES)
-    fit = problem, problem.adjust(solution.adjusted)
+    adjusted = problem.adjust(solution.adjusted)
     _, label, _ = distinct_points([problem.points])
     if not problem.free_poses or not enough_views(label, problem.views.n_views):
         return ""
-    found = find_target([fit], least_gain=LEAST_GAIN)
-    if found is None or has_other_cause(replace(solution, problem=fit[0], adjusted=fit[1]), found):
+    found = find_target([(problem, adjusted)], least_gain=LEAST_GAIN)
+    if found is None or has_other_cause(replace(solution, problem=problem, adjusted=adjusted), found):
         return ""
     target = found.target
     off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
@@ -143,15 +136,14 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
 
     Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
     """
-    fit = solution.problem, solution.adjusted
-    found = find_bends(fit, common)
+    given = solution.problem, solution.adjusted
+    found = find_bends(given, common)
     if found is None or found.target.bends is None:
         return found
-    before, after = fit if common is None else common.fits[0], found.fits[0]
-    least = _noise_of_views(*after)
-    given = _noise(*before, 0.0)
+    before, after = given if common is None else common.fits[0], found.fits[0]
+    least, flat = variance_of_views(after[0].views, after[1].state), _noise(*before, 0.0)
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
-    if bent > _NOISE * least and given - bent < _SHARE * (given - least):
+    if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
     # No two cameras of this lens can fit better than a camera for each view.
     least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
@@ -168,20 +160,11 @@ def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
     return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
 
 
-def _noise_of_views(problem: Problem, adjusted: Adjusted) -> float:
-    """Residual variance with a separate camera for each view."""
-    unknowns = 6 + conditions_on_views(problem.views, adjusted.state)
-    own = float(free_networks(problem.views, adjusted.state).sum())
-    return own / max(problem.views.n_equations - float(unknowns.sum()), 1.0)
-
-
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     """Whether there are enough independent views to estimate the target."""
     problem = solution.problem
     points = problem.points if known is None else known.straightened(problem.points)
-    given, label, point = distinct_points([points])
-    plane = planes_of(given, point) if known is None else known.plane
-    if not enough_views(label, solution.repeated.n_poses, int(plane.max()) + 1):
+    if not views_suffice([points], known, solution.repeated.n_poses):
         return False
     # Errors common to repeated views look like errors of the target.
     return choice != "auto" or not solution.repeated.worth < _WORTH
@@ -192,27 +175,21 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
     (problem, adjusted), new = found.fits[0], again.problem
     if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
         return False
-    same = np.array_equal(problem.points.pixels, new.points.pixels)
+    if not np.array_equal(problem.points.pixels, new.points.pixels):
+        return False
     cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
-    return (
-        same
-        and np.array_equal(problem.free_camera, new.free_camera)
-        and bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
-    )
+    stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    return stays and np.array_equal(problem.free_camera, new.free_camera)
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    # The lens may change only if the user named none.
-    find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
-    least = LEAST_GAIN if choice == "auto" else -np.inf
-    return find([(solution.problem, solution.adjusted)], choice == "flat", known, least)
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
 
 
 def _fitted_to(
-    problem: Problem, target: Target, before: tuple[Solution, Rejected], options: Options
+    problem: Problem, target: Target, solution: Solution, rejected: Rejected, options: Options
 ) -> tuple[Solution, Rejected] | None:
     """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
-    solution, rejected = before
     try:
         if len(rejected) or rejected.views:
             again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,5 @@ class Trained:
         return self.W @ self.V
 
 
-class Trainer(Protocol):
-    """A function that trains a stack of networks."""
-
-    def __call__(self, task: Task) -> Trained:
-        """Lower E_2D from the task's initial weights."""
-        ...
+Trainer = Callable[[Task], Trained]
+"""A function that lowers E_2D from the task's initial weights."""

@@ -67,14 +67,9 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
         raise InputError("the hidden weights must be either all free or all given")
     networks = _Networks(_Normal(patterns, free), product, 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2)
     networks.train(options)
-    product = networks.product
-    if task.free_V.all():
-        W, V = _split(task.W, product)
-    else:
-        W, V = product, task.V
-    iterations, settled = networks.iterations, networks.settled
-    curve = networks.curve(options.max_iterations)
-    return Trained(W, V, networks.normal.gamma(product), networks.loss, iterations, settled, curve)
+    W, V = _split(task.W, networks.product) if task.free_V.all() else (networks.product, task.V)
+    gamma, curve = networks.normal.gamma(networks.product), networks.curve(options.max_iterations)
+    return Trained(W, V, gamma, networks.loss, networks.iterations, networks.settled, curve)
 
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:
@@ -95,20 +90,19 @@ class _Normal:
     """E, its gradient and Gauss-Newton matrix for the free entries of the (3, I) products."""
 
     def __init__(self, patterns: Patterns, free: NDArray[np.bool_]) -> None:
-        Z, d, w = patterns.inputs, patterns.targets, patterns.weights
-        self.n_inputs = Z.shape[2]
-        self.Z, self.w = Z, w
+        Z, n = patterns.inputs, patterns.n_inputs
+        self.Z, self.w = Z, patterns.weights
         # Patterns are the last axis, along which NumPy is fastest.
         self.Zt = np.ascontiguousarray(np.swapaxes(Z, -1, -2))
-        self.dt = np.ascontiguousarray(np.swapaxes(d, -1, -2))
-        a, b = np.array([(a, b) for a in range(self.n_inputs) for b in range(a, self.n_inputs)]).T
+        self.dt = np.ascontiguousarray(np.swapaxes(patterns.targets, -1, -2))
+        a, b = np.triu_indices(n)
         self.ZZ = Z[..., a] * Z[..., b]
         # Where entry (k, a), (l, b) of the matrix is found among 6 output pairs x input pairs.
-        inputs = np.zeros((self.n_inputs, self.n_inputs), dtype=np.intp)
+        inputs = np.zeros((n, n), dtype=np.intp)
         inputs[a, b] = inputs[b, a] = np.arange(len(a))
         outputs = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
         self.free = np.flatnonzero(free)
-        row, column = np.divmod(self.free, self.n_inputs)
+        row, column = np.divmod(self.free, n)
         self.place = outputs[row[:, None], row] * len(a) + inputs[column[:, None], column]
 
     def gamma(self, product: Array) -> Array:

@@ -1,23 +1,12 @@
 """Measure the quality of a calibration beyond its reprojection error, and reach a verdict.
 
-Everything is computed from the calibration and its points, so a file can be judged like a fresh result:
-
-* the cross-validation error (`cross_validation`);
-* the noise floor: the error if each view has its own camera, a free network (`outlier_views.free_networks`);
-  a common camera with a much larger error contradicts the data;
-* the difference between two halves of the data, in units of its reported uncertainty;
-* the correlation of neighbouring residuals (`residual_correlation`);
-* two cameras among the views, or a changing focal length (`view_groups`);
-* a board whose axes have different units (`proportions`);
-* an image centre that moves (`moving_centre`), and images turned by 180 degrees (`turned_images`);
-* coefficients that the chosen distortion model lacks (`missing_coefficients`);
-* given parameters that the points contradict (`given_parameters`);
-* the coverage of the image and of directions by the points (`coverage`);
-* the uncertainty of projected pixels (`projection_uncertainty`).
+All measures (`Evidence`) are computed from the calibration and its points, so a file can be judged like a
+fresh result.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -39,7 +28,6 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import in_cameras
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
@@ -48,7 +36,7 @@ from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covar
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import pixel_spread
+from neurocal_cli.verdict.findings import pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import (
     Doubt,
     Reestimated,
@@ -96,12 +84,8 @@ def assess(calibration: Calibration) -> Verdict | None:
         return None
     behind = _views_behind(calibration)
     if behind:
-        return Verdict(
-            "poor",
-            (f"points lie behind the camera in {behind} of {len(calibration.views)} views",),
-            ("calibrate again, because the poses of these views were changed",),
-            {},
-        )
+        reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
+        return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
     return reach_verdict(calibration, gather_evidence(calibration))
 
 
@@ -113,6 +97,13 @@ def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | 
     return _AtMinimum(calibration).projection()
 
 
+def stored_state(calibration: Calibration, names: Sequence[str]) -> CameraState:
+    """The camera of a calibration and its poses of the named views, in pixels and world units."""
+    poses, camera = [calibration.views[name].pose for name in names], calibration.camera
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    return CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
+
+
 def _has_points(calibration: Calibration) -> bool:
     return bool(calibration.views) and set(calibration.points.view_names) == set(calibration.views)
 
@@ -122,15 +113,14 @@ def _views_behind(calibration: Calibration) -> int:
 
     For a wide lens: with points outside the domain of its model.
     """
-    points = calibration.points
-    poses = [calibration.views[name].pose for name in points.view_names]
+    points, view = calibration.points, calibration.points.view_index
+    state = stored_state(calibration, points.view_names)
     if calibration.camera.distortion.wide:
-        seen = calibration.camera.sees(in_cameras(poses, points.world, points.view_index))
-        return int(np.count_nonzero(np.bincount(points.view_index[~seen])))
-    axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
-    depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
-    behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
-    return int(np.count_nonzero(np.bincount(behind)))
+        seen = calibration.camera.sees((state.R[view] @ points.world[..., None])[..., 0] + state.t[view])
+    else:
+        depth = (points.world * state.R[view, 2]).sum(axis=1) + state.t[view, 2]
+        seen = depth > _IN_PLANE * np.abs(depth).max()
+    return int(np.count_nonzero(np.bincount(view[~seen])))  # np.unique would load numpy.ma
 
 
 class _AtMinimum:
@@ -139,14 +129,7 @@ class _AtMinimum:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
         views = [calibration.views[name] for name in self.points.view_names]
-        self.camera = calibration.camera
-        self.given = CameraState(
-            np.array([self.camera.entries]),
-            np.stack([view.pose.R for view in views]),
-            np.stack([view.pose.t for view in views]),
-            self.camera.distortion.model,
-            self.camera.distortion.coefficients,
-        )
+        self.camera, self.given = calibration.camera, stored_state(calibration, self.points.view_names)
         self.views = self._arranged(self.points)
         self.free = estimated_parameters(calibration)
         if xi_is_flat(calibration.distortion_model, calibration.distortion):
@@ -179,10 +162,17 @@ class _AtMinimum:
 
     def _covariance_of_given(self) -> Array:
         """(5 + K, 5 + K) covariance of a given camera, normalised."""
-        c, model = self.calibration, self.state.model
-        return entry_covariance(
-            c.intrinsics, model, c.given_names, c.given_covariance, self.views.pixel_scale
-        )
+        return self._of_entries(self.calibration.given_names, self.calibration.given_covariance)
+
+    def _of_entries(self, names: tuple[str, ...], covariance: Array) -> Array:
+        c, px = self.calibration, self.views.pixel_scale
+        return entry_covariance(c.intrinsics, c.distortion_model, names, covariance, px)
+
+    def _stored(self) -> tuple[NDArray[np.bool_], Array]:
+        """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
+        c = self.calibration
+        free = free_entries(c)
+        return free, self._of_entries(c.covariance_names, c.covariance)[np.ix_(free, free)]
 
     def _arranged(self, points: Correspondences) -> Views:
         """The points, at these or other world coordinates, with the weights that the residuals bear out."""
@@ -275,9 +265,7 @@ class _AtMinimum:
         return free_networks(self.views, self.state)
 
     def _held_out(self) -> float:
-        lost = held_out(self.minimum)
-        if self.camera.distortion.model == "rich":
-            lost = self._held_out_with_prior()
+        lost = self._held_out_with_prior() if self.state.model == "rich" else held_out(self.minimum)
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _held_out_with_prior(self) -> Array:
@@ -286,7 +274,7 @@ class _AtMinimum:
         At the minimum the gradients of points and prior cancel. Without a fold F of the views the minimum is
         at -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
         """
-        free, shared = _stored(self.calibration, self.views.pixel_scale)
+        free, shared = self._stored()
         q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
         S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
         inverse = shared / self.variance
@@ -399,7 +387,7 @@ class _AtMinimum:
             m = replace(m, state=lens.state(m.state), normal=self.wide.normal, free=lens.free)
             camera = replace(camera, distortion=Distortion(lens.model, lens.k))
         if camera.distortion.model == "rich":
-            free, shared = _stored(self.calibration, self.views.pixel_scale)
+            free, shared = self._stored()
             m = replace(m, free=free)
         if self.calibration.given_names:
             given = self._covariance_of_given()
@@ -407,16 +395,3 @@ class _AtMinimum:
             m, shared = replace(m, free=free), given[np.ix_(free, free)]
         pixels = image_grid(self.points.image_size)
         return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
-
-
-def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
-    """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
-    block = entry_covariance(
-        calibration.intrinsics,
-        calibration.distortion_model,
-        calibration.covariance_names,
-        calibration.covariance,
-        pixel_scale,
-    )
-    free = free_entries(calibration)
-    return free, np.asarray(block[np.ix_(free, free)])

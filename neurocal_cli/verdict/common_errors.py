@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,19 +15,16 @@ from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
-if TYPE_CHECKING:
-    from neurocal_cli.verdict.moving_centre import MovingCentre
-
 # Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
-_CHANGED, _MUCH_CHANGED = 0.001, 0.05  # of the focal length
+_CHANGED = Limit(0.001, 0.05)  # of the focal length
 _APART = Limit(0.01, 0.05)  # of the focal length
 # A small change of one parameter is preferred to two cameras if it explains nearly as much.
 _LARGE = 0.03  # of the focal length: largest difference for which the score tests are valid
 _NEARLY = 0.7  # share of the explained error that counts as nearly as much
 _NEAR = 0.02  # of the focal length: equal up to this
 # Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 % and 1.3 sigmas.
-_OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
+_OFF = Limit(0.005, 0.05)  # of the focal length
 _SIGMAS = 2.0
 # Rms error over that with all coefficients; Zhang's views, usable without their lens, leave 3.3.
 _TOO_SIMPLE = Limit(1.2, 4.0)
@@ -54,7 +51,12 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
         other is not None and other.explained > _NEARLY * centre.explained
         for other in (change, board, groups, missing)
     ):
-        yield _moving(centre)
+        yield (
+            1,
+            f"the image centre moves from view to view, by about {centre.size:.2g} px, as image "
+            "stabilisation moves it",
+            "switch image stabilisation off, or expect that predicted pixels are off by as much",
+        )
         return
     if missing is not None and _explains(missing.explained, evidence):
         # Residual distortion looks like a bent board, and like several cameras.
@@ -79,15 +81,6 @@ def _turned(names: tuple[str, ...]) -> Finding:
         2,
         f"{name_some(names)}: turned by 180 degrees against the other images, so their centre is mirrored",
         "give all images as the camera has stored them, without turning them upright",
-    )
-
-
-def _moving(centre: MovingCentre) -> Finding:
-    return (
-        1,
-        f"the image centre moves from view to view, by about {centre.size:.2g} px, as image stabilisation "
-        "moves it",
-        "switch image stabilisation off, or expect that predicted pixels are off by as much",
     )
 
 
@@ -180,7 +173,7 @@ def _changed(change: ViewChange, wide: bool) -> Finding:
             "others, so the images are of two sizes, or of two settings of zoom or focus"
         )
     return (
-        int(size > _CHANGED) + int(size > _MUCH_CHANGED),
+        _CHANGED.grade(size),
         reason,
         "keep zoom and focus fixed, autofocus off, and all images at one size",
     )
@@ -198,7 +191,7 @@ def _bent(board: BoardShape, unit: str) -> Finding:
 
 def _worse_by(off: float, sigmas: float) -> int:
     """Grade of a relative error of the focal length, and of an error in standard deviations."""
-    return max(int(sigmas > _SIGMAS), int(abs(off) > _OFF) + int(abs(off) > _MUCH_OFF))
+    return max(int(sigmas > _SIGMAS), _OFF.grade(abs(off)))
 
 
 def _shape(board: BoardShape, unit: str) -> str:

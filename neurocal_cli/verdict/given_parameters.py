@@ -22,11 +22,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.residual_correlation import (
-    correlation,
-    effective_number,
-    point_residuals,
-)
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
@@ -109,11 +105,7 @@ def reestimate_given(
 
 
 def reestimate_centre(
-    views: Views,
-    state: CameraState,
-    given: frozenset[str],
-    free_poses: bool,
-    variance: float,
+    views: Views, state: CameraState, given: frozenset[str], free_poses: bool, variance: float
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre without tangential distortion, on the target as given.
 
@@ -131,11 +123,7 @@ def reestimate_centre(
 
 
 def reestimate_centre_and_target(
-    points: Correspondences,
-    views: Views,
-    state: CameraState,
-    given: frozenset[str],
-    variance: float,
+    points: Correspondences, views: Views, state: CameraState, given: frozenset[str], variance: float
 ) -> tuple[Reestimated, ...]:
     """Estimate a given centre together with the target, if that is decidedly more probable.
 
@@ -192,7 +180,7 @@ def other_distortion_explains(
     if "alpha_u" not in given:
         return False
     if state.model == "none":
-        state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
+        state = state.with_model(_DISPLACED)
     free = np.arange(5 + len(state.k)) >= 5
     adjusted = adjust(views.batches, state, free, True, _STEPS)
     spare = views.n_equations - int(free.sum()) - 6 * views.n_views
@@ -219,8 +207,9 @@ def doubt_about_given(
         return None
     best, most = None, 0.0
     for what, start, some in _alternatives(state, given):
+        names = (*_ENTRIES, *coefficient_names(start.model))
         for added in some:
-            free = _estimated(start, given) | added
+            free = np.array([name not in given for name in names], dtype=bool) | added
             adjusted = adjust(views.batches, start, free, True, _STEPS)
             if covariance(adjusted.normal, free, True, views.n_equations).smallest > _WELL_POSED:
                 break
@@ -250,14 +239,8 @@ def _alternatives(
     yield "focal length or centre", state, [asked, in_part]
     if asked[0]:
         if state.model == "none":
-            state = replace(state, model=_DISPLACED, k=pinhole_coefficients(_DISPLACED))
-        yield "distortion", state, [np.concatenate([none[:5], np.ones(len(state.k), dtype=bool)])]
-
-
-def _estimated(state: CameraState, given: frozenset[str]) -> NDArray[np.bool_]:
-    """(5 + K,) which entries and coefficients the calibration estimated."""
-    names = (*_ENTRIES, *coefficient_names(state.model))
-    return np.array([name not in given for name in names], dtype=bool)
+            state = state.with_model(_DISPLACED)
+        yield "distortion", state, [np.arange(5 + len(state.k)) >= 5]
 
 
 def _change_of_poses(before: CameraState, after: CameraState, std: Array) -> float:

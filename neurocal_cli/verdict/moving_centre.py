@@ -10,7 +10,7 @@ other changes of single views: of the focal length, of the size of the image, an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.target_shape.bend_evidence import least_by_precision
 from neurocal_cli.target_shape.posterior import log_evidence
+from neurocal_cli.verdict.view_change import directions
 
 # Repeated by tests/test_moving_centre.py (slow): of 30 sets of 15 views with focal lengths of 900 to 1500 px
 # shifts of 20 px are found in all, and of 10 px in nine of ten; none where a board bends from view to view.
@@ -63,7 +64,7 @@ def moving_centre(
     if not spare * np.log(contradiction) > _GAIN:  # no more can be gained than down to the noise floor
         return None
     variance = float(q.cost.sum()) / spare
-    changes = {name: _Effect.of(q, step[free]) for name, step in _changes(views, state)}
+    changes = {name: _Effect.of(q, step[free]) for name, step in _changes(views, state, free)}
     gains = {name: effect.gains(variance, spare) for name, effect in changes.items()}
     best = int(np.argmax(gains["centre"]))
     gain, others = gains["centre"][best], max(gains[name].max() for name in gains if name != "centre")
@@ -79,19 +80,16 @@ def moving_centre(
 
 def least_with_own_centres(views: Views, state: CameraState, free: NDArray[np.bool_], q: Quadratics) -> float:
     """Squared error with a centre of its own for each view, by one Gauss-Newton step; see `moving_centre`."""
-    step = dict(_changes(views, state))["centre"][free]
+    step = dict(_changes(views, state, free))["centre"][free]
     return float(_Effect.of(q, step).least(np.array([_FREE]))[0][0])
 
 
-def _changes(views: Views, state: CameraState) -> list[tuple[str, Array]]:
+def _changes(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
     """Steps (5 + K, m) of A's entries and the coefficients for changes by the focal length, by name."""
-    a = state.entries[0]
-    centre, focal, size, proportions = (np.zeros((5 + state.k.shape[-1], m)) for m in (2, 1, 1, 1))
-    centre[3, 0] = centre[4, 1] = a[0]
-    focal[:3, 0] = size[:3, 0] = a[:3]
-    size[3:5, 0] = a[3:5] + views.pixel_centre / views.pixel_scale
-    proportions[0, 0] = a[0]
-    return [("centre", centre), ("focal", focal), ("size", size), ("proportions", proportions)]
+    yield "centre", state.entries[0, 0] * np.eye(len(free), 2, -3)
+    yield "proportions", state.entries[0, 0] * np.eye(len(free), 1)
+    for name, step in directions(views, state, free):
+        yield name, step[:, None]
 
 
 @frozen_dataclass(eq=False)

@@ -58,14 +58,14 @@ def odd_points(calibration: Calibration) -> Iterator[Finding]:
     yield from views_of_another_scale(calibration.points)
 
 
-def normalised(points: Correspondences) -> bool:
+def are_normalised(points: Correspondences) -> bool:
     """Whether the pixels are normalised coordinates."""
     return bool(np.abs(points.pixels).max() < _NORMALISED)
 
 
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     """Findings about the pixels as numbers."""
-    if normalised(points):
+    if are_normalised(points):
         yield (
             2,
             "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",
@@ -110,9 +110,8 @@ def _outside(points: Correspondences) -> Iterator[Finding]:
     count = int(_beyond(points.pixels, size).sum())
     if count == 0:
         return
-    few = count <= _SOME * len(points)
     text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
-    if few:
+    if count <= _SOME * len(points):
         yield 1, text, "correct or leave out these points"
     elif not _beyond(points.pixels, size[::-1]).any():
         yield (
@@ -145,23 +144,15 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     view = points.view_index[first]
     n_twice = np.bincount(view, different > 1, points.n_views)
     n_points = np.bincount(view, minlength=points.n_views)
-    names = np.array(points.view_names)
     whole = 2 * n_twice > n_points
-    if whole.any():
-        yield (
-            1,
-            f"{name_some(names[whole])}: most points are given twice with different pixels, as of two images "
-            "under one name",
-            "give each image a name of its own",
-        )
     some = (n_twice > 0) & ~whole
-    if some.any():
-        yield (
-            1,
-            f"{name_some(names[some])}: {int(n_twice[some].sum())} points are given twice with different "
-            "pixels",
-            "check the ids and X,Y,Z of these points",
-        )
+    twice = "points are given twice with different pixels"
+    for which, reason, advice in (
+        (whole, f"most {twice}, as of two images under one name", "give each image a name of its own"),
+        (some, f"{int(n_twice[some].sum())} {twice}", "check the ids and X,Y,Z of these points"),
+    ):
+        if which.any():
+            yield 1, f"{name_some(np.array(points.view_names)[which])}: {reason}", advice
 
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
@@ -185,8 +176,7 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
     """Findings about views in which the points are spaced wider or closer than in most views."""
     if points.n_views < 2:
         return
-    order = np.argsort(points.view_index, kind="stable")
-    worlds = np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
+    worlds = worlds_by_view(points)
     step = _steps(worlds)
     # The spacing that most views have; of two equally common ones, the first view's.
     alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
@@ -221,8 +211,7 @@ def view_of_another_unit(points: Correspondences) -> str:
 
     The targets of the views may differ in size.
     """
-    order = np.argsort(points.view_index, kind="stable")
-    step = _steps(np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1]))
+    step = _steps(worlds_by_view(points))
     ratio = step / median(step)
     odd = int(np.argmax(np.abs(np.log(ratio))))
     factor = float(max(ratio[odd], 1 / ratio[odd]))
@@ -232,6 +221,12 @@ def view_of_another_unit(points: Correspondences) -> str:
     return f"the points of {points.view_names[odd]} lie {factor:.2g} times {how} than in most views" + (
         f", as with {unit} mixed" if unit else ""
     )
+
+
+def worlds_by_view(points: Correspondences) -> list[Array]:
+    """World points of each view."""
+    order = np.argsort(points.view_index, kind="stable")
+    return np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
 
 
 def _steps(worlds: list[Array]) -> Array:
@@ -290,10 +285,9 @@ def _rejected_points(calibration: Calibration) -> Iterator[Finding]:
         where.append(f"{len(rejected.views) - 2} more views")
     if views:
         where.append(", ".join(f"{count} in {name}" for name, count in list(views.items())[:3]))
-    if targets:
-        where.append(f"{name_some(targets)} in most views")
     advice = "look at the points and views that are listed as outliers"
     if targets:
+        where.append(f"{name_some(targets)} in most views")
         advice = "check X,Y,Z of the points that are outliers in most views"
     yield (
         max(_OUTLIERS.grade(len(lost) / total), int(bool(where))),

@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
@@ -27,7 +26,8 @@ from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.points import Correspondences
-from neurocal_cli.verdict.odd_points import units_mixed
+from neurocal_cli.verdict.odd_points import units_mixed, worlds_by_view
+from neurocal_cli.verdict.view_groups import variance_of_views
 
 # tests/test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
@@ -40,7 +40,7 @@ _REFINED = (0.03, 0.005, 0.001)  # distances in log s of three errors, for the m
 _FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
-# Rows and columns of omega's entries, and the weights of their products.
+# Rows and columns of omega's entries.
 _ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
@@ -99,11 +99,8 @@ def _axes(points: Correspondences) -> tuple[int, int] | None:
     if points.n_views < _FEWEST_VIEWS or np.bincount(points.view_index).min() < _FEWEST_POINTS:
         return None
     first, second = sorted(order[1:].tolist())
-    for k in range(points.n_views):
-        rows = points.view_index == k
-        if not (np.ptp(points.world[rows][:, [first, second]], axis=0) > 0).all():
-            return None
-    return (first, second) if points.pixels.std() > 0 else None
+    extents = np.array([np.ptp(world[:, [first, second]], axis=0) for world in worlds_by_view(points)])
+    return (first, second) if (extents > 0).all() and points.pixels.std() > 0 else None
 
 
 _Fit = tuple[Views, CameraState, float]  # the points, the camera with its poses, the squared error
@@ -126,11 +123,9 @@ class _Board:
         h = self.homographies[..., :2] / [s, 1.0]
         h /= np.linalg.norm(h, axis=(1, 2), keepdims=True)
         h1, h2 = h[..., 0], h[..., 1]
-        rows = np.concatenate([_product_of(h1, h2), _product_of(h1, h1) - _product_of(h2, h2)])
+        rows = np.concatenate([product_of(h1, h2), product_of(h1, h1) - product_of(h2, h2)])
         values, vectors = np.linalg.svd(rows, full_matrices=False)[1:]
-        omega = np.zeros((3, 3))
-        omega[_ROW, _COLUMN] = omega[_COLUMN, _ROW] = vectors[-1] * np.sign(vectors[-1, 0])
-        return omega, float(values[-1])
+        return omega_of(vectors[-1]), float(values[-1])
 
     def linear(self) -> float | None:
         """The s of least residual; None if there is a camera for none."""
@@ -217,10 +212,17 @@ def _homography(plane: Array, pixels: Array) -> Array:
     return H
 
 
-def _product_of(a: Array, b: Array) -> Array:
-    """Coefficients (V, 6) of a . omega b."""
+def product_of(a: Array, b: Array) -> Array:
+    """Coefficients (V, 6) of a . omega b, for omega's entries 11, 12, 22, 13, 23, 33."""
     other = np.where(_ROW == _COLUMN, 0.0, 1.0)
     return np.asarray(a[:, _ROW] * b[:, _COLUMN] + other * a[:, _COLUMN] * b[:, _ROW])
+
+
+def omega_of(entries: Array) -> Array:
+    """The matrix omega (3, 3) from these entries up to sign; the first one becomes positive."""
+    omega = np.zeros((3, 3))
+    omega[_ROW, _COLUMN] = omega[_COLUMN, _ROW] = entries * np.sign(entries[0])
+    return omega
 
 
 def _is_noise(fit: _Fit | None) -> bool:
@@ -228,6 +230,5 @@ def _is_noise(fit: _Fit | None) -> bool:
     if fit is None:
         return False
     views, state, cost = fit
-    unknowns = 6 * views.n_views + int(conditions_on_views(views, state).sum())
-    own = float(free_networks(views, state).sum()) / max(views.n_equations - unknowns, 1)
-    return cost / max(views.n_equations - 7 - 6 * views.n_views, 1) < _FLOOR * own
+    variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
+    return variance < _FLOOR * variance_of_views(views, state)

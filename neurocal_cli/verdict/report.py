@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.verdict.findings import two_digits
+
+# The main measures, in words.
+_FACTS: dict[str, Callable[[float], str]] = {
+    "held_out_px": "cross-validation error {:.3g} px".format,
+    "precision_px": "noise floor {:.3g} px".format,
+    "projection_px": lambda std: f"std of predicted pixels {two_digits(std)} px at most",
+    "depth_share": lambda std: f"std of triangulated depth {100 * std:.2g} % of the depth",
+    "coverage": lambda share: f"{100 * share:.0f} % of the image covered",
+}
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
@@ -33,15 +43,4 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
 def facts(verdict: Verdict) -> str:
     """The main measures of a verdict in one line."""
     m = verdict.measures
-    texts = (("held_out_px", "cross-validation error"), ("precision_px", "noise floor"))
-    found = [f"{text} {m[name]:.3g} px" for name, text in texts if math.isfinite(m.get(name, math.nan))]
-    predicted = m.get("projection_px", math.nan)
-    if math.isfinite(predicted):
-        found.append(f"std of predicted pixels {two_digits(predicted)} px at most")
-    depth = m.get("depth_share", math.nan)
-    if math.isfinite(depth):
-        found.append(f"std of triangulated depth {100 * depth:.2g} % of the depth")
-    coverage = m.get("coverage", math.nan)
-    if math.isfinite(coverage):
-        found.append(f"{100 * coverage:.0f} % of the image covered")
-    return ", ".join(found)
+    return ", ".join(text(m[name]) for name, text in _FACTS.items() if math.isfinite(m.get(name, math.nan)))

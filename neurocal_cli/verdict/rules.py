@@ -22,7 +22,7 @@ from neurocal_cli.verdict.findings import (
     verdict_of,
 )
 from neurocal_cli.verdict.given_parameters import Doubt, Reestimated, told_apart
-from neurocal_cli.verdict.odd_points import normalised, odd_pixels, odd_points
+from neurocal_cli.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.verdict.proportions import MEASURE_AXES, unlike_axes
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
@@ -80,7 +80,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
-    if normalised(calibration.points):  # the other rules are in pixels
+    if are_normalised(calibration.points):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
     if _oblong(calibration):  # a target stretched in one direction makes views differ as well
@@ -108,17 +108,16 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
 
 
 def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    spread = pixel_spread(calibration.points)
-    pairing = "check that each pixel belongs to its point, and that X,Y,Z are those of the true target"
+    spread, diagonal = pixel_spread(calibration.points), image_diagonal(calibration.points)
     yield (
-        ERROR.grade(e.rmse_px / image_diagonal(calibration.points)),
+        ERROR.grade(e.rmse_px / diagonal),
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
-        pairing,
+        "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
     )
     # Given poses that are wrong leave such errors as well, so they are not excused.
-    estimated = calibration.target is not None and calibration.type != 4
-    flexes = estimated and _by_flexing(e, image_diagonal(calibration.points))
-    if e.rmse_px > 1e-4 * spread and not flexes:
+    flexes = calibration.target is not None and calibration.type != 4 and _by_flexing(e, diagonal)
+    unexcused = e.rmse_px > 1e-4 * spread and not flexes
+    if unexcused:
         yield (
             _CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
@@ -141,7 +140,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "flat",
         )
         yield (
-            _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread and not flexes else 0,
+            _CORRELATION.grade(e.correlation) if unexcused else 0,
             f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
             "model or the target does not fit",
             "try another --distortion, or measure the target",
@@ -221,7 +220,7 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    if calibration.type in (3,):
+    if calibration.type == 3:
         return
     cover = e.coverage
     if np.isfinite(cover.image):

@@ -96,7 +96,7 @@ def view_change(
         name: np.bincount(group, values) / np.bincount(group) for name, values in _of_poses(views, state)
     }
     found: list[ViewChange] = []
-    for what, step in _directions(views, state, free):
+    for what, step in directions(views, state, free):
         test = _ScoreTest.of(scores, step[free], variance)
         for pattern, members, amount, sigmas in _patterns(test, lines):
             names = tuple(views.names[k] for k in order if members[group[k]])
@@ -118,7 +118,7 @@ def _of_poses(views: Views, state: CameraState) -> Iterator[tuple[str, Array]]:
             yield f"tilt along {name}", normal[:, axis]
 
 
-def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
+def directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
     """Steps of A's entries and the coefficients for a unit change, by the name of what changes."""
     focal, size = np.zeros((2, len(free)))
     focal[:3] = size[:3] = state.entries[0, :3]

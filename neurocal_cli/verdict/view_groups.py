@@ -102,6 +102,12 @@ def view_groups(
     )
 
 
+def variance_of_views(views: Views, state: CameraState) -> float:
+    """Variance of the residuals with a separate camera for each view, normalised."""
+    unknowns = int((6 + conditions_on_views(views, state)).sum())
+    return float(free_networks(views, state).sum()) / max(views.n_equations - unknowns, 1)
+
+
 @frozen_dataclass(eq=False)
 class _Split:
     member: NDArray[np.bool_]
