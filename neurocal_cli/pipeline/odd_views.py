@@ -102,7 +102,7 @@ def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
         state = cameras_from_products(problem, groups, problem.normalised_entries[None])
     except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
         return None
-    return in_pixels(problem, state)
+    return in_pixels(*problem.as_seen(state))
 
 
 def _fit(
