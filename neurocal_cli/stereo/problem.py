@@ -45,8 +45,6 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     alone, paired_right = np.flatnonzero(frame < 0), np.flatnonzero(frame >= 0)
     paired = frame[paired_right]
     frame[alone] = n_left + np.arange(len(alone))
-    in_both = np.zeros(n_left + len(alone), dtype=bool)
-    in_both[paired] = True
     centre = np.concatenate([arranged[0].centre, arranged[1].centre[alone]])
     scale = np.concatenate([arranged[0].scale, arranged[1].scale[alone]])
     sides = [
@@ -63,7 +61,6 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
         names=names,
         centre=centre,
         scale=scale,
-        in_both=in_both,
         unit=float(median(scale)),
         observations=(replace(sides[0][0], weight=weights[0]), replace(sides[1][0], weight=weights[1])),
         cameras=(sides[0][1], sides[1][1]),
@@ -100,9 +97,7 @@ def _side(
     normal = normal_blocks(batches, state)[0]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
     noise = float(np.sqrt(normal[:, -1, -1].sum() / max(spare, 1)))
-    observed = Observations(
-        batches, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
-    )
+    observed = Observations(batches, frame, views.pixel_centre, views.pixel_scale, 1.0, views.n_equations)
     return observed, state, normal, noise
 
 

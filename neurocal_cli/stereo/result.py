@@ -103,7 +103,7 @@ class _RigAssembly:
         left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
         pose = Pose(state.R, state.t * problem.unit)
         covariance, std = self._rig_covariance(pose)
-        n_points = sum(observed.n_points for observed in problem.observations)
+        n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
         return Rig(
             left,
             right,
@@ -113,7 +113,7 @@ class _RigAssembly:
             tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
             dict(left_out),
             rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
-            max_px=float(np.sqrt(max(part.max() for part in squares))),
+            max_px=max(left.max_px, right.max_px),
             converged=left.converged,
             stop_reason=left.stop_reason,
             iterations=self.fit.iterations,
@@ -162,7 +162,7 @@ class _RigAssembly:
                              int(batches.counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip
-        rmse = float(np.sqrt(sums.sum() / observed.n_points))
+        rmse = float(np.sqrt(sums.sum() / batches.counts.sum()))
         return replace(
             given,
             views=views,
