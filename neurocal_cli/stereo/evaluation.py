@@ -136,7 +136,12 @@ class _Evaluator:
         self.points = points or (cameras[0].points, cameras[1].points)
         if self.given:
             for camera, given in zip(cameras, self.points, strict=True):
-                _refuse_other(camera, given)
+                refuse_another_size(camera, given)
+                if given.unit != camera.unit:
+                    raise InputError(
+                        f"{given.source} is in {given.unit}, but the calibration in {camera.unit}; give both "
+                        "in one unit"
+                    )
                 self.warnings += [why] if (why := undistorted_before(given, camera)) else []
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
@@ -149,7 +154,8 @@ class _Evaluator:
 
     def evaluation(self) -> StereoEvaluation:
         """The errors of all points, through the poses of the views and through the rig."""
-        rig, by_view, through = self.rig, self._by_view(), None
+        rig, pairs, through = self.rig, self.views.both, None
+        by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
         judgement: Callable[[], Verdict | None] = self._judgement
         if rig is not None:
             poses, used = self._poses_on(rig), self._used(rig)
@@ -168,7 +174,7 @@ class _Evaluator:
             by_view,
             through,
             float("nan") if rig is None else rig.baseline,
-            self.views.both,
+            pairs,
             (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
             (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
@@ -200,10 +206,6 @@ class _Evaluator:
             fits.append(fit)
         return fits[0], fits[1]
 
-    def _by_view(self) -> SpaceError:
-        """Errors with the two poses of each view."""
-        return self._error(*self._own_poses(self.views.both), np.ones(len(self.views.both), dtype=bool))
-
     def _own_poses(self, pairs: Sequence[tuple[str, str]]) -> tuple[list[Pose], list[Pose]]:
         """Poses of views in the left camera, and the relative pose of the cameras by each of them."""
         first, rigs, new = [], [], set(self.new)
@@ -229,8 +231,8 @@ class _Evaluator:
     def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""
         verdict = self._judgement()
-        if verdict is None or not len(rig.left.points):
-            return verdict
+        if verdict is None:
+            return None
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
         seen = residuals[np.isfinite(residuals)]
         rmse_px = float(np.sqrt((seen**2).mean())) if seen.size else np.nan
@@ -301,12 +303,3 @@ class _Evaluator:
         triangulated = np.where(found.behind[:, None], np.nan, found.points)
         K = self.cameras[0].intrinsics
         return space_error(triangulated, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)
-
-
-def _refuse_other(camera: Calibration, points: Correspondences) -> None:
-    refuse_another_size(camera, points)
-    if points.unit != camera.unit:
-        raise InputError(
-            f"{points.source} is in {points.unit}, but the calibration in {camera.unit}; give both in one "
-            "unit"
-        )

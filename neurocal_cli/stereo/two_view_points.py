@@ -152,9 +152,8 @@ class PointBatch:
         x_r, y_r = h0 * q, h1 * q
         u, v, (ux, uy, vx, vy) = self._image(1, x_r, y_r)
         by_u, by_v = [], []
-        for n in range(3):
-            down = self.t[2] if n == 2 else self.R[2][n]
-            across, along = (self.t[k] if n == 2 else self.R[k][n] for k in (0, 1))
+        by_state = [[*row[:2], t] for row, t in zip(self.R, self.t, strict=True)]  # of h, by x, y, w
+        for across, along, down in zip(*by_state, strict=True):
             dx, dy = (across - x_r * down) * q, (along - y_r * down) * q
             by_u.append(ux * dx + uy * dy)
             by_v.append(vx * dx + vy * dy)
