@@ -11,7 +11,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.setting_normals import Constants
+from neurocal_cli.zoom_lens.setting_normals import Constants, coefficients_of
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
@@ -54,10 +54,9 @@ def camera_at(
             f"the lens does not determine the camera at {describe(lens.controls, setting)}: the std of the "
             f"focal length is {100 * share:.3g} % of its value; choose a setting nearer to those of the fit"
         )
-    model = coefficient_names(lens.model)
-    L, K = len(lens.names), len(model)
+    L = len(lens.names)
     has_theta = prediction.covariance.shape[1] > L and lens.free_theta
-    free = ["alpha_u", "alpha_v", "u0", "v0", *(["theta"] if has_theta else []), *model]
+    free = [*lens.names[:4], *(["theta"] if has_theta else []), *coefficient_names(lens.model)]
     place = {name: k for k, name in enumerate(lens.names)} | {"theta": L}
     order = [place[name] for name in free]
     spread = {name: float(std[place[name]]) for name in free}
@@ -79,7 +78,7 @@ def camera_at(
         rmse_px=float("nan"),
         max_px=float("nan"),
         distortion_model=lens.model,
-        distortion=values[L - K :].copy() if K else np.zeros(0),
+        distortion=coefficients_of(values, lens.model).copy(),
         covariance=prediction.covariance[0][np.ix_(order, order)],
         covariance_names=tuple(free),
         camera_name=camera_name,

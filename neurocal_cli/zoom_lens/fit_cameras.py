@@ -67,16 +67,17 @@ class LensCameras:
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
         if not (np.isfinite(settings).all() and np.isfinite(local).all()):
             raise InputError(f"{source}: the settings and parameters must be finite numbers; correct them")
-        if not (local[:, :2] > 0).all():
-            row = int(np.argmin((local[:, :2] > 0).all(axis=1)))
+        positive = (local[:, :2] > 0).all(axis=1)
+        if not positive.all():
+            row = int(np.argmin(positive))
             raise InputError(f"{source}, row {row + 1}: alpha_u and alpha_v must be positive")
         moves = np.ptp(settings, axis=0) > 0
         if not moves.any():
             raise InputError(f"{source}: all cameras are at one setting; give cameras at several settings")
         controls = tuple(name for name, moving in zip(controls, moves, strict=True) if moving)
-        order = np.lexsort(settings[:, moves].T[::-1])
-        moving_settings = settings[order][:, moves]
-        return cls(controls, moving_settings, names, local[order], image_size, unit, source, model, theta)
+        settings = settings[:, moves]
+        order = np.lexsort(settings.T[::-1])
+        return cls(controls, settings[order], names, local[order], image_size, unit, source, model, theta)
 
 
 def fit_lens_cameras(
