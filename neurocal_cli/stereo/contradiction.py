@@ -113,11 +113,11 @@ def contradiction(
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
     found = _best(poses, used)
-    odd = np.zeros_like(used)
     if seek_odd and is_significant(_squares(poses, used), _degrees(used)):
         odd = odd_pairs(poses, used)
-    if odd.any() and (_score(poses, used & ~odd, None, 6 * int(odd.sum())) < _score(poses, used, found)):
-        return _as_contradiction(poses, used & ~odd, _best(poses, used & ~odd), odd)
+        rest = used & ~odd
+        if odd.any() and _score(poses, rest, None, 6 * int(odd.sum())) < _score(poses, used, found):
+            return _as_contradiction(poses, rest, _best(poses, rest), odd)
     return _as_contradiction(poses, used, found, np.zeros_like(used))
 
 

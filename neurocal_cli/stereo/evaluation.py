@@ -158,7 +158,7 @@ class _Evaluator:
         by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
         judgement: Callable[[], Verdict | None] = self._judgement
         if rig is not None:
-            poses, used = self._poses_on(rig), self._used(rig)
+            poses, used = self._poses_on(rig), np.array([pair not in rig.left_out for pair in pairs])
             # None if all views contradict the rig.
             through = self._error(poses, [rig.pose], used) if used.any() else None
             if self.given:
@@ -224,10 +224,6 @@ class _Evaluator:
             poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
         return [poses[a] for a, _ in self.views.both]
 
-    def _used(self, rig: Rig) -> NDArray[np.bool_]:
-        """(V,) which views do not contradict the rig."""
-        return np.array([pair not in rig.left_out for pair in self.views.both])
-
     def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""
         verdict = self._judgement()
@@ -276,10 +272,9 @@ class _Evaluator:
 
     def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
         """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
-        used = self._used(rig)
         if side == 1:
             poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]
-        place = {pair[side]: k for k, pair in enumerate(self.views.both) if used[k]}
+        place = {pair[side]: k for k, pair in enumerate(self.views.both) if pair not in rig.left_out}
         points = self.points[side]
         some = points.select(np.array([name in place for name in points.view_names])[points.view_index])
         camera = self.cameras[side].camera

@@ -9,7 +9,7 @@ then compares the relative poses with their covariances, and tells whether the r
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class SoundPairs:
 
     problem: RigProblem  # of all pairs
     rig: Pose  # the rig of most pairs, the start of an adjustment
-    left_out: Mapping[Pair, str] = field(default_factory=dict)  # pairs that do not determine it, and why
+    left_out: Mapping[Pair, str]  # pairs that do not determine it, and why
     moved: str = ""  # message about a rig that moved between two pairs
     by_chance: bool = False  # whether the pairs differ by no more than chance
 

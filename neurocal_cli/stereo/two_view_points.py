@@ -88,16 +88,14 @@ class PointBatch:
         """One step of each point, halved where it raises the error."""
         x, y, w = (value + change for value, change in zip(state, step, strict=True))
         N_new, new = self._normal(x, y, w)
-        worse = ~(new <= cost * RISE + ROUNDING)
         length = 1.0
-        while worse.any() and length > 1e-3:
+        while (worse := ~(new <= cost * RISE + ROUNDING)).any() and length > 1e-3:
             length *= 0.5
             x, y, w = (
                 np.where(worse, value + length * change, now)
                 for value, change, now in zip(state, step, (x, y, w), strict=True)
             )
             N_new, new = self._normal(x, y, w)
-            worse = ~(new <= cost * RISE + ROUNDING)
         if worse.any():
             x, y, w = (np.where(worse, old, now) for old, now in zip(state, (x, y, w), strict=True))
             N_new, new = (

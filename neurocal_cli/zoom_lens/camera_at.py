@@ -11,9 +11,9 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.setting_normals import Constants, coefficients_of
+from neurocal_cli.zoom_lens.setting_normals import coefficients_of
 from neurocal_cli.zoom_lens.settings import describe
-from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+from neurocal_cli.zoom_lens.zoom_lens import Prediction, ZoomLens
 
 _VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 
@@ -67,7 +67,7 @@ def camera_at(
         intrinsics=Intrinsics(values[0], values[1], values[2], values[3], theta),
         std=spread,
         fixed=frozenset() if has_theta else frozenset({"theta"}),
-        views=_views(lens, values, prediction.constants, prediction.covariance[0]),
+        views=_views(lens, prediction),
         points=Correspondences.none(lens.image_size, lens.unit),
         type=1,
         method="lens",
@@ -86,11 +86,12 @@ def camera_at(
     )
 
 
-def _views(lens: ZoomLens, local: Array, constants: Constants, covariance: Array) -> dict[str, ViewResult]:
+def _views(lens: ZoomLens, prediction: Prediction) -> dict[str, ViewResult]:
     """The pose of a still camera as one view."""
     if not lens.still:
         return {}
-    R, t, L = constants.R, constants.t, len(lens.names)
+    R, t, L = prediction.constants.R, prediction.constants.t, len(lens.names)
+    local, covariance = prediction.local[0], prediction.covariance[0]
     angles = euler_jacobian(R) @ covariance[L + 1 : L + 4, L + 1 : L + 4] @ euler_jacobian(R).T
     variances = [*np.diagonal(angles), *np.diagonal(covariance)[L + 4 : L + 6], covariance[4, 4]]
     std = dict(zip(POSE_NAMES, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError, check_seed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -16,11 +15,10 @@ from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
 from neurocal_cli.zoom_lens.result import refuse_gaps
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables, local_names
 from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
-_INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach
 
 
@@ -53,16 +51,14 @@ class LensCameras:
         A missing column, impossible values, and one setting only are errors.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
-        coefficients = coefficient_names(model)
-        missing = [name for name in (*_INTRINSIC, *coefficients) if columns.get(name) is None]
+        missing = [name for name in local_names(False, model) if columns.get(name) is None]
         if not controls or missing:
             lacking = missing[0] if missing else "zoom or focus"
             raise InputError(
                 f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, "
                 "alpha_u, alpha_v, u0, v0"
             )
-        t_z = ["t_z"] if columns.get("t_z") is not None else []
-        names = (*_INTRINSIC, *t_z, *coefficients)
+        names = local_names(columns.get("t_z") is not None, model)
         settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
         if not (np.isfinite(settings).all() and np.isfinite(local).all()):

@@ -89,10 +89,9 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     # The linearisation fails for a member now and then, so the median counts.
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
-    tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
-    return replace(finished, warnings=_warnings(finished, start, tables_rms))
+    return replace(finished, warnings=_warnings(finished, start))
 
 
 def _refuse_contradiction(lens: ZoomLens, each: Array, points: Correspondences) -> None:
@@ -121,7 +120,7 @@ def refuse_gaps(lens: ZoomLens, source: str) -> None:
         ) from error
 
 
-def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> tuple[str, ...]:
+def _warnings(lens: ZoomLens, start: CalibratedSettings) -> tuple[str, ...]:
     warnings = []
     alone = int((~start.static.good).sum())
     if alone:
@@ -133,6 +132,7 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> t
     for rejected in lens.rejected:
         where = describe(lens.controls, np.array(rejected.setting))
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
+    tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     if lens.rmse_px > _POOR_FIT * tables_rms:
         warnings.append(
             f"the error of the networks is {lens.rmse_px:.3g} px, that of separate settings {tables_rms:.3g} "

@@ -21,6 +21,7 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camer
 from neurocal_cli.bundle_adjustment.units import translations, translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.least_squares.schur_complement import eliminate
@@ -58,8 +59,7 @@ class Normal:
     def blocks(self) -> Array:
         """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
         g = self.g[..., None]
-        below = np.concatenate([np.swapaxes(g, 1, 2), self.cost[:, None, None]], axis=2)
-        return np.concatenate([np.concatenate([self.H, g], axis=2), below], axis=1)
+        return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
 
 
 @frozen_dataclass(eq=False)
@@ -70,6 +70,11 @@ class Tables:
     constants: Constants
     normal: Normal  # linearised there; for known cameras: of the squared errors over the networks' scatter
     converged: bool = True
+
+
+def local_names(with_t_z: bool, model: str) -> tuple[str, ...]:
+    """Names of the local parameters with a distortion model."""
+    return (*INTRINSIC_NAMES[:4], *(("t_z",) if with_t_z else ()), *coefficient_names(model))
 
 
 def coefficients_of(local: Array, model: str) -> Array:
@@ -96,8 +101,7 @@ class PixelData:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the local parameters."""
-        t_z = ("t_z",) if self.still else ()
-        return ("alpha_u", "alpha_v", "u0", "v0", *t_z, *coefficient_names(self.model))
+        return local_names(self.still, self.model)
 
     @property
     def n_shared(self) -> int:

@@ -80,16 +80,12 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
     """One setting; without distortion where its points do not determine it."""
-
-    def calibrated(model: str) -> Calibration:
-        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
-
     try:
-        return calibrated(model)
+        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
     except DegenerateGeometryError:
         if model == "none":
             raise
-        return calibrated("none")
+        return _calibrate(points, "none", seed, skew)
 
 
 def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
