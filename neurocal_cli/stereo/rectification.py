@@ -98,17 +98,16 @@ def _scale(
 ) -> float:
     """Factor of the focal length."""
     last = np.array(size, dtype=float) - 1
-    pixels = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, _GRID)] * 2), axis=-1).reshape(-1, 2) * last
+    grid = np.linspace(0.0, 1.0, _GRID)
+    pixels = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) * last
     room = np.array([centre, last - centre])  # to the left and top, to the right and bottom
     fill, hold = [], []
     for camera, R in cameras:
         image = f * _rectified(camera, R, pixels).clip(-_WIDEST, _WIDEST).reshape(_GRID, _GRID, 2)
         # What is behind sets no limit.
-        left, top = (np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1]))
-        right, bottom = (
-            np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])
-        )
-        inner = np.array([[left, top], [right, bottom]])
+        near = [np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1])]
+        far = [np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])]
+        inner = np.array([near, far])
         outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])
         signs = np.array([[-1.0], [1.0]])
         fill.append((room / (signs * inner)).max())

@@ -116,12 +116,11 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     problem = rig_problem(left, right, views)
     consensus = find_consensus(problem)
     reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))
-    # A fault that has a name is certain. The others may belong to a rig that moved.
-    named = {pair: reason for pair, reason in reasons.items() if reason not in ("", UNSYNCHRONISED)}
     found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
     poses = relative_poses(problem, consensus.rig)
     if poses is not None:
-        used = np.array([pair not in named for pair in poses.names])
+        # A fault that has a name is certain. The others may belong to a rig that moved.
+        used = np.array([reasons[pair] in ("", UNSYNCHRONISED) for pair in poses.names])
         found = _explained(poses, used, found)
     found = _with_shifted(left, right, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
