@@ -164,7 +164,7 @@ def _larger_part(
 
 
 def describe_move(
-    names: Sequence[Pair], size: Array, why: Contradiction, kept: Sequence[Pair] = ()
+    names: Sequence[Pair], size: Array, why: Contradiction, kept: Sequence[Pair]
 ) -> tuple[str, str]:
     """Describe a rig that has two geometries, the second from some pair on, with advice.
 

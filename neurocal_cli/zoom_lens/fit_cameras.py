@@ -98,9 +98,8 @@ def fit_lens_cameras(
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)
-    low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
-    x = scaled_controls(cameras.settings, low, high)
-    L, S = len(cameras.names), len(x)
+    x = scaled_controls(cameras.settings, cameras.settings.min(axis=0), cameras.settings.max(axis=0))
+    S = len(x)
     members = fit_committee(
         x,
         cameras.names,
@@ -113,11 +112,11 @@ def fit_lens_cameras(
     )
     constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
     table = Tables(cameras.local, constants, _error_normal(members, x, cameras.local))
-    warnings: list[str] = []
+    warnings: tuple[str, ...] = ()
     if too_few(S, len(cameras.controls)):
-        warnings.append(
+        warnings = (
             f"{S} cameras are too few to tell their errors from the changes of the lens, so the standard "
-            "deviations may be far too large; give at least 5 values of each control"
+            "deviations may be far too large; give at least 5 values of each control",
         )
     lens = ZoomLens(
         controls=cameras.controls,
@@ -130,7 +129,7 @@ def fit_lens_cameras(
         tables=table,
         static=table,
         variance=1.0,
-        scatter=np.zeros(L),
+        scatter=np.zeros(len(cameras.names)),
         free_theta=cameras.theta != np.pi / 2,
         counts=np.zeros(S, dtype=np.int64),
         rmse=np.full(S, np.nan),
@@ -141,7 +140,7 @@ def fit_lens_cameras(
         converged=True,
         image_size=cameras.image_size,
         unit=cameras.unit,
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
     refuse_gaps(lens, cameras.source)
     return lens

@@ -90,8 +90,8 @@ class PixelData:
     setting: NDArray[np.int64]  # (V,)
     n_settings: int
     still: bool  # whether neither the camera nor the target moves
-    model: str = "none"  # of the distortion
-    free_theta: bool = True
+    model: str  # of the distortion
+    free_theta: bool
 
     @classmethod
     def of(cls, lens: LensPoints, still: bool, model: str, free_theta: bool) -> PixelData:
