@@ -41,7 +41,6 @@ class Observations:
     pixel_centre: Array  # (2,) [px]
     pixel_scale: float  # S1 [px]
     weight: float  # of a squared normalised residual, (pixel_scale / sigma)^2, so that residuals are whitened
-    n_points: int
     n_equations: float  # two for most points; one where a point was measured in one direction only
 
     @property
@@ -126,7 +125,6 @@ class RigProblem:
     names: tuple[tuple[str, ...], tuple[str, ...]]  # views of each camera, in the order of its observations
     centre: Array  # (V, 3) world = centre + scale * local
     scale: Array  # (V,)
-    in_both: NDArray[np.bool_]  # (V,) whether the view is of both cameras
     unit: float  # of the rig's translation [world unit]
     observations: tuple[Observations, Observations]
     cameras: tuple[CameraState, CameraState]  # as calibrated alone, with the poses of the views
@@ -156,7 +154,7 @@ class RigProblem:
         R = np.concatenate([left.R, np.zeros((len(self.scale) - len(left.R), 3, 3))])
         t = np.concatenate([left.t, np.zeros((len(R) - len(left.t), 3))])
         view = self.observations[1].view
-        alone = np.flatnonzero(~self.in_both[view])
+        alone = view >= len(left.R)
         R[view[alone]], t[view[alone]] = right.R[alone], right.t[alone]
         return RigState(self.cameras, rig.R.copy(), rig.t / self.unit, R, t)
 
@@ -165,7 +163,7 @@ class RigProblem:
         view = self.observations[side].view
         R, t = state.view_R[view], state.view_t[view]
         if side == 1:
-            both = self.in_both[view][:, None]
+            both = (view < len(self.names[0]))[:, None]
             baseline = state.t * (self.unit / self.scale[view])[:, None]
             R, t = np.where(both[..., None], state.R @ R, R), np.where(both, t @ state.R.T + baseline, t)
         return replace(state.cameras[side], R=R, t=t)
@@ -200,19 +198,27 @@ class RigProblem:
         T[:, own, place] = 1.0
         T[:, -1, -1] = 1.0
         pose = np.arange(POSE.start, POSE.stop)
-        both = self.in_both[views] if side == 1 else np.zeros(len(views), dtype=bool)
-        alone, which = np.flatnonzero(~both), np.flatnonzero(both)
+        through = (views < len(self.names[0])) & (side == 1)
+        alone, which = np.flatnonzero(~through), np.flatnonzero(through)[:, None, None]
         T[alone[:, None], pose, columns.pose] = 1.0
-        if which.size:
-            view = views[which]
-            by_rig, by_pose = np.zeros((len(which), 6, 6)), np.zeros((6, 6))
-            by_rig[:, :3, :3] = np.eye(3)
-            by_rig[:, 3:, :3] = -cross_matrix(state.view_t[view] @ state.R.T)
-            by_rig[:, 3:, 3:] = np.eye(3) * (self.unit / self.scale[view])[:, None, None]
-            by_pose[:3, :3] = by_pose[3:, 3:] = state.R
-            T[which[:, None, None], pose[:, None], columns.rig] = by_rig
-            T[which[:, None, None], pose[:, None], columns.pose] = by_pose
+        view = views[through]
+        by_rig, by_pose = steps_through(state.R, state.view_t[view] @ state.R.T, self.unit / self.scale[view])
+        T[which, pose[:, None], columns.rig] = by_rig
+        T[which, pose[:, None], columns.pose] = by_pose
         return T
+
+
+def steps_through(R: Array, centre: Array, unit: Array) -> tuple[Array, Array]:
+    """Derivatives (P, 6, 6) of w', tau' by w, tau, and those by w_k, tau_k, of the shape of R (..., 3, 3).
+
+    `centre` (P, 3) are R t_k, and `unit` (P,) is the rig's unit of length in that of each view.
+    """
+    by_rig, by_pose = np.zeros((len(unit), 6, 6)), np.zeros((*R.shape[:-2], 6, 6))
+    by_rig[:, :3, :3] = np.eye(3)
+    by_rig[:, 3:, :3] = -cross_matrix(centre)
+    by_rig[:, 3:, 3:] = np.eye(3) * unit[:, None, None]
+    by_pose[..., :3, :3] = by_pose[..., 3:, 3:] = R
+    return by_rig, by_pose
 
 
 @frozen_dataclass(eq=False)

@@ -25,8 +25,7 @@ from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
 from neurocal_cli.stereo.contradiction import FOCAL, Contradiction, contradiction
-from neurocal_cli.stereo.covariance import rig_covariance
-from neurocal_cli.stereo.given_cameras import covariance_by_given
+from neurocal_cli.stereo.covariance import covariance_by_given, rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses
@@ -56,6 +55,8 @@ _DEPTH = Limit(0.01, 0.05)  # std over the depth
 _BASELINE = Limit(0.01, 0.05)  # std over the baseline
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the pairs
 
+# When the right images were taken, and towards which pair's place they show the target.
+_MOTIONS = {"late": ("later", "to the next"), "early": ("earlier", "back to the previous")}
 _MOMENT = (
     "trigger both cameras at the same moment, or hold the target still; check that the cameras are fixed"
 )
@@ -70,7 +71,8 @@ _LEAST_STEP = 1e-9
 class _Evidence:
     """Measures of a rig's quality; nan and None if a view does not determine its pose."""
 
-    cameras: tuple[Verdict | None, Verdict | None]  # by their own points
+    # Side of each camera, whether something of it was given, and the verdict by its own points.
+    cameras: list[tuple[str, bool, Verdict]]
     names: tuple[tuple[str, str], ...]  # of all pairs, in order
     size: Array  # (P,) of each pair's target [world unit]
     moved: Contradiction | None = None  # of all pairs, if the rig moved
@@ -104,7 +106,11 @@ def assess_rig(rig: Rig) -> Verdict | None:
 
 def _evidence(rig: Rig) -> _Evidence:
     pairs = (*rig.pairs, *rig.left_out)
-    cameras = assess(rig.left), assess(rig.right)
+    cameras = [
+        (side, camera.type != 1, verdict)
+        for side, camera in (("left", rig.left), ("right", rig.right))
+        if (verdict := assess(camera)) is not None
+    ]
     poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs)), rig.pose)
     if poses is None:
         return _Evidence(cameras, pairs, np.zeros(0))
@@ -206,25 +212,18 @@ def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
     # A camera that is poor by itself, or was given wrong, spoils the pairs, so it is named before them.
-    for given, verdict, side in _cameras(rig, e):
+    for side, given, verdict in e.cameras:
         if verdict.reasons and (given or verdict.word == "poor"):
             advice = verdict.advice[0] if verdict.advice else ""
             yield WORDS.index(verdict.word), f"{side} camera: {verdict.reasons[0]}", advice
     yield from _pairs(rig, e)
     yield from _precision(rig, e)
-    for _, verdict, side in _cameras(rig, e):
+    for side, _, verdict in e.cameras:
         # Reasons and advice come the worst first.
         for k, reason in enumerate(verdict.reasons):
             yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
         for k, advice in enumerate(verdict.advice):
             yield (1 if k else WORDS.index(verdict.word)), "", advice
-
-
-def _cameras(rig: Rig, e: _Evidence) -> Iterator[tuple[bool, Verdict, str]]:
-    """Whether something of each camera was given, its verdict by its own points, and its side."""
-    for camera, verdict, side in zip((rig.left, rig.right), e.cameras, ("left", "right"), strict=True):
-        if verdict is not None:
-            yield camera.type != 1, verdict, side
 
 
 def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
@@ -245,7 +244,7 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     found = e.contradiction
     if found is None:
         return
-    if found.kind in (*FOCAL, "late", "early"):
+    if found.kind in (*FOCAL, *_MOTIONS):
         yield _changed(e, found)
         return
     if found.kind in TWO_GEOMETRIES:
@@ -271,10 +270,8 @@ def _rig_moved(rig: Rig, e: _Evidence, found: Contradiction) -> Finding:
 def _changed(e: _Evidence, found: Contradiction) -> Finding:
     """Finding about a focal length that changed, or images taken at different moments."""
     grade = _CHANGE.grade(found.gain)
-    if found.kind in ("late", "early"):
-        sense, way = {"late": ("later", "to the next"), "early": ("earlier", "back to the previous")}[
-            found.kind
-        ]
+    if found.kind in _MOTIONS:
+        sense, way = _MOTIONS[found.kind]
         return (
             grade,
             f"the two cameras were not triggered at the same moment: the right images were taken {sense}, as "

@@ -44,11 +44,8 @@ _SUSPECT = 60.0
 _OWN_SHARE = 3.0
 _MOST_STARTS = 40
 _STEPS = 10  # most concentration steps; fewer suffice
-FOCAL = {
-    "left focal": (0,),
-    "right focal": (1,),
-    "both focal": (0, 1),
-}  # the cameras whose focal length changed
+# The cameras whose focal length changed.
+FOCAL = {"left focal": (0,), "right focal": (1,), "both focal": (0, 1)}
 
 
 @frozen_dataclass(eq=False)
@@ -116,11 +113,11 @@ def contradiction(
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
     found = _best(poses, used)
-    odd = np.zeros_like(used)
     if seek_odd and is_significant(_squares(poses, used), _degrees(used)):
         odd = odd_pairs(poses, used)
-    if odd.any() and (_score(poses, used & ~odd, None, 6 * int(odd.sum())) < _score(poses, used, found)):
-        return _as_contradiction(poses, used & ~odd, _best(poses, used & ~odd), odd)
+        rest = used & ~odd
+        if odd.any() and _score(poses, rest, None, 6 * int(odd.sum())) < _score(poses, used, found):
+            return _as_contradiction(poses, rest, _best(poses, rest), odd)
     return _as_contradiction(poses, used, found, np.zeros_like(used))
 
 
@@ -128,19 +125,16 @@ def _as_contradiction(
     poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | None, odd: NDArray[np.bool_]
 ) -> Contradiction:
     n, squares = _degrees(used), _squares(poses, used)
-    equations = poses.spare + max(n, 0)
-    growth = float(np.sqrt((poses.spare + squares) / equations))
+    growth = float(np.sqrt((poses.spare + squares) / (poses.spare + n)))
     scatter = float(np.sqrt(squares / n)) if n else 0.0
     none = np.zeros((2, poses.design.shape[2]))
     if found is None:
         return Contradiction("odd" if odd.any() else "", 0, 0.0, n, odd, scatter, scatter, 0.0, growth, none)
     left = max(squares - found.gain, 0.0) / max(n - len(found.values), 1)
     amount = float(found.values[0]) if found.kind in ("late", "early") else 0.0
-    for side, kind in enumerate(("left focal", "right focal")):
-        if found.kind == kind:
-            amount = float(np.mean(found.values / _focal(poses, side)))
-    if found.kind == "both focal":
-        amount = float(np.mean(found.values))
+    if found.kind in FOCAL:
+        size = 1.0 if found.kind == "both focal" else _focal(poses, FOCAL[found.kind][0])
+        amount = float(np.mean(found.values / size))
     if found.kind == "size":
         baseline = poses.reference + (poses.solution(used) - found.shift[0])[poses.rig[3:]]
         amount = float(found.values[0] * (poses.reference @ baseline) / max(baseline @ baseline, 1e-300))
@@ -159,7 +153,7 @@ def _squares(poses: RelativePoses, used: NDArray[np.bool_]) -> float:
     S, g = poses.normal(used)
     solved = solve_scaled(S, g[:, None])[:, 0]
     alone = poses.cameras.g.sum(axis=0)[:-6]
-    own = solve_scaled(poses.cameras.S.sum(axis=0)[:-6, :-6], alone[:, None])[:, 0] if len(alone) else alone
+    own = solve_scaled(poses.cameras.S.sum(axis=0)[:-6, :-6], alone[:, None])[:, 0]
     return max(float(poses.pairs.cost[used].sum() - g @ solved + alone @ own), 0.0)
 
 

@@ -136,7 +136,12 @@ class _Evaluator:
         self.points = points or (cameras[0].points, cameras[1].points)
         if self.given:
             for camera, given in zip(cameras, self.points, strict=True):
-                _refuse_other(camera, given)
+                refuse_another_size(camera, given)
+                if given.unit != camera.unit:
+                    raise InputError(
+                        f"{given.source} is in {given.unit}, but the calibration in {camera.unit}; give both "
+                        "in one unit"
+                    )
                 self.warnings += [why] if (why := undistorted_before(given, camera)) else []
         self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
         self.pairs = pair_points(*self.points, self.views)
@@ -149,10 +154,11 @@ class _Evaluator:
 
     def evaluation(self) -> StereoEvaluation:
         """The errors of all points, through the poses of the views and through the rig."""
-        rig, by_view, through = self.rig, self._by_view(), None
+        rig, pairs, through = self.rig, self.views.both, None
+        by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
         judgement: Callable[[], Verdict | None] = self._judgement
         if rig is not None:
-            poses, used = self._poses_on(rig), self._used(rig)
+            poses, used = self._poses_on(rig), np.array([pair not in rig.left_out for pair in pairs])
             # None if all views contradict the rig.
             through = self._error(poses, [rig.pose], used) if used.any() else None
             if self.given:
@@ -168,7 +174,7 @@ class _Evaluator:
             by_view,
             through,
             float("nan") if rig is None else rig.baseline,
-            self.views.both,
+            pairs,
             (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
             (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
@@ -200,10 +206,6 @@ class _Evaluator:
             fits.append(fit)
         return fits[0], fits[1]
 
-    def _by_view(self) -> SpaceError:
-        """Errors with the two poses of each view."""
-        return self._error(*self._own_poses(self.views.both), np.ones(len(self.views.both), dtype=bool))
-
     def _own_poses(self, pairs: Sequence[tuple[str, str]]) -> tuple[list[Pose], list[Pose]]:
         """Poses of views in the left camera, and the relative pose of the cameras by each of them."""
         first, rigs, new = [], [], set(self.new)
@@ -222,15 +224,11 @@ class _Evaluator:
             poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
         return [poses[a] for a, _ in self.views.both]
 
-    def _used(self, rig: Rig) -> NDArray[np.bool_]:
-        """(V,) which views do not contradict the rig."""
-        return np.array([pair not in rig.left_out for pair in self.views.both])
-
     def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""
         verdict = self._judgement()
-        if verdict is None or not len(rig.left.points):
-            return verdict
+        if verdict is None:
+            return None
         residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
         seen = residuals[np.isfinite(residuals)]
         rmse_px = float(np.sqrt((seen**2).mean())) if seen.size else np.nan
@@ -274,10 +272,9 @@ class _Evaluator:
 
     def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
         """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
-        used = self._used(rig)
         if side == 1:
             poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]
-        place = {pair[side]: k for k, pair in enumerate(self.views.both) if used[k]}
+        place = {pair[side]: k for k, pair in enumerate(self.views.both) if pair not in rig.left_out}
         points = self.points[side]
         some = points.select(np.array([name in place for name in points.view_names])[points.view_index])
         camera = self.cameras[side].camera
@@ -301,12 +298,3 @@ class _Evaluator:
         triangulated = np.where(found.behind[:, None], np.nan, found.points)
         K = self.cameras[0].intrinsics
         return space_error(triangulated, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)
-
-
-def _refuse_other(camera: Calibration, points: Correspondences) -> None:
-    refuse_another_size(camera, points)
-    if points.unit != camera.unit:
-        raise InputError(
-            f"{points.source} is in {points.unit}, but the calibration in {camera.unit}; give both in one "
-            "unit"
-        )

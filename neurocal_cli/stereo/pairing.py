@@ -119,17 +119,17 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
         raise InputError(
             f"{left.source} is in {left.unit}, {right.source} in {right.unit}; give both in the same unit"
         )
-    sides = [_in_pairs(left, [a for a, _ in views.both]), _in_pairs(right, [b for _, b in views.both])]
-    rows, order = [side[0] for side in sides], [side[1] for side in sides]
+    sides = _in_pairs(left, [a for a, _ in views.both]), _in_pairs(right, [b for _, b in views.both])
+    rows, order = zip(*sides, strict=True)
     by_id = left.point is not None and right.point is not None
     if by_id:
-        codes = _codes(
-            np.asarray(left.point)[rows[0]].astype(str), np.asarray(right.point)[rows[1]].astype(str)
-        )
+        ids = [np.asarray(side.point)[row].astype(str) for side, row in zip((left, right), rows, strict=True)]
+        codes = np.unique(np.concatenate(ids), return_inverse=True)[1].reshape(-1)
     else:
-        codes = _place_codes(left.world[rows[0]], right.world[rows[1]])
-    n_codes = 1 + max(int(code.max(initial=0)) for code in codes)
-    keys = [view * n_codes + code for view, code in zip(order, codes, strict=True)]
+        codes = _place_codes(np.concatenate([left.world[rows[0]], right.world[rows[1]]]))
+    n_codes = 1 + int(codes.max(initial=0))
+    parts = np.split(codes, [len(rows[0])])
+    keys = [view * n_codes + code for view, code in zip(order, parts, strict=True)]
     if not by_id:  # no view has an id twice
         for points, row, key in zip((left, right), rows, keys, strict=True):
             _refuse_repeated(points, row, key)
@@ -154,16 +154,8 @@ def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.int
     return rows, pair[rows]
 
 
-def _codes(left: NDArray[np.str_], right: NDArray[np.str_]) -> list[NDArray[np.intp]]:
-    """An integer for each label, equal for equal labels."""
-    _, inverse = np.unique(np.concatenate([left, right]), return_inverse=True)
-    inverse = inverse.reshape(-1)
-    return [inverse[: len(left)], inverse[len(left) :]]
-
-
-def _place_codes(left: Array, right: Array) -> list[NDArray[np.intp]]:
-    """An integer for each place in the world, equal for places that differ by rounding only."""
-    world = np.concatenate([left, right])
+def _place_codes(world: Array) -> NDArray[np.intp]:
+    """An integer for each place in the world (N, 3), equal for places that differ by rounding only."""
     size = float(np.ptp(world, axis=0).max(initial=0.0)) or 1.0
     codes = np.zeros(len(world), dtype=np.intp)
     for column in world.T:
@@ -172,7 +164,7 @@ def _place_codes(left: Array, right: Array) -> list[NDArray[np.intp]]:
         starts = values[np.concatenate([[True], np.diff(values) > _SAME_PLACE * size])]
         codes = codes * len(starts) + np.searchsorted(starts, column, side="right") - 1
         codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # small, so no product overflows
-    return [codes[: len(left)], codes[len(left) :]]
+    return codes
 
 
 def _refuse_repeated(points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp]) -> None:

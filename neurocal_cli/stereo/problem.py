@@ -45,16 +45,14 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     alone, paired_right = np.flatnonzero(frame < 0), np.flatnonzero(frame >= 0)
     paired = frame[paired_right]
     frame[alone] = n_left + np.arange(len(alone))
-    in_both = np.zeros(n_left + len(alone), dtype=bool)
-    in_both[paired] = True
     centre = np.concatenate([arranged[0].centre, arranged[1].centre[alone]])
     scale = np.concatenate([arranged[0].scale, arranged[1].scale[alone]])
     sides = [
-        _side(camera, seen, centre[which], scale[which], which)
-        for camera, seen, which in zip(cameras, arranged, (np.arange(n_left), frame), strict=True)
+        _side(camera, own, centre[which], scale[which], which)
+        for camera, own, which in zip(cameras, arranged, (np.arange(n_left), frame), strict=True)
     ]
-    noise = [max(side[3], _LEAST_NOISE) for side in sides]
-    real = [observed.pixel_scale * s for (observed, *_), s in zip(sides, noise, strict=True)]
+    seen, states, normals, noise = zip(*sides, strict=True)
+    real = [observed.pixel_scale * s for observed, s in zip(seen, noise, strict=True)]
     weights = [
         1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2 for s, own in zip(noise, real, strict=True)
     ]
@@ -63,11 +61,10 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
         names=names,
         centre=centre,
         scale=scale,
-        in_both=in_both,
         unit=float(median(scale)),
-        observations=(replace(sides[0][0], weight=weights[0]), replace(sides[1][0], weight=weights[1])),
-        cameras=(sides[0][1], sides[1][1]),
-        own_normal=(weights[0] * sides[0][2], weights[1] * sides[1][2]),
+        observations=(replace(seen[0], weight=weights[0]), replace(seen[1], weight=weights[1])),
+        cameras=(states[0], states[1]),
+        own_normal=(weights[0] * normals[0], weights[1] * normals[1]),
         paired=paired,
         paired_right=paired_right,
         spread=_spread(arranged[0], paired),
@@ -99,10 +96,8 @@ def _side(
     )
     normal = normal_blocks(batches, state)[0]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
-    noise = float(np.sqrt(normal[:, -1, -1].sum() / max(spare, 1)))
-    observed = Observations(
-        batches, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
-    )
+    noise = max(float(np.sqrt(normal[:, -1, -1].sum() / max(spare, 1))), _LEAST_NOISE)
+    observed = Observations(batches, frame, views.pixel_centre, views.pixel_scale, 1.0, views.n_equations)
     return observed, state, normal, noise
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.distortion.undistorted_view import plane_like
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -48,9 +48,9 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
     axis = 0 if abs(t[0]) > abs(t[1]) else 1
     turn = _shortest_turn(t, np.eye(3)[axis] * (1.0 if t[axis] > 0 else -1.0))
     rotations = turn @ half, turn @ half.T
-    cameras = [(rig.left, rotations[0]), (rig.right, rotations[1])]
+    cameras = [(rig.left.camera, rotations[0]), (rig.right.camera, rotations[1])]
     along = float((rotations[1] @ rig.t)[axis])
-    f = 0.5 * float(sum(plane_like(camera.camera).A[1 - axis, 1 - axis] for camera, _ in cameras))
+    f = 0.5 * float(sum(plane_like(camera).A[1 - axis, 1 - axis] for camera, _ in cameras))
     centres = [_centre(camera, R, f, size) for camera, R in cameras]
     centre = 0.5 * (centres[0] + centres[1])  # one for both: disparity 0 at infinity
     if alpha is not None:
@@ -70,20 +70,20 @@ def _shortest_turn(a: Array, b: Array) -> Array:
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + a @ b))
 
 
-def _rectified(camera: Calibration, R: Array, pixels: Array) -> Array:
+def _rectified(camera: Camera, R: Array, pixels: Array) -> Array:
     """Normalised rectified points of pixels, (N, 2).
 
     nan where the distortion does not reach a pixel, and where its ray is behind the rectified image plane.
     """
-    rays = camera.camera.unproject(pixels) @ R.T
+    rays = camera.unproject(pixels) @ R.T
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
 
 
-def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> Array:
+def _centre(camera: Camera, R: Array, f: float, size: tuple[int, int]) -> Array:
     """Principal point that centres the corners of the image in the rectified one, its middle if wide."""
     last = np.array(size, dtype=float) - 1
-    if camera.camera.distortion.wide:  # the corners are far out, or behind
+    if camera.distortion.wide:  # the corners are far out, or behind
         middle = _rectified(camera, R, last[None] / 2)[0]
         return np.asarray(0.5 * last - f * (middle if np.isfinite(middle).all() else 0.0))
     corners = _rectified(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
@@ -94,23 +94,20 @@ def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> A
 
 
 def _scale(
-    cameras: list[tuple[Calibration, Array]], f: float, centre: Array, size: tuple[int, int], alpha: float
+    cameras: list[tuple[Camera, Array]], f: float, centre: Array, size: tuple[int, int], alpha: float
 ) -> float:
     """Factor of the focal length."""
-    grid = np.linspace(0.0, 1.0, _GRID)
     last = np.array(size, dtype=float) - 1
+    grid = np.linspace(0.0, 1.0, _GRID)
+    pixels = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) * last
     room = np.array([centre, last - centre])  # to the left and top, to the right and bottom
     fill, hold = [], []
     for camera, R in cameras:
-        u, v = np.meshgrid(grid, grid)
-        image = _rectified(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(_GRID, _GRID, 2)
-        image = f * image.clip(-_WIDEST, _WIDEST)
+        image = f * _rectified(camera, R, pixels).clip(-_WIDEST, _WIDEST).reshape(_GRID, _GRID, 2)
         # What is behind sets no limit.
-        left, top = (np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1]))
-        right, bottom = (
-            np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])
-        )
-        inner = np.array([[left, top], [right, bottom]])
+        near = [np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1])]
+        far = [np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])]
+        inner = np.array([near, far])
         outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])
         signs = np.array([[-1.0], [1.0]])
         fill.append((room / (signs * inner)).max())

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, cross_matrix, rotation_vector
+from neurocal_cli.geometry import Array, rotation_vector
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.stereo.adjust import RigProblem
+from neurocal_cli.stereo.adjust import RigProblem, steps_through
 
 _POSE = np.arange(POSE.start, POSE.stop)
 _MUCH_LARGER = 2.0  # ratio of a view's variance to that of all; 50 equations reach it once in 10 million
@@ -103,12 +103,7 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     centre = (R @ left.t[first][..., None])[..., 0]
     t = scale[:, None] * (right.t[second] - centre)
     offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / problem.unit], axis=1)
-    # A step of the right view's pose is by_rig times one of the rig plus by_pose times one of the left view.
-    by_rig, by_pose = np.zeros((len(order), 6, 6)), np.zeros((len(order), 6, 6))
-    by_rig[:, :3, :3] = np.eye(3)
-    by_rig[:, 3:, :3] = -cross_matrix(centre)
-    by_rig[:, 3:, 3:] = np.eye(3) / scale[:, None, None]
-    by_pose[:, :3, :3] = by_pose[:, 3:, 3:] = R
+    by_rig, by_pose = steps_through(R, centre, 1.0 / scale)
     of_right = np.asarray(np.linalg.inv(by_rig), dtype=float)
     of_left = -of_right @ by_pose
     covariance = _transformed(of_right, sides[1].covariance[second])

@@ -221,16 +221,11 @@ def _fit_lines(rig: Rig) -> list[str]:
         f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
         f"{plural(rig.iterations, 'iteration')}"
     )
-    return [*lines, *_beside_alone(rig), rig.stop_reason]
-
-
-def _beside_alone(rig: Rig) -> list[str]:
-    """How much worse one rig for all pairs is than poses of their own, where that is much."""
     measures = {} if rig.verdict is None else rig.verdict.measures
     growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
-    if not growth > _MUCH_WORSE:
-        return []
-    return [
-        f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
-        f"it is {growth:.2g} times as much"
-    ]
+    if growth > _MUCH_WORSE:
+        lines.append(
+            f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
+            f"it is {growth:.2g} times as much"
+        )
+    return [*lines, rig.stop_reason]

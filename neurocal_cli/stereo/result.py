@@ -27,8 +27,7 @@ from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import Observations, RigFit
-from neurocal_cli.stereo.covariance import covariance_of_choice, not_smaller
-from neurocal_cli.stereo.given_cameras import covariance_by_given
+from neurocal_cli.stereo.covariance import covariance_by_given, covariance_of_choice, not_smaller
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
 
@@ -103,7 +102,7 @@ class _RigAssembly:
         left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
         pose = Pose(state.R, state.t * problem.unit)
         covariance, std = self._rig_covariance(pose)
-        n_points = sum(observed.n_points for observed in problem.observations)
+        n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
         return Rig(
             left,
             right,
@@ -113,7 +112,7 @@ class _RigAssembly:
             tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
             dict(left_out),
             rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
-            max_px=float(np.sqrt(max(part.max() for part in squares))),
+            max_px=max(left.max_px, right.max_px),
             converged=left.converged,
             stop_reason=left.stop_reason,
             iterations=self.fit.iterations,
@@ -162,7 +161,7 @@ class _RigAssembly:
                              int(batches.counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip
-        rmse = float(np.sqrt(sums.sum() / observed.n_points))
+        rmse = float(np.sqrt(sums.sum() / batches.counts.sum()))
         return replace(
             given,
             views=views,

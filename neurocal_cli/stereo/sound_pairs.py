@@ -9,7 +9,7 @@ then compares the relative poses with their covariances, and tells whether the r
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class SoundPairs:
 
     problem: RigProblem  # of all pairs
     rig: Pose  # the rig of most pairs, the start of an adjustment
-    left_out: Mapping[Pair, str] = field(default_factory=dict)  # pairs that do not determine it, and why
+    left_out: Mapping[Pair, str]  # pairs that do not determine it, and why
     moved: str = ""  # message about a rig that moved between two pairs
     by_chance: bool = False  # whether the pairs differ by no more than chance
 
@@ -116,12 +116,11 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     problem = rig_problem(left, right, views)
     consensus = find_consensus(problem)
     reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))
-    # A fault that has a name is certain. The others may belong to a rig that moved.
-    named = {pair: reason for pair, reason in reasons.items() if reason not in ("", UNSYNCHRONISED)}
     found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
     poses = relative_poses(problem, consensus.rig)
     if poses is not None:
-        used = np.array([pair not in named for pair in poses.names])
+        # A fault that has a name is certain. The others may belong to a rig that moved.
+        used = np.array([reasons[pair] in ("", UNSYNCHRONISED) for pair in poses.names])
         found = _explained(poses, used, found)
     found = _with_shifted(left, right, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
@@ -165,7 +164,7 @@ def _larger_part(
 
 
 def describe_move(
-    names: Sequence[Pair], size: Array, why: Contradiction, kept: Sequence[Pair] = ()
+    names: Sequence[Pair], size: Array, why: Contradiction, kept: Sequence[Pair]
 ) -> tuple[str, str]:
     """Describe a rig that has two geometries, the second from some pair on, with advice.
 

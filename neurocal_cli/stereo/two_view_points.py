@@ -88,16 +88,14 @@ class PointBatch:
         """One step of each point, halved where it raises the error."""
         x, y, w = (value + change for value, change in zip(state, step, strict=True))
         N_new, new = self._normal(x, y, w)
-        worse = ~(new <= cost * RISE + ROUNDING)
         length = 1.0
-        while worse.any() and length > 1e-3:
+        while (worse := ~(new <= cost * RISE + ROUNDING)).any() and length > 1e-3:
             length *= 0.5
             x, y, w = (
                 np.where(worse, value + length * change, now)
                 for value, change, now in zip(state, step, (x, y, w), strict=True)
             )
             N_new, new = self._normal(x, y, w)
-            worse = ~(new <= cost * RISE + ROUNDING)
         if worse.any():
             x, y, w = (np.where(worse, old, now) for old, now in zip(state, (x, y, w), strict=True))
             N_new, new = (
@@ -152,9 +150,8 @@ class PointBatch:
         x_r, y_r = h0 * q, h1 * q
         u, v, (ux, uy, vx, vy) = self._image(1, x_r, y_r)
         by_u, by_v = [], []
-        for n in range(3):
-            down = self.t[2] if n == 2 else self.R[2][n]
-            across, along = (self.t[k] if n == 2 else self.R[k][n] for k in (0, 1))
+        by_state = [[*row[:2], t] for row, t in zip(self.R, self.t, strict=True)]  # of h, by x, y, w
+        for across, along, down in zip(*by_state, strict=True):
             dx, dy = (across - x_r * down) * q, (along - y_r * down) * q
             by_u.append(ux * dx + uy * dy)
             by_v.append(vx * dx + vy * dy)

@@ -35,8 +35,8 @@ class WidePointBatch:
         whitening: tuple[Array, Array] | None,
     ) -> None:
         self.cameras, self.pixels = cameras, (left.T, right.T)
-        rigs = np.broadcast_to(np.moveaxis(rig, -1, 0), (left.shape[1], 3, 4))
-        self.R, self.t = rigs[:, :, :3], rigs[:, :, 3]
+        self.P = np.broadcast_to(np.moveaxis(rig, -1, 0), (left.shape[1], 3, 4))
+        self.R, self.t = self.P[:, :, :3], self.P[:, :, 3]
         self.whitening = None if whitening is None else tuple(_upper(factors) for factors in whitening)
         self.left = cameras[0].unproject(self.pixels[0])
         self.right = cameras[1].unproject(self.pixels[1])
@@ -114,10 +114,7 @@ class WidePointBatch:
 
     def linear(self) -> Array:
         """(n, 3) smallest singular vectors of the equations that each ray is parallel to its point."""
-        n = len(self.left)
-        identity = np.broadcast_to(np.eye(3, 4), (n, 3, 4))
-        rig = np.concatenate([self.R, self.t[:, :, None]], axis=2)
-        rows = [cross_matrix(ray) @ P for ray, P in ((self.left, identity), (self.right, rig))]
+        rows = [cross_matrix(self.left) @ np.eye(3, 4), cross_matrix(self.right) @ self.P]
         return nearest_solution(np.concatenate(rows, axis=1))
 
     def midpoint(self) -> Array:

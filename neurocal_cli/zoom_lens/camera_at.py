@@ -11,9 +11,9 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.setting_normals import Constants
+from neurocal_cli.zoom_lens.setting_normals import coefficients_of
 from neurocal_cli.zoom_lens.settings import describe
-from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+from neurocal_cli.zoom_lens.zoom_lens import Prediction, ZoomLens
 
 _VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 
@@ -54,10 +54,9 @@ def camera_at(
             f"the lens does not determine the camera at {describe(lens.controls, setting)}: the std of the "
             f"focal length is {100 * share:.3g} % of its value; choose a setting nearer to those of the fit"
         )
-    model = coefficient_names(lens.model)
-    L, K = len(lens.names), len(model)
+    L = len(lens.names)
     has_theta = prediction.covariance.shape[1] > L and lens.free_theta
-    free = ["alpha_u", "alpha_v", "u0", "v0", *(["theta"] if has_theta else []), *model]
+    free = [*lens.names[:4], *(["theta"] if has_theta else []), *coefficient_names(lens.model)]
     place = {name: k for k, name in enumerate(lens.names)} | {"theta": L}
     order = [place[name] for name in free]
     spread = {name: float(std[place[name]]) for name in free}
@@ -68,7 +67,7 @@ def camera_at(
         intrinsics=Intrinsics(values[0], values[1], values[2], values[3], theta),
         std=spread,
         fixed=frozenset() if has_theta else frozenset({"theta"}),
-        views=_views(lens, values, prediction.constants, prediction.covariance[0]),
+        views=_views(lens, prediction),
         points=Correspondences.none(lens.image_size, lens.unit),
         type=1,
         method="lens",
@@ -79,7 +78,7 @@ def camera_at(
         rmse_px=float("nan"),
         max_px=float("nan"),
         distortion_model=lens.model,
-        distortion=values[L - K :].copy() if K else np.zeros(0),
+        distortion=coefficients_of(values, lens.model).copy(),
         covariance=prediction.covariance[0][np.ix_(order, order)],
         covariance_names=tuple(free),
         camera_name=camera_name,
@@ -87,11 +86,12 @@ def camera_at(
     )
 
 
-def _views(lens: ZoomLens, local: Array, constants: Constants, covariance: Array) -> dict[str, ViewResult]:
+def _views(lens: ZoomLens, prediction: Prediction) -> dict[str, ViewResult]:
     """The pose of a still camera as one view."""
     if not lens.still:
         return {}
-    R, t, L = constants.R, constants.t, len(lens.names)
+    R, t, L = prediction.constants.R, prediction.constants.t, len(lens.names)
+    local, covariance = prediction.local[0], prediction.covariance[0]
     angles = euler_jacobian(R) @ covariance[L + 1 : L + 4, L + 1 : L + 4] @ euler_jacobian(R).T
     variances = [*np.diagonal(angles), *np.diagonal(covariance)[L + 4 : L + 6], covariance[4, 4]]
     std = dict(zip(POSE_NAMES, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))

@@ -84,7 +84,8 @@ def fit_committee(
     `report` is called with the share that is done. The first of the members consists of the networks that
     agree best with the others.
     """
-    probe = _probe(x.shape[1])
+    # A grid over the whole range of the controls.
+    probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=x.shape[1])))
     L = len(names)
     first = [j for j, name in enumerate(names) if name == "t_z"]
     order = [*first, 2, 3, *range(4 + len(first), L), 0, 1]
@@ -113,11 +114,6 @@ def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
     choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
     return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
-
-
-def _probe(D: int) -> Array:
-    """A grid over the whole range of the controls."""
-    return np.array(list(product(np.linspace(-1, 1, _GRID), repeat=D)))
 
 
 def _given(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, entries_of
 from neurocal_cli.camera.projection import image_points
 from neurocal_cli.errors import InputError, NeurocalError
@@ -16,7 +16,8 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.methods import calibrate
 from neurocal_cli.zoom_lens.baseline_models import baselines_of
-from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
+from neurocal_cli.zoom_lens.parameter_networks import are_cameras
+from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData, coefficients_of
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 from neurocal_cli.zoom_lens.target import on_target
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -116,12 +117,9 @@ def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Co
     V = points.points.n_views
     R, t = np.empty((V, 3, 3)), np.empty((V, 3))
     number = {name: k for k, name in enumerate(points.points.view_names)}
-    n_k = len(coefficient_names(lens.model))
     for s, values in enumerate(local):
-        camera = Camera(
-            Intrinsics(values[0], values[1], values[2], values[3], theta),
-            Distortion(lens.model, values[len(values) - n_k :]),
-        )
+        distortion = Distortion(lens.model, coefficients_of(values, lens.model))
+        camera = Camera(Intrinsics(values[0], values[1], values[2], values[3], theta), distortion)
         part = points.points.select(points.point_setting == s)
         try:
             fit = calibrate(
@@ -145,7 +143,7 @@ def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Consta
         camera = np.einsum("nij,nj->ni", constants.R[view], world) + constants.t[view]
     depth = np.where(camera[:, 2] > 0, camera[:, 2], np.nan)
     image_x, image_y = camera[:, 0] / depth, camera[:, 1] / depth
-    k = p[:, p.shape[1] - len(coefficient_names(lens.model)) :].T
+    k = coefficients_of(p, lens.model).T
     entries = entries_of(p[:, 0], p[:, 1], p[:, 2], p[:, 3], constants.theta)
     u, v = image_points(entries, lens.model, k, image_x, image_y)
     return np.asarray((u - pixels[:, 0]) ** 2 + (v - pixels[:, 1]) ** 2)
@@ -155,14 +153,13 @@ def _baseline_error(
     lens: ZoomLens, points: LensPoints, local: Array, constants: Constants, fitted: Constants
 ) -> float:
     """Rms error of one baseline; the poses of its views start at those of the lens."""
-    if not (np.isfinite(local).all() and (local[:, :2] > 0).all()):
+    if not are_cameras(local).all():
         return np.nan
     if not lens.still:
         if not np.isfinite(fitted.R).all():
             return np.nan
-        n_k = len(coefficient_names(lens.model))
         # A table of known cameras may contain t_z, which the poses replace.
-        intrinsic = np.column_stack([local[:, :4], local[:, local.shape[1] - n_k :]])
+        intrinsic = np.column_stack([local[:, :4], coefficients_of(local, lens.model)])
         data = PixelData.of(points, False, lens.model, True)
         _, constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta))
     return _rms(_squares(lens, points, local, constants))

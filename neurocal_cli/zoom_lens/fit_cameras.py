@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError, check_seed
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -16,11 +15,10 @@ from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
 from neurocal_cli.zoom_lens.result import refuse_gaps
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables, local_names
 from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
-_INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach
 
 
@@ -53,30 +51,29 @@ class LensCameras:
         A missing column, impossible values, and one setting only are errors.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
-        coefficients = coefficient_names(model)
-        missing = [name for name in (*_INTRINSIC, *coefficients) if columns.get(name) is None]
+        missing = [name for name in local_names(False, model) if columns.get(name) is None]
         if not controls or missing:
             lacking = missing[0] if missing else "zoom or focus"
             raise InputError(
                 f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, "
                 "alpha_u, alpha_v, u0, v0"
             )
-        t_z = ["t_z"] if columns.get("t_z") is not None else []
-        names = (*_INTRINSIC, *t_z, *coefficients)
+        names = local_names(columns.get("t_z") is not None, model)
         settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
         if not (np.isfinite(settings).all() and np.isfinite(local).all()):
             raise InputError(f"{source}: the settings and parameters must be finite numbers; correct them")
-        if not (local[:, :2] > 0).all():
-            row = int(np.argmin((local[:, :2] > 0).all(axis=1)))
+        positive = (local[:, :2] > 0).all(axis=1)
+        if not positive.all():
+            row = int(np.argmin(positive))
             raise InputError(f"{source}, row {row + 1}: alpha_u and alpha_v must be positive")
         moves = np.ptp(settings, axis=0) > 0
         if not moves.any():
             raise InputError(f"{source}: all cameras are at one setting; give cameras at several settings")
         controls = tuple(name for name, moving in zip(controls, moves, strict=True) if moving)
-        order = np.lexsort(settings[:, moves].T[::-1])
-        moving_settings = settings[order][:, moves]
-        return cls(controls, moving_settings, names, local[order], image_size, unit, source, model, theta)
+        settings = settings[:, moves]
+        order = np.lexsort(settings.T[::-1])
+        return cls(controls, settings[order], names, local[order], image_size, unit, source, model, theta)
 
 
 def fit_lens_cameras(
@@ -101,9 +98,8 @@ def fit_lens_cameras(
     report = progress or (lambda stage, share: None)
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)
-    low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
-    x = scaled_controls(cameras.settings, low, high)
-    L, S = len(cameras.names), len(x)
+    x = scaled_controls(cameras.settings, cameras.settings.min(axis=0), cameras.settings.max(axis=0))
+    S = len(x)
     members = fit_committee(
         x,
         cameras.names,
@@ -116,11 +112,11 @@ def fit_lens_cameras(
     )
     constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
     table = Tables(cameras.local, constants, _error_normal(members, x, cameras.local))
-    warnings: list[str] = []
+    warnings: tuple[str, ...] = ()
     if too_few(S, len(cameras.controls)):
-        warnings.append(
+        warnings = (
             f"{S} cameras are too few to tell their errors from the changes of the lens, so the standard "
-            "deviations may be far too large; give at least 5 values of each control"
+            "deviations may be far too large; give at least 5 values of each control",
         )
     lens = ZoomLens(
         controls=cameras.controls,
@@ -133,7 +129,7 @@ def fit_lens_cameras(
         tables=table,
         static=table,
         variance=1.0,
-        scatter=np.zeros(L),
+        scatter=np.zeros(len(cameras.names)),
         free_theta=cameras.theta != np.pi / 2,
         counts=np.zeros(S, dtype=np.int64),
         rmse=np.full(S, np.nan),
@@ -144,7 +140,7 @@ def fit_lens_cameras(
         converged=True,
         image_size=cameras.image_size,
         unit=cameras.unit,
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
     refuse_gaps(lens, cameras.source)
     return lens

@@ -36,22 +36,19 @@ _MORE_CAMERAS = "check the numbers of each camera, and add cameras where the par
 
 def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
     """Judge a lens, also by the rms reprojection error at other points [px] if there are any."""
-    measures = {"alpha_share": _alpha_share(lens)}
+    everywhere = lens.predict(np.concatenate([lens.settings, middles(lens.settings)]))
+    share = float((everywhere.std[:, :2] / everywhere.local[:, :2]).max())
+    uncertain = (
+        _ALPHA.grade(share),
+        f"the std of the focal length is up to {100 * share:.2g} % of its value between the settings",
+        _MORE_CAMERAS if lens.known else "add settings where the parameters change most, and points",
+    )
+    measures = {"alpha_share": share}
     if lens.known:
-        findings = (*_of_known_cameras(lens), *_uncertain(lens), *_large_error(lens, elsewhere_px))
+        findings = (*_of_known_cameras(lens, everywhere), uncertain, *_large_error(lens, elsewhere_px))
         return verdict_of(findings, measures)
     measures = {"held_out_px": lens.left_out_px, "precision_px": lens.noise_floor_px, **measures}
-    return verdict_of((*_findings(lens), _elsewhere(lens, elsewhere_px)), measures)
-
-
-def _alpha_share(lens: ZoomLens) -> float:
-    """Largest std of alpha_u or alpha_v over its value, at the settings and between them."""
-    prediction = _everywhere(lens)
-    return float((prediction.std[:, :2] / prediction.local[:, :2]).max())
-
-
-def _everywhere(lens: ZoomLens) -> Prediction:
-    return lens.predict(np.concatenate([lens.settings, middles(lens.settings)]))
+    return verdict_of((*_findings(lens), uncertain, _elsewhere(lens, elsewhere_px)), measures)
 
 
 def _elsewhere(lens: ZoomLens, px: float) -> Finding:
@@ -110,10 +107,10 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
             f"{floor:.3g} px, so the lens changes too much between the settings",
             "add settings where the parameters change most",
         )
-    yield from _uncertain(lens)
 
 
-def _of_known_cameras(lens: ZoomLens) -> Iterator[Finding]:
+def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Finding]:
+    """Findings about known cameras; `everywhere` is the prediction at the settings and between them."""
     check = "check its row: the numbers, their order and the setting"
     local, nets = lens.tables.local, [member.nets for member in lens.members]
     outputs, _ = local_to_outputs(nets[0].scale, local)
@@ -126,8 +123,7 @@ def _of_known_cameras(lens: ZoomLens) -> Iterator[Finding]:
         if outside.any():
             where = describe(lens.controls, lens.settings[int(outside.argmax())])
             yield 2, f"the image centre at {where} lies outside the image", f"{check}; check image_size"
-    prediction = _everywhere(lens)
-    share = float((prediction.std[:, 2:4] / prediction.local[:, :1]).max())
+    share = float((everywhere.std[:, 2:4] / everywhere.local[:, :1]).max())
     yield (
         _CENTRE.grade(share),
         f"the std of the image centre is up to {100 * share:.2g} % of the focal length between the settings",
@@ -142,12 +138,3 @@ def _large_error(lens: ZoomLens, rmse_px: float) -> Iterator[Finding]:
             f"the rms reprojection error of {rmse_px:.3g} px is large",
             "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
         )
-
-
-def _uncertain(lens: ZoomLens) -> Iterator[Finding]:
-    share = _alpha_share(lens)
-    yield (
-        _ALPHA.grade(share),
-        f"the std of the focal length is up to {100 * share:.2g} % of its value between the settings",
-        _MORE_CAMERAS if lens.known else "add settings where the parameters change most, and points",
-    )

@@ -59,12 +59,10 @@ class Topology:
     def parts(self) -> dict[str, slice]:
         """Slices of a, s, c, U, b, v, q, m (the weights in M), o among the weights."""
         D, own, R, H = self.controls, self.controls * self.own, self.width, self.hidden
-        counts = {"a": D, "s": own, "c": own, "U": H * R, "b": H, "v": H, "q": R, "m": len(self.pairs[0])}
-        parts, start = {}, 0
-        for name, count in (counts | {"o": 1}).items():
-            parts[name] = slice(start, start + count)
-            start += count
-        return parts
+        counts = {"a": D, "s": own, "c": own, "U": H * R, "b": H, "v": H, "q": R}
+        counts |= {"m": len(self.pairs[0]), "o": 1}
+        ends = np.cumsum(list(counts.values())).tolist()
+        return {name: slice(end - counts[name], end) for name, end in zip(counts, ends, strict=True)}
 
     @property
     def n_weights(self) -> int:

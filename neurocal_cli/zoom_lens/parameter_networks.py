@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -112,6 +113,11 @@ class LensNets:
         scatter[0] /= slope**2
         scatter[1] = scatter[1] * alpha[1] ** 2 + scatter[0]
         return scatter
+
+
+def are_cameras(local: Array) -> NDArray[np.bool_]:
+    """(...) which local parameters (..., L) are finite, with positive scale factors."""
+    return np.asarray(np.isfinite(local).all(axis=-1) & (local[..., :2] > 0).all(axis=-1))
 
 
 def outputs_to_local(scale: str, outputs: Array) -> tuple[Array, Array]:

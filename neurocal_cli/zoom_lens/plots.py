@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, picture, style
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
@@ -102,7 +103,7 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
         axes.plot(along, middle, color=color, linewidth=1.2, label=label)
         places, found = lens.settings[members, 0], lens.tables.local[members, j]
         axes.errorbar(places, found, error[members], fmt="o", markersize=2.8, elinewidth=0.7, color=color)
-    unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else lens.unit if name == "t_z" else ""
+    unit = "px" if name in INTRINSIC_NAMES[:4] else lens.unit if name == "t_z" else ""
     style(axes, name)
     axes.set(xlabel=lens.controls[0], ylabel=unit.replace("$", r"\$"))
     if j == 0 and len(slices) > 1:

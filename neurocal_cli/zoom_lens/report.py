@@ -96,7 +96,7 @@ def _network_rows(lens: ZoomLens) -> list[list[str]]:
 
 def _labelled(name: str, unit: str) -> str:
     """A parameter with its unit: pixels for four of them, or the given one."""
-    unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else unit
+    unit = "px" if name in INTRINSIC_NAMES[:4] else unit
     return f"{name} [{unit}]" if unit else name
 
 
@@ -114,9 +114,7 @@ def camera_report(calibration: Calibration) -> str:
     return f"{calibration.camera_name}: {calibration.stop_reason}\n\n" + "\n".join(align(rows))
 
 
-def evaluation_report(
-    evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict | None = None
-) -> str:
+def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict) -> str:
     """Errors of a lens as aligned text: overall, of the baselines, at the worst settings; the verdict."""
     shown = sorted(evaluation.settings, key=lambda setting: -np.nan_to_num(setting.rmse_px))[:_MOST_SETTINGS]
     settings = [[*controls, "points", "rms [px]", "max [px]"]]
@@ -128,9 +126,8 @@ def evaluation_report(
         f"{_pixels(evaluation.rmse_px)} px, maximum {_pixels(evaluation.max_px)} px"
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
-    blocks = [[head], align(_baseline_rows(evaluation)), [title, *align(settings)]]
-    if verdict is not None:
-        blocks.append(verdict_lines(verdict))
+    tables = align(_baseline_rows(evaluation)), [title, *align(settings)]
+    blocks = [[head], *tables, verdict_lines(verdict)]
     return "\n\n".join("\n".join(block) for block in blocks)
 
 
@@ -145,7 +142,7 @@ def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
     return rows
 
 
-def evaluation_json(evaluation: LensEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
+def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, Any]:
     """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         "n_points": evaluation.n_points,
@@ -161,7 +158,7 @@ def evaluation_json(evaluation: LensEvaluation, verdict: Verdict | None = None) 
             for setting in evaluation.settings
         ],
         "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
-        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+        "verdict": verdict_json(verdict),
     }
 
 

@@ -18,10 +18,11 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.odd_points import view_of_another_unit
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, free_pose_variance
 from neurocal_cli.zoom_lens.joint_training import Joint
+from neurocal_cli.zoom_lens.parameter_networks import are_cameras
 from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, far_value, middles
-from neurocal_cli.zoom_lens.static_calibration import first_constants, fit_local
+from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
@@ -38,7 +39,8 @@ _LEAST_ERROR = 5.0  # times the noise, in the image
 def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
     """The lens without its errors and warnings."""
     still = start.data.still
-    averaged = fit_local(start.data, start.tables.local, first_constants(start.static, start.lens, still))
+    constants = first_constants(start.static, start.lens, still)
+    averaged = common_tables(start.data, start.tables.local, constants, fixed=True)
 
     def of_lens(constants: Constants) -> Constants:
         # The poses of the views of a moving camera are not part of the lens.
@@ -87,15 +89,14 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     # The linearisation fails for a member now and then, so the median counts.
     squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
-    tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
-    return replace(finished, warnings=_warnings(finished, start, tables_rms))
+    return replace(finished, warnings=_warnings(finished, start))
 
 
 def _refuse_contradiction(lens: ZoomLens, each: Array, points: Correspondences) -> None:
     """Refuse networks with outputs (M, S, L) that are no valid camera at one of their own settings."""
-    valid = (np.isfinite(each).all(axis=2) & (each[:, :, :2] > 0).all(axis=2)).all(axis=0)
+    valid = are_cameras(each).all(axis=0)
     if valid.all():
         return
     where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
@@ -119,7 +120,7 @@ def refuse_gaps(lens: ZoomLens, source: str) -> None:
         ) from error
 
 
-def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> tuple[str, ...]:
+def _warnings(lens: ZoomLens, start: CalibratedSettings) -> tuple[str, ...]:
     warnings = []
     alone = int((~start.static.good).sum())
     if alone:
@@ -131,6 +132,7 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> t
     for rejected in lens.rejected:
         where = describe(lens.controls, np.array(rejected.setting))
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
+    tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     if lens.rmse_px > _POOR_FIT * tables_rms:
         warnings.append(
             f"the error of the networks is {lens.rmse_px:.3g} px, that of separate settings {tables_rms:.3g} "

@@ -21,6 +21,7 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camer
 from neurocal_cli.bundle_adjustment.units import translations, translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.least_squares.schur_complement import eliminate
@@ -58,8 +59,7 @@ class Normal:
     def blocks(self) -> Array:
         """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
         g = self.g[..., None]
-        below = np.concatenate([np.swapaxes(g, 1, 2), self.cost[:, None, None]], axis=2)
-        return np.concatenate([np.concatenate([self.H, g], axis=2), below], axis=1)
+        return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
 
 
 @frozen_dataclass(eq=False)
@@ -72,6 +72,16 @@ class Tables:
     converged: bool = True
 
 
+def local_names(with_t_z: bool, model: str) -> tuple[str, ...]:
+    """Names of the local parameters with a distortion model."""
+    return (*INTRINSIC_NAMES[:4], *(("t_z",) if with_t_z else ()), *coefficient_names(model))
+
+
+def coefficients_of(local: Array, model: str) -> Array:
+    """Distortion coefficients (..., K), which are the last of the local parameters (..., L)."""
+    return local[..., local.shape[-1] - len(coefficient_names(model)) :]
+
+
 @frozen_dataclass(eq=False)
 class PixelData:
     """Points of all settings, ready for `linearise`."""
@@ -80,8 +90,8 @@ class PixelData:
     setting: NDArray[np.int64]  # (V,)
     n_settings: int
     still: bool  # whether neither the camera nor the target moves
-    model: str = "none"  # of the distortion
-    free_theta: bool = True
+    model: str  # of the distortion
+    free_theta: bool
 
     @classmethod
     def of(cls, lens: LensPoints, still: bool, model: str, free_theta: bool) -> PixelData:
@@ -91,8 +101,7 @@ class PixelData:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the local parameters."""
-        t_z = ("t_z",) if self.still else ()
-        return ("alpha_u", "alpha_v", "u0", "v0", *t_z, *coefficient_names(self.model))
+        return local_names(self.still, self.model)
 
     @property
     def n_shared(self) -> int:
@@ -143,29 +152,33 @@ class PixelData:
         else:
             R, t = constants.R, constants.t
         centred = translations_normalised(views, R, t)
-        k = local[self.setting, len(self.names) - len(coefficient_names(self.model)) :]
+        k = coefficients_of(local[self.setting], self.model)
         return CameraState(A / views.pixel_scale, R, centred, self.model, k)
 
-    def entries_by_parameters(self, local: Array, constants: Constants) -> tuple[Array, Array]:
-        """Derivatives of A's normalised entries by alpha_u, alpha_v, u0, v0 (V, 5, 4) and by theta (V, 5)."""
+    def camera_jacobian(self, local: Array, constants: Constants) -> Array:
+        """Derivatives (V, 5 + K, 5 + K) of A's normalised entries and the distortion coefficients.
+
+        They are by alpha_u, alpha_v, u0, v0, the coefficients and theta.
+        """
         a, b = local[self.setting, :2].T
         sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
-        by_local, by_theta = np.zeros((len(a), 5, 4)), np.zeros((len(a), 5))
-        by_local[:, 0, 0], by_local[:, 1, 0], by_local[:, 2, 1] = 1.0, -cosine / sine, 1 / sine
-        by_local[:, 3, 2] = by_local[:, 4, 3] = 1.0
-        by_theta[:, 1], by_theta[:, 2] = a / sine**2, -b * cosine / sine**2
-        return by_local / self.views.pixel_scale, by_theta / self.views.pixel_scale
+        K = len(coefficient_names(self.model))
+        J = np.zeros((len(a), 5 + K, 5 + K))
+        J[:, 0, 0], J[:, 1, 0], J[:, 2, 1] = 1.0, -cosine / sine, 1 / sine
+        J[:, 3, 2] = J[:, 4, 3] = 1.0
+        J[:, 1, -1], J[:, 2, -1] = a / sine**2, -b * cosine / sine**2
+        J /= self.views.pixel_scale
+        J[:, 5:, 4:-1] = np.eye(K)
+        return J
 
     def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
         """Normal matrices over local and shared parameters and the residual, for a still camera."""
         views, V, K = self.views, len(N), N.shape[1] - 12
-        by_local, by_theta = self.entries_by_parameters(local, constants)
         C = np.zeros((V, 12 + K, 12 + K))
         scale = views.scale[:, None, None]
-        C[:, :5, :4] = by_local
+        of_camera = np.delete(np.arange(6 + K), 4)  # all local parameters but t_z, and theta
+        C[:, camera_columns(K)[:, None], of_camera] = self.camera_jacobian(local, constants)
         C[:, 10, 4] = 1 / views.scale
-        C[:, 11 : 11 + K, 5 : 5 + K] = np.eye(K)
-        C[:, :5, 5 + K] = by_theta
         # The world turns about its origin, the points of a view about their centre, so t changes too.
         centre = (constants.R @ views.centre[..., None])[..., 0]
         C[:, 5:8, 6 + K : 9 + K] = np.eye(3)
@@ -179,8 +192,7 @@ class PixelData:
         V, K = len(N), N.shape[1] - 12
         keep = np.concatenate([camera_columns(K), [11 + K]])
         U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))
-        by_local, by_theta = self.entries_by_parameters(local, constants)
         C = np.zeros((V, 6 + K, 6 + K))
-        C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta
+        C[:, :-1, :-1] = self.camera_jacobian(local, constants)
         C[:, -1, -1] = 1.0
         return np.swapaxes(C, 1, 2) @ U @ C * self.views.pixel_scale**2

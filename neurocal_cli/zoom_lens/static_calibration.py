@@ -80,16 +80,12 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
     """One setting; without distortion where its points do not determine it."""
-
-    def calibrated(model: str) -> Calibration:
-        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
-
     try:
-        return calibrated(model)
+        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
     except DegenerateGeometryError:
         if model == "none":
             raise
-        return calibrated("none")
+        return _calibrate(points, "none", seed, skew)
 
 
 def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -113,33 +109,26 @@ def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
 
 
 def common_tables(
-    data: PixelData, local: Array, constants: Constants, progress: Progress | None = None
+    data: PixelData,
+    local: Array,
+    constants: Constants,
+    progress: Progress | None = None,
+    *,
+    fixed: bool = False,
 ) -> Tables:
-    """Minimise the reprojection error over the local parameters and the constants."""
-    return _minimum(data, local, constants, data.n_shared, progress)
-
-
-def fit_local(data: PixelData, local: Array, constants: Constants) -> Tables:
-    """Minimise the reprojection error over the local parameters alone."""
-    return _minimum(data, local, constants, 0)
-
-
-def _minimum(
-    data: PixelData, local: Array, constants: Constants, n_shared: int, progress: Progress | None = None
-) -> Tables:
-    """Minimise over the local parameters, which are eliminated, and some constants."""
+    """Minimise the reprojection error over the local parameters and, if they are not fixed, the constants."""
     tried = count()
 
     def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
         # Valid if all points are in front and the distortion is monotonic.
         if progress is not None:
             progress("common constants", (done := next(tried)) / (done + 10))
-        constants = before.constants.moved(by_shared) if n_shared else before.constants
+        constants = before.constants if fixed else before.constants.moved(by_shared)
         tables = _linearised(data, before.local + by_local, constants)
         return tables, tables.normal.sensible
 
     L, start = local.shape[1], _linearised(data, local, constants)
-    shared = np.arange(L, L + n_shared)
+    shared = np.arange(L, L + (0 if fixed else data.n_shared))
     problem = SharedAndOwn(start, lambda tables: tables.normal.blocks, moved, shared, np.arange(L))
     settled = minimise(problem, _OPTIONS).settled[0]
     return replace(problem.state, converged=bool(settled))

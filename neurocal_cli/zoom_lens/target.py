@@ -75,7 +75,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
     prior = prior_of_target(target)
     n = len(target.given)
     state = data.state_of(tables.local, tables.constants)
-    by_local, by_theta = data.entries_by_parameters(tables.local, tables.constants)
+    jacobian = data.camera_jacobian(tables.local, tables.constants)
     columns = camera_columns(K)
     information = np.zeros((3 * n, 3 * n))
     coupling = np.zeros((data.n_settings, len(data.names) + data.n_shared, 3 * n))
@@ -92,9 +92,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
             terms.point_camera.reshape(3 * n, -1).T
             - N[columns[:, None], np.arange(POSE.start, POSE.stop)] @ gain
         )
-        into = np.zeros((len(data.names) + 1, 5 + K))
-        into[:4, :5], into[4 : 4 + K, 5:], into[4 + K, :5] = by_local[v].T, np.eye(K), by_theta[v]
-        coupling[data.setting[v]] += into @ entries
+        coupling[data.setting[v]] += jacobian[v].T @ entries
     if not data.free_theta:
         coupling[:, -1] = 0.0
     px2 = views.pixel_scale**2

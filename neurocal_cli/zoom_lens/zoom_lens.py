@@ -11,7 +11,7 @@ from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.target import Target
-from neurocal_cli.zoom_lens.parameter_networks import LensNets
+from neurocal_cli.zoom_lens.parameter_networks import LensNets, are_cameras
 from neurocal_cli.zoom_lens.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
@@ -226,7 +226,7 @@ class ZoomLens:
         x = self.scaled(self._numbers(settings, 2))
         pairs = [member.nets.local_with_jacobian(x) for member in self.members]
         locals_ = np.array([local for local, _ in pairs])
-        valid = (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
+        valid = are_cameras(locals_).all(axis=0)
         if not valid.all():
             bad = int(np.argmin(valid))
             raise InputError(
