@@ -14,10 +14,8 @@ from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.failures import one_line, value_failures
+from neurocal_cli.io.tree_fields import is_number
 from neurocal_cli.points import UNDISTORTED
-
-# Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
-is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 # 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch

@@ -14,8 +14,8 @@ from neurocal_cli.geometry import Array
 
 T = TypeVar("T")
 
-# YAML 1.1 reads 1e-05 as text, because it has no decimal point, but other programs write numbers so.
-_NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+# Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
+is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 
 class Field:
@@ -164,7 +164,8 @@ def _as_float(value: Any) -> float:
             return float(value)
         except OverflowError:
             return math.nan
-    if isinstance(value, str) and re.fullmatch(_NUMBER_TEXT, value):
+    # YAML 1.1 reads 1e-05 as text, because it has no decimal point, but other programs write numbers so.
+    if isinstance(value, str) and is_number(value):
         return float(value)
     return math.nan
 
