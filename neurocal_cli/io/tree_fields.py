@@ -42,17 +42,13 @@ class Field:
 
     def __getitem__(self, key: str) -> Field:
         """Value of a required key."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        if key not in self.value:
+        if key not in self._mapping():
             self.refuse(f"the key {self._below(key)} is missing; add it or write the file again")
         return Field(self.value[key], self.source, self._below(key))
 
     def get(self, key: str, default: Any = None) -> Field:
         """Value of a key, or a default if the key is missing or null."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        found = self.value.get(key)
+        found = self._mapping().get(key)
         return Field(default if found is None else found, self.source, self._below(key))
 
     def first(self, keys: Iterable[str]) -> Field | None:
@@ -66,9 +62,7 @@ class Field:
 
     def entries(self) -> dict[str, Field]:
         """All values of a mapping, by their keys."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        return {key: self[key] for key in self.value}
+        return {key: self[key] for key in self._mapping()}
 
     def items(self) -> Iterator[Field]:
         """Iterate over the entries of a list."""
@@ -149,6 +143,11 @@ class Field:
         if not all(math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True)):
             self.fail(expected)
         return np.array(numbers, dtype=float).reshape(objects.shape)
+
+    def _mapping(self) -> dict[str, Any]:
+        if not isinstance(self.value, dict):
+            self.fail("a mapping (key: value)")
+        return self.value
 
     def _below(self, key: str) -> str:
         shown = key if re.fullmatch(r"[\w.-]{1,60}", key) else repr(key[:60])
