@@ -40,6 +40,11 @@ class CameraSet:
             )
 
     @property
+    def mounted(self) -> tuple[Pose, ...]:
+        """Poses from the first camera to each of them."""
+        return (Pose(np.eye(3), np.zeros(3)), *self.relative)
+
+    @property
     def has_lengths(self) -> bool:
         """Whether there is any translation, so that the unit matters."""
         return bool(self.relative or self.poses)

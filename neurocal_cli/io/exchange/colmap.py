@@ -174,7 +174,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
     if len(cameras.cameras) == 1 and not cameras.poses:
         return {"": _joined(files["cameras.txt"])}
-    rig = (Pose(np.eye(3), np.zeros(3)), *cameras.relative)
+    rig = cameras.mounted
     sensors = [f"CAMERA {k} 1 {_seven(pose)}" for k, pose in enumerate(rig[1:], start=2)]
     files["rigs.txt"] = [" ".join([f"1 {len(rig)} CAMERA 1", *sensors])]
     files["frames.txt"], files["images.txt"], files["points3D.txt"] = [], [], []

@@ -10,8 +10,6 @@ import ast
 import re
 from typing import Any
 
-import numpy as np
-
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
@@ -67,10 +65,9 @@ def _numbers(field: Field, count: int) -> Array:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    if len(cameras.cameras) == 1:
-        world = cameras.poses.get(REFERENCE, Pose(np.eye(3), np.zeros(3)))
-        return {"": _model(cameras.cameras[0], world)}
-    poses = (Pose(np.eye(3), np.zeros(3)), *cameras.relative)
+    poses = cameras.mounted
+    if len(poses) == 1:
+        return {"": _model(cameras.cameras[0], cameras.poses.get(REFERENCE, poses[0]))}
     names = ["left", "right"] if len(poses) == 2 else [f"camera{k}" for k in range(len(poses))]
     return {
         f"{name}.cameramodel": _model(camera, pose)
