@@ -30,7 +30,7 @@ POINTS = Schema(
     required=(*PLACE, *PIXEL),
     optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *SETTINGS),
     labels=frozenset({"view", "point"}),
-    headerless=(*PLACE, *PIXEL),
+    headerless=True,
     instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 

@@ -35,7 +35,7 @@ class Schema:
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
     labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
-    headerless: tuple[str, ...] = ()  # columns of a file without a header; if empty, the header is required
+    headerless: bool = False  # whether a file may have the required columns without a header
     instead: str = ""  # advice for files of another kind
 
     @property
@@ -217,9 +217,9 @@ def decimal_commas(found: int, expected: int, separator: str | None) -> str:
 def _headerless_names(
     fields: list[str], separator: str | None, comments: list[str], schema: Schema
 ) -> tuple[str, ...]:
-    expected = schema.headerless
-    if not expected:
-        raise InputError(f"the header is missing; begin with {','.join(schema.required)}")
+    expected = schema.required
+    if not schema.headerless:
+        raise InputError(f"the header is missing; begin with {','.join(expected)}")
     if len(fields) != len(expected):
         points = decimal_commas(len(fields), len(expected), separator)
         raise InputError(
