@@ -288,28 +288,28 @@ def _view_lines(views: Any) -> list[str]:
 
 
 def _training_lines(calibration: Calibration) -> list[str]:
-    fit = (
-        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
-    )
-    if calibration.n_rejected:
-        fit += f", {plural(calibration.n_rejected, 'outlier')} rejected"
-    training = [] if calibration.network is None else _network_lines(calibration.network)
+    rejected = f", {plural(calibration.n_rejected, 'outlier')} rejected" if calibration.n_rejected else ""
+    lines = [
+        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, "
+        f"maximum {_pixels(calibration.max_px)} px{rejected}"
+    ]
     if (found := calibration.straight_lines) is not None:
         u, v = found.centre
-        training.insert(
-            0,
+        lines.append(
             f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
             f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
-            f"after; centre of distortion ({u:.1f}, {v:.1f})",
+            f"after; centre of distortion ({u:.1f}, {v:.1f})"
         )
+    if calibration.network is not None:
+        lines += _network_lines(calibration.network)
     if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
         errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
         how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
-        training += [
+        lines += [
             f"distortion model: {calibration.distortion_model}, {how}:",
             f"  {', '.join(errors)} px",
         ]
-    return [fit, *training, calibration.stop_reason]
+    return [*lines, calibration.stop_reason]
 
 
 def _among(calibration: Calibration) -> str:
