@@ -70,10 +70,9 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
         )
     padded = np.zeros(14)
     padded[: len(values)] = values
-    if padded[8:].any():
-        return ("tilted", padded) if padded[12:].any() else ("thin_prism", padded[:12])
-    padded = padded[:8]
-    return ("rational", padded) if padded[5:].any() else ("plumb_bob", padded[:5])
+    lengths = {model: len(coefficient_names(model)) for model in ("plumb_bob", "rational", *WITH_PRISM)}
+    model = next(model for model, length in lengths.items() if not padded[length:].any())
+    return model, padded[: lengths[model]]
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
