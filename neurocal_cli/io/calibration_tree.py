@@ -185,17 +185,18 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     model = block.get("distortion", "none").text()
     with value_failures(root.source, f"{block.path}.distortion: "):
         names = coefficient_names(model)
-    coefficients = root["distortion_coefficients"]["data"].array(-1)
+    data = root["distortion_coefficients"]["data"]
+    coefficients = data.array(-1)
     if len(coefficients) < len(names):
-        root["distortion_coefficients"]["data"].fail(f"{len(names)} numbers or more")
-    path = f"{block.path}.parameters"
+        data.fail(f"{len(names)} numbers or more")
     if coefficients[len(names) :].any():
         root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
     for name, value in zip(names, coefficients, strict=False):
         stated = block["parameters"].get(name, {}).get("value", value).number()
         if abs(stated - value) > _SAME * abs(value):
             root.refuse(
-                f"distortion_coefficients and {path}.{name} disagree; correct the one that was edited"
+                f"distortion_coefficients and {block.path}.parameters.{name} disagree; correct the one that "
+                "was edited"
             )
     return model, coefficients[: len(names)]
 
