@@ -212,4 +212,4 @@ def _seven(pose: Pose) -> str:
     return " ".join(map(number, [*to_quaternion(pose.R), *pose.t]))
 
 
-FORMAT = Format("COLMAP", tuple(_NAMES), False, True, 99, False, True, _text)
+FORMAT = Format("COLMAP", tuple(_NAMES), _text, poses=True, most_cameras=99, needs_size=True)

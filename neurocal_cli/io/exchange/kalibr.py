@@ -106,4 +106,5 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": "\n".join([*lines, ""])}
 
 
-FORMAT = Format("Kalibr", ("none", "k1k2p1p2", *_WRITTEN), False, False, 99, True, True, _text)
+_HELD = ("none", "k1k2p1p2", *_WRITTEN)
+FORMAT = Format("Kalibr", _HELD, _text, most_cameras=99, metres=True, needs_size=True)

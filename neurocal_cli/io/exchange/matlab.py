@@ -176,4 +176,4 @@ def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
     }
 
 
-FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), True, True, 2, False, True, _text)
+FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), _text, skew=True, poses=True, needs_size=True)

@@ -92,4 +92,4 @@ def _model(camera: Camera, pose: Pose) -> str:
     )
 
 
-FORMAT = Format("mrcal", tuple(_NAMES), False, False, 99, False, True, _text)
+FORMAT = Format("mrcal", tuple(_NAMES), _text, most_cameras=99, needs_size=True)
