@@ -165,17 +165,21 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
 
 
 def _parameters_json(calibration: Calibration) -> dict[str, Any]:
-    values = dict(zip(INTRINSIC_NAMES, calibration.intrinsics.values().tolist(), strict=True))
-    names = coefficient_names(calibration.distortion_model)
-    values |= dict(zip(names, calibration.distortion.tolist(), strict=True))
     return {
         name: {
             "value": value,
             "std": number_or_none(calibration.std.get(name, math.nan)),
             "fixed": name in calibration.fixed,
         }
-        for name, value in values.items()
+        for name, value in _parameters(calibration).items()
     }
+
+
+def _parameters(calibration: Calibration) -> dict[str, float]:
+    """The intrinsic parameters and the coefficients of the distortion."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    values = [*calibration.intrinsics.values().tolist(), *calibration.distortion.tolist()]
+    return dict(zip(names, values, strict=True))
 
 
 def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
@@ -234,15 +238,11 @@ def plural(count: int, noun: str) -> str:
 def parameter_rows(calibration: Calibration) -> list[list[str]]:
     """Rows of the intrinsic parameters, and of the pose if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
-    for name in INTRINSIC_NAMES:
-        unit = "rad" if name == "theta" else "px"
-        value = float(getattr(calibration.intrinsics, name))
-        rows.append(_parameter_row(name, unit, value, calibration.std[name], name in calibration.fixed))
-    for name, value in zip(
-        coefficient_names(calibration.distortion_model), calibration.distortion, strict=True
-    ):
+    units = dict.fromkeys(INTRINSIC_NAMES, "px") | {"theta": "rad"}
+    for name, value in _parameters(calibration).items():
         if name not in rich_lens.NAMES:
-            rows.append(_parameter_row(name, "", value, calibration.std[name], name in calibration.fixed))
+            unit, std = units.get(name, ""), calibration.std[name]
+            rows.append(_parameter_row(name, unit, value, std, name in calibration.fixed))
     if calibration.distortion_model == "rich":
         rows.append(_displacement_row(calibration))
     if len(calibration.views) == 1:
@@ -288,28 +288,28 @@ def _view_lines(views: Any) -> list[str]:
 
 
 def _training_lines(calibration: Calibration) -> list[str]:
-    fit = (
-        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
-    )
-    if calibration.n_rejected:
-        fit += f", {plural(calibration.n_rejected, 'outlier')} rejected"
-    training = [] if calibration.network is None else _network_lines(calibration.network)
+    rejected = f", {plural(calibration.n_rejected, 'outlier')} rejected" if calibration.n_rejected else ""
+    lines = [
+        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, "
+        f"maximum {_pixels(calibration.max_px)} px{rejected}"
+    ]
     if (found := calibration.straight_lines) is not None:
         u, v = found.centre
-        training.insert(
-            0,
+        lines.append(
             f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
             f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
-            f"after; centre of distortion ({u:.1f}, {v:.1f})",
+            f"after; centre of distortion ({u:.1f}, {v:.1f})"
         )
+    if calibration.network is not None:
+        lines += _network_lines(calibration.network)
     if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
         errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
         how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
-        training += [
+        lines += [
             f"distortion model: {calibration.distortion_model}, {how}:",
             f"  {', '.join(errors)} px",
         ]
-    return [fit, *training, calibration.stop_reason]
+    return [*lines, calibration.stop_reason]
 
 
 def _among(calibration: Calibration) -> str:

@@ -70,25 +70,25 @@ class Target:
     def seen(self, points: Correspondences) -> Correspondences:
         """Points of this target moved to their estimated coordinates, with the bend of each view."""
         found = self.applied(points)
-        bent = (self.places(points.world) >= 0)[:, None] * self._bend(found)
-        return found if self.bends is None else replace(found, world=found.world + bent)
+        if self.bends is None:
+            return found
+        bent = (self.places(points.world) >= 0)[:, None] * self._bend(self.bends, found)
+        return replace(found, world=found.world + bent)
 
     def straightened(self, points: Correspondences) -> Correspondences:
         """Estimated points with the bend of each view removed."""
         if self.bends is None:
             return points
-        world = points.world - self._bend(points)
+        world = points.world - self._bend(self.bends, points)
         return replace(points, world=np.where((self.rows_of(world) >= 0)[:, None], world, points.world))
 
     def as_given(self, points: Correspondences) -> Correspondences:
         """Points moved back to their given coordinates: the inverse of `seen`."""
         return _moved(points, self.rows_of(self.straightened(points).world), self.given)
 
-    def _bend(self, points: Correspondences) -> Array:
+    def _bend(self, bends: Bends, points: Correspondences) -> Array:
         """(N, 3) offsets of points by the bends of their views [world unit]."""
-        if self.bends is None:
-            return np.zeros_like(points.world)
-        by_view = self.bends.of_views(points.view_names)[points.view_index]
+        by_view = bends.of_views(points.view_names)[points.view_index]
         return np.asarray((self._shapes(points.world) @ by_view[..., None])[..., 0])
 
     def _shapes(self, world: Array) -> Array:

@@ -38,6 +38,7 @@ def calibration_page(
     parts = [
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(calibration.verdict),
+        section("Parameters", table(parameter_rows(calibration))),
         *_camera_parts(calibration, photographs or {}),
         _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
     ]
@@ -67,7 +68,7 @@ def rig_page(
     sides = ("Left camera", rig.left), ("Right camera", rig.right)
     for (side, camera), images in zip(sides, photographs or ({}, {}), strict=True):
         parts.append(section(side, " "))
-        parts += _camera_parts(camera, images, parameters=False)
+        parts += _camera_parts(camera, images)
     command = "neurocal stereo LEFT.csv RIGHT.csv" + _options(rig.left)
     parts.append(_repeat(command, rig.left, origin))
     return page("Calibration of two cameras", parts)
@@ -116,11 +117,9 @@ def _over_settings(lens: ZoomLens) -> str:
     )  # fmt: skip
 
 
-def _camera_parts(
-    calibration: Calibration, photographs: Mapping[str, bytes], parameters: bool = True
-) -> list[str]:
-    """Sections on a camera: parameters, drawings, views, rejected points and views, warnings."""
-    parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
+def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) -> list[str]:
+    """Sections on a camera: drawings, views, rejected points and views, warnings."""
+    parts: list[str] = []
     points, pixels = calibration.points, calibration.points.pixels
     if len(points):
         poses = [calibration.views[name].pose for name in points.view_names]
@@ -145,8 +144,7 @@ def _camera_parts(
         ]
         parts.append(section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'))
         parts += _view_parts(calibration, residuals, size, scale, photographs)
-    parts += [_rejected(calibration), _warnings(calibration.warnings)]
-    return parts
+    return [*parts, _rejected(calibration), _warnings(calibration.warnings)]
 
 
 def _uncertainty(calibration: Calibration) -> str:

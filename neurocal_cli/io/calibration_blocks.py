@@ -147,9 +147,9 @@ def _view(entry: Field) -> ViewResult:
     return ViewResult(
         pose=Pose(R, np.array(values[3:])),
         std=std,
-        n_points=entry["n_points"].integer() if "n_points" in entry else 0,
+        n_points=entry.get("n_points", 0).integer(),
         rmse_px=entry["rmse_px"].number_or_nan(),
-        fixed="fixed" in entry and entry["fixed"].boolean(),
+        fixed=entry.get("fixed", False).boolean(),
     )
 
 

@@ -15,7 +15,6 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_blocks import read_rejected, read_target, read_verdict, read_views
 from neurocal_cli.io.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
-from neurocal_cli.io.camera_info import own_length
 from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.failures import value_failures
 from neurocal_cli.io.file_storage import read_tree
@@ -185,20 +184,21 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     block = neurocal_block(root)
     model = block.get("distortion", "none").text()
     with value_failures(root.source, f"{block.path}.distortion: "):
-        length = own_length(model)
-    coefficients = root["distortion_coefficients"]["data"].array(-1)
-    if len(coefficients) < length:
-        root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")
-    path = f"{block.path}.parameters"
-    if coefficients[length:].any():
+        names = coefficient_names(model)
+    data = root["distortion_coefficients"]["data"]
+    coefficients = data.array(-1)
+    if len(coefficients) < len(names):
+        data.fail(f"{len(names)} numbers or more")
+    if coefficients[len(names) :].any():
         root.refuse(f"distortion_coefficients has more values than {model}, the distortion; correct one")
-    for name, value in zip(coefficient_names(model), coefficients, strict=False):
+    for name, value in zip(names, coefficients, strict=False):
         stated = block["parameters"].get(name, {}).get("value", value).number()
         if abs(stated - value) > _SAME * abs(value):
             root.refuse(
-                f"distortion_coefficients and {path}.{name} disagree; correct the one that was edited"
+                f"distortion_coefficients and {block.path}.parameters.{name} disagree; correct the one that "
+                "was edited"
             )
-    return model, coefficients[:length]
+    return model, coefficients[: len(names)]
 
 
 def _network(field: Field) -> NetworkRecord:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 # ROS's names of our models. Others are a plumb_bob with 5 coefficients; simpler models use the first of them.
 _ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}
-_LENGTHS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 _FORMULAS = {
     "cylinder": "u = f atan2(X, Z) + u0, v = f Y / hypot(X, Z) + v0",
     "equirectangular": "u = f atan2(X, Z) + u0, v = f atan2(Y, hypot(X, Z)) + v0",
@@ -31,15 +30,14 @@ _FORMULAS = {
 
 def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
     """Find ROS's name of one of our models, and pad its coefficients, which must fit, with zeros."""
-    own = own_length(model)
+    own = len(coefficient_names(model))
     name = _ROS.get(model, model if model in (*WIDE, *WITH_PRISM) else "plumb_bob")
-    length = _LENGTHS.get(name, own)
     values = np.asarray(coefficients, dtype=float).ravel()
     if np.any(values[own:] != 0) or not np.isfinite(values).all():
         raise InputError(
             f"the distortion model {model} has {own} finite coefficients, found {values.tolist()}"
         )
-    padded = np.zeros(length)
+    padded = np.zeros(5 if name == "plumb_bob" else own)
     padded[: min(own, len(values))] = values[:own]
     return name, padded
 
@@ -57,8 +55,8 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
     if not values.any():
         return "none", np.zeros(0)
     if name in WIDE:
-        if len(values) != own_length(name):
-            raise InputError(f"the model {name} has {own_length(name)} coefficients, found {len(values)}")
+        if len(values) != len(WIDE[name]):
+            raise InputError(f"the model {name} has {len(WIDE[name])} coefficients, found {len(values)}")
         return name, values
     if name not in ("plumb_bob", "rational_polynomial", *WITH_PRISM):
         raise InputError(
@@ -72,15 +70,9 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
         )
     padded = np.zeros(14)
     padded[: len(values)] = values
-    if padded[8:].any():
-        return ("tilted", padded) if padded[12:].any() else ("thin_prism", padded[:12])
-    padded = padded[:8]
-    return ("rational", padded) if padded[5:].any() else ("plumb_bob", padded[:5])
-
-
-def own_length(model: str) -> int:
-    """Number of coefficients of one of our models."""
-    return len(coefficient_names(model))
+    lengths = {model: len(coefficient_names(model)) for model in ("plumb_bob", "rational", *WITH_PRISM)}
+    model = next(model for model, length in lengths.items() if not padded[length:].any())
+    return model, padded[: lengths[model]]
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:

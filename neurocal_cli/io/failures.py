@@ -38,6 +38,11 @@ def reason(error: BaseException) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
+def source_of(path: str | Path) -> str:
+    """Name of a file for messages; ``-`` is stdin."""
+    return "<stdin>" if str(path) == "-" else one_line(path)
+
+
 def one_line(path: str | Path) -> str:
     """Make a path, or any text, printable on one line."""
     text = str(path)

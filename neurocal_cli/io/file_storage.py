@@ -28,12 +28,8 @@ def read_tree(path: str | Path) -> Field:
 
 def parse_tree(text: str, source: str) -> Field:
     """Read the text of a YAML, JSON or XML file; see `read_tree`."""
-    start = text.lstrip()[:1]
-    if start == "<":
-        return Field(_parse_xml(text, source), source)
-    if start == "{":
-        return Field(_parse_json(text, source), source)
-    return Field(parse_yaml(text, source), source)
+    parse = {"<": _parse_xml, "{": _parse_json}.get(text.lstrip()[:1], parse_yaml)
+    return Field(parse(text, source), source)
 
 
 def _parse_json(text: str, source: str) -> Any:

@@ -38,7 +38,6 @@ def repeatable_stdin() -> Iterator[None]:
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
     """Read a whole file, or stdin for ``-``, and its name for messages."""
     if str(path) == "-":
-        _protect_stdin()
         with _stdin_failures():
             return _stdin().read(), "<stdin>"
     source = one_line(path)
@@ -50,7 +49,6 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
     """Read a file in blocks of whole lines of about `size` bytes; without line ends it is one block."""
     if str(path) == "-":
-        _protect_stdin()
         with _stdin_failures():
             yield from _whole_lines(_stdin(), size)
         return
@@ -68,21 +66,17 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
 
 
 def _stdin() -> IO[bytes]:
+    """Stdin, or what was kept of it; the current command may not overwrite its file."""
+    if outputs := held_back():
+        outputs.protect("-")
     kept = _KEPT.get()
     return sys.stdin.buffer if kept is None else io.BytesIO(kept)
 
 
 def _protect(file: IO[bytes]) -> None:
     """Prevent the current command from overwriting a file that it reads."""
-    outputs = held_back()
-    if outputs is not None:
+    if outputs := held_back():
         outputs.protect_status(os.fstat(file.fileno()))
-
-
-def _protect_stdin() -> None:
-    outputs = held_back()
-    if outputs is not None:
-        outputs.protect("-")
 
 
 def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:

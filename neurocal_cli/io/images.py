@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -178,7 +179,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
     """Decode a file with a valid header; the decoder's output to stderr is not shown."""
     with captured_stderr() as complaints:
         try:
-            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+            pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
             pixels = None
     if pixels is None:
@@ -196,11 +197,9 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
         raise FormatError(
             f"does not hold a single picture of {header.width} x {header.height} px; save it again", source
         )
-    if pixels.dtype == np.uint8:
-        return pixels.astype(np.uint8, copy=False)
-    if pixels.dtype == np.uint16:
-        return pixels.astype(np.uint16, copy=False)
-    raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
+    return pixels
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.reading import read_intrinsics
@@ -31,8 +31,7 @@ _PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"
 _TABLE = Schema(kind="cameras", required=_PARAMETERS, optional=("t_z", *CONTROLS))
 _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
-# The coefficients of each of these models begin with those of the previous one.
-_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
+_NESTED = (*POLYNOMIAL_MODELS, "rational")  # each has the coefficients of the one before it, and more
 # Contents of a file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; lenses; image sizes.
 _Rows = tuple[dict[str, Array], list[Distortion], set[tuple[int, int]]]
 

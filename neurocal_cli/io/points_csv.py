@@ -30,7 +30,7 @@ POINTS = Schema(
     required=(*PLACE, *PIXEL),
     optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *SETTINGS),
     labels=frozenset({"view", "point"}),
-    headerless=(*PLACE, *PIXEL),
+    headerless=True,
     instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 
@@ -227,8 +227,10 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
     """Refuse points at several zoom or focus settings, because a calibration has one setting."""
     for name in SETTINGS:
         given = [(table, table.numbers[name]) for table in tables if name in table.numbers]
+        if not given:
+            continue
+        setting = given[0][1][0]
         for table, column in given:
-            setting = given[0][1][0]
             differs = column != setting
             if differs.any():
                 row = int(np.argmax(differs))
@@ -237,9 +239,7 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
                     "but a calibration has one setting of zoom and focus; give one setting, or use "
                     "`neurocal lens fit`"
                 )
-        if given:
-            setting = given[0][1][0]
-            notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
+        notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
 
 
 def _covariance(tables: list[Table]) -> Array | None:

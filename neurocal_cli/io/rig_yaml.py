@@ -127,8 +127,8 @@ def rig_from_field(root: Field) -> Rig:
         pose,
         std | {"baseline": block["baseline_std"].number_or_nan()},
         block["covariance"]["data"].array(6, 6, unknown=True),
-        tuple(_names(entry, 2) for entry in block["pairs"].items()),  # type: ignore[misc]
-        {_names(entry, 3)[:2]: _names(entry, 3)[2] for entry in block["left_out"].items()},  # type: ignore[misc]
+        tuple((a, b) for a, b in (_names(entry, 2) for entry in block["pairs"].items())),
+        {(a, b): why for a, b, why in (_names(entry, 3) for entry in block["left_out"].items())},
         rmse_px=block["rmse_px"].number_or_nan(),
         max_px=block["max_px"].number_or_nan(),
         converged=block["converged"].boolean(),

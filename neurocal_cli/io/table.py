@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.failures import one_line
+from neurocal_cli.io.failures import one_line, source_of
 from neurocal_cli.io.files import decode, read_blocks, read_bytes
 from neurocal_cli.io.table_header import (
     Layout,
@@ -31,9 +31,9 @@ from neurocal_cli.io.table_header import (
     decimal_commas,
     find_layout,
     is_decimal_comma,
-    is_number,
     split_fields,
 )
+from neurocal_cli.io.tree_fields import is_number
 
 _BLOCK = 1 << 22  # bytes of a stream read at a time, some ten thousand rows
 # Printable ASCII without quotes, with tabs and line ends: characters that both readers treat alike.
@@ -91,7 +91,7 @@ def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Itera
     It reads `block` bytes at a time, into which the lines above the header must fit. Before an error in a
     line, earlier blocks have been yielded.
     """
-    source = "<stdin>" if str(path) == "-" else one_line(path)
+    source = source_of(path)
     layout, rows = None, False
     for data in read_blocks(path, block):
         data = _plain_lines(data, source, schema)

@@ -14,10 +14,8 @@ from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.failures import one_line, value_failures
+from neurocal_cli.io.tree_fields import is_number
 from neurocal_cli.points import UNDISTORTED
-
-# Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
-is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 # 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
@@ -37,7 +35,7 @@ class Schema:
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
     labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
-    headerless: tuple[str, ...] = ()  # columns of a file without a header; if empty, the header is required
+    headerless: bool = False  # whether a file may have the required columns without a header
     instead: str = ""  # advice for files of another kind
 
     @property
@@ -219,9 +217,9 @@ def decimal_commas(found: int, expected: int, separator: str | None) -> str:
 def _headerless_names(
     fields: list[str], separator: str | None, comments: list[str], schema: Schema
 ) -> tuple[str, ...]:
-    expected = schema.headerless
-    if not expected:
-        raise InputError(f"the header is missing; begin with {','.join(schema.required)}")
+    expected = schema.required
+    if not schema.headerless:
+        raise InputError(f"the header is missing; begin with {','.join(expected)}")
     if len(fields) != len(expected):
         points = decimal_commas(len(fields), len(expected), separator)
         raise InputError(

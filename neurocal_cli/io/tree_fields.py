@@ -14,8 +14,8 @@ from neurocal_cli.geometry import Array
 
 T = TypeVar("T")
 
-# YAML 1.1 reads 1e-05 as text, because it has no decimal point, but other programs write numbers so.
-_NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+# Form of a number in our files; Python's float() would also accept 1_0 and digits of other alphabets.
+is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 
 class Field:
@@ -42,17 +42,13 @@ class Field:
 
     def __getitem__(self, key: str) -> Field:
         """Value of a required key."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        if key not in self.value:
+        if key not in self._mapping():
             self.refuse(f"the key {self._below(key)} is missing; add it or write the file again")
         return Field(self.value[key], self.source, self._below(key))
 
     def get(self, key: str, default: Any = None) -> Field:
         """Value of a key, or a default if the key is missing or null."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        found = self.value.get(key)
+        found = self._mapping().get(key)
         return Field(default if found is None else found, self.source, self._below(key))
 
     def first(self, keys: Iterable[str]) -> Field | None:
@@ -66,9 +62,7 @@ class Field:
 
     def entries(self) -> dict[str, Field]:
         """All values of a mapping, by their keys."""
-        if not isinstance(self.value, dict):
-            self.fail("a mapping (key: value)")
-        return {key: self[key] for key in self.value}
+        return {key: self[key] for key in self._mapping()}
 
     def items(self) -> Iterator[Field]:
         """Iterate over the entries of a list."""
@@ -150,6 +144,11 @@ class Field:
             self.fail(expected)
         return np.array(numbers, dtype=float).reshape(objects.shape)
 
+    def _mapping(self) -> dict[str, Any]:
+        if not isinstance(self.value, dict):
+            self.fail("a mapping (key: value)")
+        return self.value
+
     def _below(self, key: str) -> str:
         shown = key if re.fullmatch(r"[\w.-]{1,60}", key) else repr(key[:60])
         return f"{self.path}.{shown}" if self.path else shown
@@ -164,7 +163,8 @@ def _as_float(value: Any) -> float:
             return float(value)
         except OverflowError:
             return math.nan
-    if isinstance(value, str) and re.fullmatch(_NUMBER_TEXT, value):
+    # YAML 1.1 reads 1e-05 as text, because it has no decimal point, but other programs write numbers so.
+    if isinstance(value, str) and is_number(value):
         return float(value)
     return math.nan
 

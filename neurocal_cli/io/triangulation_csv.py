@@ -21,7 +21,7 @@ MATCHES = Schema(
     required=("uL", "vL", "uR", "vR"),
     optional=("point",),
     labels=frozenset({"point"}),
-    headerless=("uL", "vL", "uR", "vR"),
+    headerless=True,
 )
 _LARGEST = 1e100  # squares of pixels beyond this overflow
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")

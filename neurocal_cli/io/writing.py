@@ -58,8 +58,6 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
                 for chunk in chunks:
                     file.write(_encode(chunk))
             return
-        if outputs is not None:
-            outputs.check(one_line(path), former)
         _check_place(path, former)
         target = os.path.realpath(path)
         temporary = _written_beside(target, chunks, former)
@@ -85,7 +83,7 @@ def check_places(*paths: str | None) -> None:
     A UsageError says that an output is an input of the command (`Outputs.protect`), or that two outputs are
     the same file or stdout.
     """
-    outputs, taken = held_back(), set[str]()
+    taken = set[str]()
     for path in paths:
         if path is None:
             continue
@@ -98,8 +96,6 @@ def check_places(*paths: str | None) -> None:
             former, target = _status(path), os.path.realpath(path)
             if former is not None and not (stat.S_ISREG(former.st_mode) or stat.S_ISDIR(former.st_mode)):
                 continue
-            if outputs is not None:
-                outputs.check(one_line(path), former)
             _check_place(path, former)
             if target in taken:
                 raise UsageError(f"{one_line(path)} is given for two outputs; give each a place of its own")
@@ -107,6 +103,9 @@ def check_places(*paths: str | None) -> None:
 
 
 def _check_place(path: str | Path, former: os.stat_result | None) -> None:
+    """Refuse an input of the command, and a place where no file can be written."""
+    if outputs := held_back():
+        outputs.check(one_line(path), former)
     folder = os.path.dirname(os.path.realpath(path))
     if str(path).endswith(os.sep) or (former is not None and stat.S_ISDIR(former.st_mode)):
         raise IsADirectoryError(errno.EISDIR, "is a folder")

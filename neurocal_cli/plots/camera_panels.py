@@ -187,7 +187,7 @@ def draw_coverage(axes: Axes, subject: Subject) -> None:
         middle = across[column : column + 2].mean(), down[row : row + 2].mean()
         axes.plot(*middle, "x", color=ACCENT, markersize=8)
     some = np.random.default_rng(0).permutation(len(u))[:_MOST_DOTS]
-    axes.plot(u[some], v[some], ".", color=INK, markersize=1.5, rasterized=len(u) > 2000)
+    axes.plot(u[some], v[some], ".", color=INK, markersize=1.5, rasterized=len(u) > _MANY_DOTS)
     style(axes, f"Coverage: {np.mean(counts > 0):.0%} of the parts of the image hold points")
     axes.grid(False)
 

@@ -12,6 +12,7 @@ from neurocal_cli.plots.camera_panels import Subject, draw_poses, panels_of
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.stereo.space_error import SpaceError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,7 +82,7 @@ def draw_points_in_space(
     panels: dict[str, Draw] = {
         "across": lambda axes: _draw_cloud(axes, errors[:, :2], ("X right", "Y down"), unit),
         "depth": lambda axes: _draw_cloud(axes, errors[:, [0, 2]], ("X right", "Z depth"), unit),
-        "depths": lambda axes: _draw_depths(axes, evaluation, unit),
+        "depths": lambda axes: _draw_depths(axes, found, unit),
         "views": lambda axes: _draw_space_views(axes, evaluation, unit),
         "poses": lambda axes: draw_poses(axes, None if rig is None else rig.left, others),
     }
@@ -134,9 +135,8 @@ def _draw_cloud(axes: Axes, errors: Array, names: tuple[str, str], unit: str) ->
         axes.invert_yaxis()
 
 
-def _draw_depths(axes: Axes, evaluation: StereoEvaluation, unit: str) -> None:
+def _draw_depths(axes: Axes, found: SpaceError, unit: str) -> None:
     """Draw the error by depth."""
-    found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     for part in found.depths:
         axes.plot([part.nearest, part.farthest], [part.rmse] * 2, color=INK, linewidth=3)
         middle = (part.nearest + part.farthest) / 2

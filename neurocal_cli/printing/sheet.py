@@ -146,8 +146,7 @@ def _black(laid: Laid) -> Array:
     start, end = np.maximum(first, low), np.minimum(first + 1, high)
     kept = ((end - start) > 1e-9).all(axis=1)
     (a, b), (x, y) = start[kept].T, end[kept].T
-    return laid.at(np.stack([np.stack([a, b], -1), np.stack([x, b], -1), np.stack([x, y], -1),
-                             np.stack([a, y], -1)], axis=1))  # fmt: skip
+    return laid.at(np.column_stack([a, b, x, b, x, y, a, y]).reshape(-1, 4, 2))
 
 
 def _beside(start: Array, end: Array) -> list[Line]:

@@ -14,6 +14,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.report import plural
 
 _NO_SKEW = 1e-3  # px; a smaller loss is not reported
 _NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported
@@ -65,10 +66,7 @@ def adapt_cameras(
         parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
         seen = [part.points.pixels for part in parts]
     for camera, points in zip(cameras.cameras, seen, strict=True):
-        if model is None:
-            new, near, loss = _adapted(camera, target, force, points)
-        else:
-            new, near, loss = _of_model(camera, model, target, points)
+        new, near, loss = _adapted(camera, target, model, force, points)
         adapted.append(new)
         losses += [f"{camera.name}: {loss}"] if loss else []
         moved.append(None if near is None else near.over_image)
@@ -81,25 +79,22 @@ def adapt_cameras(
             else "the new camera has no standard deviations, points and verdict"
         )
     if n_views:
-        count = f"{n_views} view{'s' * (n_views != 1)}"
-        remarks.append(f"a file of {target.program} has no place for the poses of {count}")
+        remarks.append(f"a file of {target.program} has no place for the poses of {plural(n_views, 'view')}")
     found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else cameras.origin)
     return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
 
 
-def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Adaptation:
-    straight = target.skew or not camera.intrinsics.skewed
-    if with_model(camera.distortion, model) is not None and straight:
-        return _as_model(camera, model), None, ""
-    near = nearest_camera(camera, model, target.skew, points)
-    return near.camera, near, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
-
-
-def _adapted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Adaptation:
-    model = next((m for m in target.models if with_model(camera.distortion, m) is not None), None)
+def _adapted(
+    camera: Camera, target: Format, wanted: str | None, force: bool, points: Array | None
+) -> _Adaptation:
+    models = target.models if wanted is None else (wanted,)
+    model = next((m for m in models if with_model(camera.distortion, m) is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
     if model is not None and straight:
         return _as_model(camera, model), None, ""
+    if wanted is not None:
+        near = nearest_camera(camera, wanted, target.skew, points)
+        return near.camera, near, f"the nearest {wanted}{'' if straight else ' without skew'} {_pixels(near)}"
     if model is not None:
         near = nearest_camera(camera, model, False, points)
         if near.over_image.max_px < _NO_SKEW:

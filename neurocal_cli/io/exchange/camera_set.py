@@ -40,6 +40,11 @@ class CameraSet:
             )
 
     @property
+    def mounted(self) -> tuple[Pose, ...]:
+        """Poses from the first camera to each of them."""
+        return (Pose(np.eye(3), np.zeros(3)), *self.relative)
+
+    @property
     def has_lengths(self) -> bool:
         """Whether there is any translation, so that the unit matters."""
         return bool(self.relative or self.poses)
@@ -69,13 +74,13 @@ class Format:
 
     program: str  # name for messages
     models: tuple[str, ...]  # our names of its distortion models, the simplest first
-    skew: bool  # whether its programs support skew
-    poses: bool  # whether it contains the poses of views
-    most_cameras: int
-    metres: bool  # whether lengths are in metres
-    needs_size: bool  # whether the image size must be known
     # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
     text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
+    skew: bool = False  # whether its programs support skew
+    poses: bool = False  # whether it contains the poses of views
+    most_cameras: int = 2
+    metres: bool = False  # whether lengths are in metres
+    needs_size: bool = False  # whether the image size must be known
 
 
 def to_vector(R: Array) -> Array:

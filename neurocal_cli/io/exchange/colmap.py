@@ -174,21 +174,20 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
     if len(cameras.cameras) == 1 and not cameras.poses:
         return {"": _joined(files["cameras.txt"])}
-    rig = (Pose(np.eye(3), np.zeros(3)), *cameras.relative)
+    rig = cameras.mounted
     sensors = [f"CAMERA {k} 1 {_seven(pose)}" for k, pose in enumerate(rig[1:], start=2)]
     files["rigs.txt"] = [" ".join([f"1 {len(rig)} CAMERA 1", *sensors])]
     files["frames.txt"], files["images.txt"], files["points3D.txt"] = [], [], []
-    number_of_image = 0
     if len({_word(view) for view in cameras.poses}) < len(cameras.poses):
         raise InputError("two names of views differ by blanks alone, which COLMAP's have not; rename one")
     for frame, (view, pose) in enumerate(cameras.poses.items(), start=1):
         data = []
         for camera, mounted in enumerate(rig, start=1):
-            number_of_image += 1
-            data.append(f"CAMERA {camera} {number_of_image}")
+            image = (frame - 1) * len(rig) + camera
+            data.append(f"CAMERA {camera} {image}")
             # As in COLMAP's rigs, the images of each camera are in a folder with its name.
             name = f"camera{camera}/{_word(view)}" if len(rig) > 1 else _word(view)
-            files["images.txt"] += [f"{number_of_image} {_seven(after(mounted, pose))} {camera} {name}", ""]
+            files["images.txt"] += [f"{image} {_seven(after(mounted, pose))} {camera} {name}", ""]
         files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
     return {name: _joined(lines) for name, lines in files.items()}
 
@@ -213,4 +212,4 @@ def _seven(pose: Pose) -> str:
     return " ".join(map(number, [*to_quaternion(pose.R), *pose.t]))
 
 
-FORMAT = Format("COLMAP", tuple(_NAMES), False, True, 99, False, True, _text)
+FORMAT = Format("COLMAP", tuple(_NAMES), _text, poses=True, most_cameras=99, needs_size=True)

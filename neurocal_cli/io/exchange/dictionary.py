@@ -165,6 +165,6 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
 
 
 _ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
-OPENCV = Format("OpenCV", _ALL, False, True, 2, False, False, _opencv)
-JSON = Format("JSON", _ALL, True, True, 2, False, False, lambda set_, _: {"": json_text(entries(set_))})
-NPZ = Format("NumPy", _ALL, True, True, 2, False, False, lambda set_, _: {"": npz_bytes(entries(set_))})
+OPENCV = Format("OpenCV", _ALL, _opencv, poses=True)
+JSON = Format("JSON", _ALL, lambda set_, _: {"": json_text(entries(set_))}, skew=True, poses=True)
+NPZ = Format("NumPy", _ALL, lambda set_, _: {"": npz_bytes(entries(set_))}, skew=True, poses=True)

@@ -83,7 +83,7 @@ def _camera(field: Field, name: str) -> Camera:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    lines, before = [], Pose(np.eye(3), np.zeros(3))
+    lines, mounted = [], cameras.mounted
     for k, camera in enumerate(cameras.cameras):
         a, _, b, u0, v0 = camera.entries
         model, lens = _WRITTEN.get(camera.distortion.model, ("pinhole", "radtan"))
@@ -100,12 +100,11 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
             f"  rostopic: {text(f'/{camera.name}/image_raw')}",
         ]
         if k:
-            pose = cameras.relative[k - 1]
-            step = after(pose, inverse(before))
+            step = after(mounted[k], inverse(mounted[k - 1]))
             lines.append("  T_cn_cnm1:")
             lines += [f"  - {flow(row)}" for row in np.vstack([step.D, [0.0, 0.0, 0.0, 1.0]])]
-            before = pose
     return {"": "\n".join([*lines, ""])}
 
 
-FORMAT = Format("Kalibr", ("none", "k1k2p1p2", *_WRITTEN), False, False, 99, True, True, _text)
+_HELD = ("none", "k1k2p1p2", *_WRITTEN)
+FORMAT = Format("Kalibr", _HELD, _text, most_cameras=99, metres=True, needs_size=True)

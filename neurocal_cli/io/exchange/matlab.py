@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
@@ -96,7 +96,7 @@ def _camera(tree: dict[str, Any]) -> Camera:
         height, width = _numbers(tree, "ImageSize", 2)
         size = int(width), int(height)
     model = "plumb_bob" if k3 else "k1k2p1p2" if k.any() else "none"
-    lens = Distortion(model, k[: {"plumb_bob": 5, "k1k2p1p2": 4, "none": 0}[model]])
+    lens = Distortion(model, k[: len(MODELS[model])])
     return Camera(Intrinsics.from_matrix(K), lens, size)
 
 
@@ -176,4 +176,4 @@ def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
     }
 
 
-FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), True, True, 2, False, True, _text)
+FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), _text, skew=True, poses=True, needs_size=True)

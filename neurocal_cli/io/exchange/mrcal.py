@@ -10,10 +10,8 @@ import ast
 import re
 from typing import Any
 
-import numpy as np
-
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
@@ -22,12 +20,12 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import number
 
 REFERENCE = "reference"  # view name of the pose in the common world
-_LENGTHS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 _NAMES = {
     "none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8",
     "thin_prism": "OPENCV12",
 }  # fmt: skip
-_BY_LENGTH = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
+_LENGTHS = {name: len(MODELS[model]) for model, name in _NAMES.items()}
+_BY_LENGTH = {len(MODELS[model]): model for model in _NAMES}
 _START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
 
 
@@ -67,10 +65,9 @@ def _numbers(field: Field, count: int) -> Array:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    if len(cameras.cameras) == 1:
-        world = cameras.poses.get(REFERENCE, Pose(np.eye(3), np.zeros(3)))
-        return {"": _model(cameras.cameras[0], world)}
-    poses = (Pose(np.eye(3), np.zeros(3)), *cameras.relative)
+    poses = cameras.mounted
+    if len(poses) == 1:
+        return {"": _model(cameras.cameras[0], cameras.poses.get(REFERENCE, poses[0]))}
     names = ["left", "right"] if len(poses) == 2 else [f"camera{k}" for k in range(len(poses))]
     return {
         f"{name}.cameramodel": _model(camera, pose)
@@ -95,4 +92,4 @@ def _model(camera: Camera, pose: Pose) -> str:
     )
 
 
-FORMAT = Format("mrcal", tuple(_NAMES), False, False, 99, False, True, _text)
+FORMAT = Format("mrcal", tuple(_NAMES), _text, most_cameras=99, needs_size=True)

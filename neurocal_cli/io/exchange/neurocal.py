@@ -121,4 +121,4 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
 
 
-FORMAT = Format("neurocal", tuple(MODELS), True, True, 2, False, False, _text)
+FORMAT = Format("neurocal", tuple(MODELS), _text, skew=True, poses=True)

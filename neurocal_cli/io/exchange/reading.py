@@ -13,7 +13,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_tree import boofcv_camera
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format, after, inverse
-from neurocal_cli.io.failures import one_line, value_failures
+from neurocal_cli.io.failures import source_of, value_failures
 from neurocal_cli.io.file_storage import parse_tree
 from neurocal_cli.io.files import decode, read_bytes
 from neurocal_cli.io.tree_fields import Field
@@ -33,13 +33,12 @@ FORMATS: dict[str, Format] = {
 _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 
 
-def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
+def read_cameras(paths: Sequence[str | Path]) -> CameraSet:
     """Read the cameras of a file of a known program, or of two files that belong together.
 
     One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder that
     holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left and the
-    right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. Poses and points of a neurocal
-    file are read only if `whole`.
+    right camera of ROS or mrcal, or the two files of OpenCV's stereo sample.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
@@ -51,32 +50,29 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
         merged = Field({**first.value, **second.value}, f"{first.source}, {second.source}")
         with value_failures(merged.source):
             return dictionary.from_tree(merged)
-    cameras = [_cameras(one, whole or len(names) > 1) for one in opened]
+    cameras = [_cameras(one, whole=True) for one in opened]
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
 
 def read_intrinsics(path: str | Path) -> Camera:
     """Read a single camera without its poses, from any file of `read_cameras`."""
-    found = read_cameras([path], whole=False)
-    if len(found.cameras) > 1:
-        raise FormatError("is a stereo rig; give the file of one camera", _source(str(path)))
-    return found.cameras[0]
+    return _single(path)[1].cameras[0]
 
 
 def read_given_camera(path: str | Path) -> Camera | Calibration:
     """Read a single camera without its poses; of a neurocal file also the covariance of its parameters."""
-    name = str(path)
-    opened = _opened(name)
-    found = _cameras(opened, whole=False)
-    if len(found.cameras) > 1:
-        raise FormatError("is a stereo rig; give the file of one camera", _source(name))
+    opened, found = _single(path)
     if isinstance(opened, Field) and found.program == "neurocal":
         return neurocal.without_points(opened, found)
     return found.cameras[0]
 
 
-def _source(name: str) -> str:
-    return "<stdin>" if name == "-" else one_line(name)
+def _single(path: str | Path) -> tuple[CameraSet | Field, CameraSet]:
+    opened = _opened(str(path))
+    found = _cameras(opened, whole=False)
+    if len(found.cameras) > 1:
+        raise FormatError("is a stereo rig; give the file of one camera", source_of(path))
+    return opened, found
 
 
 def _opened(name: str) -> CameraSet | Field:

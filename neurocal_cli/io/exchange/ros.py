@@ -63,4 +63,4 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
 
 
-FORMAT = Format("ROS", ("none", "plumb_bob", "rational", "fisheye"), False, False, 2, True, True, _text)
+FORMAT = Format("ROS", ("none", "plumb_bob", "rational", "fisheye"), _text, metres=True, needs_size=True)
