@@ -30,7 +30,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
     sharp_profile,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.shading import Shading, excess_variance, quadratic_terms
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
@@ -241,7 +241,7 @@ def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Arra
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
     n_u, n_v = normal.T
-    return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
+    return np.column_stack([polynomial_terms(frame, place, 6), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: Array, noise: float) -> LevelPrior:

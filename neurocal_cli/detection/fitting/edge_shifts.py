@@ -21,7 +21,7 @@ import numpy as np
 
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur, FieldBlur
 from neurocal_cli.detection.fitting.map_fit import MapFit
-from neurocal_cli.detection.fitting.shading import Shading, quadratic_terms
+from neurocal_cli.detection.fitting.shading import Shading, polynomial_terms
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -91,7 +91,7 @@ class EdgeShifts:
         s = self._relative_blur(lines)
         A, B = self.shading.at(lines.middle)
         levels = [s * (A - mean) / contrast, s * (B - contrast) / contrast]
-        places = s[:, None] * quadratic_terms(self.shading.frame, lines.middle)[:, 1:]
+        places = s[:, None] * polynomial_terms(self.shading.frame, lines.middle, 6)[:, 1:]
         return np.column_stack([np.ones_like(s), s - 1, *levels, places])
 
     def _relative_blur(self, lines: Lines) -> Array:

@@ -62,16 +62,17 @@ class Shading:
 
     def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
         """Differences of measured dark and light levels from the polynomials [DN]."""
-        dark, light = (
-            levels.level - polynomial_terms(self.frame, levels.place, len(coefficients)) @ coefficients
-            for levels, coefficients in zip(both, (self.dark, self.light), strict=True)
-        )
+        dark, light = (levels.level - self.levels_at(levels.place)[k] for k, levels in enumerate(both))
         return dark, light
+
+    def levels_at(self, place: Array) -> tuple[Array, Array]:
+        """Dark and light level at places (N, 2)."""
+        terms = polynomial_terms(self.frame, place, len(self.dark))
+        return terms @ self.dark, terms @ self.light
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = polynomial_terms(self.frame, place, len(self.dark))
-        dark, light = terms @ self.dark, terms @ self.light
+        dark, light = self.levels_at(place)
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
     def spread_at(self, place: Array) -> Array:
@@ -112,59 +113,44 @@ class LocalShading(Shading):
             return smooth
         above = smooth.off_levels((dark, light))
         spread = [
-            min(
-                excess_variance(rest - _Nearby.of(x.place, x.place, itself=False).mean(rest), x.variance),
-                before,
-            )
+            min(excess_variance(_unlike_others(x.place, rest), x.variance), before)
             for x, rest, before in zip((dark, light), above, smooth.spread, strict=True)
         ]
         near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above, has_border)
 
-    def at(self, place: Array) -> tuple[Array, Array]:
-        """Mean level and half contrast at places (N, 2)."""
-        terms = polynomial_terms(self.frame, place, len(self.dark))
+    def levels_at(self, place: Array) -> tuple[Array, Array]:
+        """Dark and light level at places (N, 2)."""
         dark, light = (
-            terms @ coefficients + _Nearby.of(near, place).mean(above)
-            for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
+            level + _nearness(near, place) @ above
+            for level, near, above in zip(super().levels_at(place), self.near, self.above, strict=True)
         )
-        return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
+        return dark, light
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
         if not self.has_border:
             return super().spread_at(place)
-        return np.stack(
-            [
-                base + _Nearby.of(near, place).variance(above)
-                for base, near, above in zip(self.spread, self.near, self.above, strict=True)
-            ]
-        )
+        spread = []
+        for base, near, above in zip(self.spread, self.near, self.above, strict=True):
+            weight = _nearness(near, place)
+            spread.append(base + np.maximum(weight @ above**2 - (weight @ above) ** 2, 0.0))
+        return np.stack(spread)
 
 
-@frozen_dataclass(eq=False)
-class _Nearby:
-    """Weights (N, M) of places near others, normal in their distances."""
+def _nearness(near: Array, place: Array, itself: bool = True) -> Array:
+    """Weights (N, M) of places `near` (M, 2) at places (N, 2), normal in their distances, with the sum 1."""
+    away = ((place[:, None] - near) ** 2).sum(axis=-1)
+    if not itself:
+        np.fill_diagonal(away, np.inf)
+    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
+    weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
+    return np.asarray(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
 
-    weight: Array
 
-    @classmethod
-    def of(cls, near: Array, place: Array, itself: bool = True) -> _Nearby:
-        """Weights of places `near` (M, 2) at places (N, 2)."""
-        away = ((place[:, None] - near) ** 2).sum(axis=-1)
-        if not itself:
-            np.fill_diagonal(away, np.inf)
-        width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
-        weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
-        return cls(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
-
-    def mean(self, value: Array) -> Array:
-        """(N,) means of values (M,)."""
-        return np.asarray(self.weight @ value)
-
-    def variance(self, value: Array) -> Array:
-        """(N,) variances of values (M,) around their means."""
-        return np.maximum(self.weight @ value**2 - self.mean(value) ** 2, 0.0)
+def _unlike_others(place: Array, value: Array) -> Array:
+    """Differences of values (N,) at places (N, 2) from the mean of the others nearby."""
+    return np.asarray(value - _nearness(place, place, itself=False) @ value)
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
@@ -222,10 +208,7 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     local = LocalShading.of(smooth, dark, light, has_border=True) if shadowed else richer
     if not isinstance(local, LocalShading):
         return richer
-    by_local = [
-        above - _Nearby.of(near, near, itself=False).mean(above)
-        for near, above in zip(local.near, local.above, strict=True)
-    ]
+    by_local = [_unlike_others(near, above) for near, above in zip(local.near, local.above, strict=True)]
     errors = [np.abs(np.concatenate(left)).mean() for left in (richer.off_levels(both), by_local)]
     return local if errors[1] < _CLEARLY * errors[0] else richer
 
@@ -236,7 +219,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
         return coefficients, np.inf
-    terms = quadratic_terms(frame, levels.place)
+    terms = polynomial_terms(frame, levels.place, _TERMS[-1])
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
     # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
@@ -305,16 +288,8 @@ def excess_variance(residual: Array, variance: Array) -> float:
     return max(upper_median(residual**2) / CHI2_MEDIAN - 2 * upper_median(variance), 0.0)
 
 
-def quadratic_terms(frame: Frame, place: Array) -> Array:
-    """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, 6)."""
-    x, y = ((place - frame.centre) / frame.unit).T
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-
-
 def polynomial_terms(frame: Frame, place: Array, count: int) -> Array:
     """1, x, y, x^2, x y, y^2, x^3, ... of places (N, 2) [px], scaled by the frame; (N, count)."""
-    if count == _TERMS[-1]:
-        return quadratic_terms(frame, place)
     x, y = ((place - frame.centre) / frame.unit).T
     terms = power = [np.ones_like(x)]
     while len(terms) < count:
