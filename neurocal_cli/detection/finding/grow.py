@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.checks import check_vertices
+from neurocal_cli.detection.finding.checks import VertexCheck, check_vertices
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square, signs
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
@@ -147,24 +147,29 @@ def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) ->
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
 
 
-def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
-    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
+def _checked(level: Level, lattice: Lattice) -> tuple[Lattice, VertexCheck, Array]:
+    """The lattice with measured contrasts, its vertices' checks, and how far these are off, in tolerances."""
     row, col, predicted = lattice.predicted
     points = lattice.pixels[row, col]
     check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
     contrast = lattice.contrast.copy()
     contrast[row, col] = check.contrast
-    result = lattice.with_contrast(contrast)
-    right = (
+    return lattice.with_contrast(contrast), check, _off(predicted, points) / _tolerance(predicted)
+
+
+def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
+    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
+    lattice, check, off = _checked(level, lattice)
+    row, col, predicted = lattice.predicted
+    good = np.zeros(lattice.contrast.shape, dtype=bool)
+    good[row, col] = (
         check.is_vertex
-        & (_off(predicted, points) < _tolerance(predicted))
+        & (off < 1)
         & (predicted.area > 4)
         & (predicted.spread < 2 * _MOST_SPREAD)
+        & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     )
-    right &= check.contrast > _WEAKEST * _usual_contrast(result)[row, col]
-    good = np.zeros(contrast.shape, dtype=bool)
-    good[row, col] = right
-    return result, good
+    return lattice, good
 
 
 def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
@@ -173,23 +178,17 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         row, col, predicted = lattice.predicted
         if not len(row):
             break
-        pixels, contrast, seen = lattice.pixels, lattice.contrast.copy(), lattice.seen
-        points = pixels[row, col]
-        off = _off(predicted, points) / _tolerance(predicted)
-        off = np.where((predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD), off, np.inf)
-        check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
+        lattice, check, off = _checked(level, lattice)
         # Vertices outside complete squares have fewer neighbours to confirm them.
-        closes = in_whole_square(seen)[row, col]
+        closes = in_whole_square(lattice.seen)[row, col]
         accepted = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
+        accepted &= (predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD)
         off = np.where(accepted, off, np.inf)
-        contrast[row, col] = check.contrast
         if not (off > 1).any():
-            lattice = lattice.with_contrast(contrast)
             break
         # An outlier spoils the predictions of its neighbours, so remove only the worst of a neighbourhood.
-        worst = np.zeros(pixels.shape[:2])
+        worst = np.zeros(lattice.contrast.shape)
         worst[row, col] = off
         bad = (worst > 1) & (worst >= cv2.dilate(worst, np.ones((3, 3), np.uint8)))
-        pixels = np.where(bad[..., None], np.nan, pixels)
-        lattice = Lattice(pixels, np.where(bad, np.nan, contrast), lattice.dark)
+        lattice = lattice.subset(~bad)
     return lattice.cropped()

@@ -19,6 +19,8 @@ from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+# Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _FEWEST = 9  # saddles, for 3 x 3 vertices
 # Insensitive; tests/test_finding.py.
 _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
@@ -127,12 +129,11 @@ def find_seeds_3x3(links: Links) -> Index:
     centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
     block[:, 1, 1] = centre
-    for p, (c, r) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+    for p, (c, r) in enumerate(STEPS):
         block[:, 1 + r, 1 + c] = links.to[centre, p]
         # The vertex between ports p and p + 1: from the neighbour, through the port before the entry.
         corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
-        c2, r2 = ((1, 1), (-1, 1), (-1, -1), (1, -1))[p]
-        block[:, 1 + r2, 1 + c2] = corner
+        block[:, 1 + r + c, 1 + c - r] = corner
     grid = links.saddles.points[block]
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")

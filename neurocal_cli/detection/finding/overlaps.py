@@ -64,8 +64,6 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
     Such rows occur if a lattice has grown across a fold into the other plane.
     """
     result = list(lattices)
-    if len(result) < 2:
-        return result
     for _ in range(2):
         places = [_vertices_and_next(x) for x in result]
         for i, lattice in enumerate(result):
