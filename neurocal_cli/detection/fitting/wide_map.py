@@ -55,6 +55,7 @@ class WideMap(SmoothMap):
     richest_lens: ClassVar[int] = len(_LENSES) - 1
     lens_models: ClassVar[tuple[tuple[int, int], ...]] = models[: len(_LENSES)]
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
+    square: ClassVar[slice] = _SQUARE
     rest: ClassVar[int] = _REST
 
     turn: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) R
@@ -73,7 +74,7 @@ class WideMap(SmoothMap):
         values = self.parameters
         direction, across, angle = self._seen(ground)
         stretch = angle * (values[_FIRST : _SQUARE.start] @ self._profile(angle)[0]) / across
-        return np.asarray(values[_CENTRE, None] + self._squared @ (stretch * direction[:2]))
+        return np.asarray(values[_CENTRE, None] + self._metric @ (stretch * direction[:2]))
 
     def along(self, places: Places) -> tuple[Array, Array]:
         """Pixels along the places' directions, and their derivatives; see `SmoothMap.along`."""
@@ -91,7 +92,7 @@ class WideMap(SmoothMap):
         out[_CENTRE] = axis
         out[_SQUARE.start] = axis[0] * q[0] - axis[1] * q[1]
         out[_SQUARE.start + 1] = axis[0] * q[1] + axis[1] * q[0]
-        axis = self._squared @ axis
+        axis = self._metric @ axis
         outwards = (axis * towards).sum(axis=0)
         value += radius * outwards
         np.multiply(terms, angle * outwards, out=out[_FIRST : _SQUARE.start])
@@ -123,11 +124,6 @@ class WideMap(SmoothMap):
             terms.append(2 * w * terms[-1] - terms[-2])
             slopes.append(2 * terms[-2] + 2 * w * slopes[-1] - slopes[-2])
         return np.array(terms), np.array(slopes) * (4 * angle / self.widest**2)
-
-    @property
-    def _squared(self) -> Array:
-        m, n = self.parameters[_SQUARE]
-        return np.array([[1 + m, n], [n, 1 - m]])
 
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:
