@@ -11,6 +11,7 @@ import numpy as np
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.predict import predict_vertices
+from neurocal_cli.detection.grid import TURNS
 from neurocal_cli.geometry import Array
 
 # Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
@@ -24,7 +25,6 @@ _BESIDE = 2.0  # squares; lattices farther apart share no vertices
 _NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
 _LEAST = 4  # least number of vertices compared
-_TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
@@ -161,8 +161,7 @@ def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
     if near.sum() < _LEAST:
         return None
     own = np.stack([col, row], axis=-1)[near]
-    for numbers in _TURNS:
-        turn = np.array(numbers, dtype=np.intp).reshape(2, 2)
+    for turn in np.array(TURNS):
         away = grid[near] - own @ turn.T
         shift = np.rint(np.median(away, axis=0)).astype(np.intp)
         off = np.abs(away - shift).max(axis=1)
