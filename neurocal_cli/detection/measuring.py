@@ -58,8 +58,7 @@ def measure(
         return _nothing(grid)
     fitted = fit_grid(grid_image)
     vertices = np.full(grid.pixels.shape, np.nan)
-    seen = grid.seen
-    vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
+    vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
@@ -155,11 +154,10 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
     uneven = fitted.unevenness
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
-    index = np.argwhere(grid_image.grid.seen)[:, ::-1]
-    vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
+    vertices[grid_image.grid.seen] = np.where(good[:, None], pixels, np.nan)
     return Measured(
-        kind=np.full(len(index), VERTEX, dtype=np.int64),
-        index=index.astype(np.int64),
+        kind=np.full(len(pixels), VERTEX, dtype=np.int64),
+        index=grid_image.vertices.astype(np.int64),
         pixels=pixels,
         covariance=covariance,
         across=None,

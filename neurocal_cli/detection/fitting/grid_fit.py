@@ -483,6 +483,7 @@ def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Ar
 
 def _blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:
     """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
+    good = good if good.any() else np.ones_like(good)
     board = BoardBlur.of(fit, edges.normal, good)
     wide = isinstance(at, WideMap)
     if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
