@@ -1,7 +1,6 @@
 """Measure the mid-points or vertices of a grid to the limit set by the pixel noise.
 
-In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Each
-edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
+Each edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
 curvature of the edges and the position of each mid-point along its edge. The position across the edge comes
 from that edge alone. The outermost mid-points may be measured along their edges as well (`crossing_edges`).
 Gamma, ink spread and blooming displace all edges towards the dark or the light side: an alternating shift

@@ -1,8 +1,7 @@
 """Split a lattice that covers two planes at the fold between them.
 
-In: a lattice. Out: one lattice for each plane. Along a line of vertices on one plane, second differences
-change slowly, for any tilt and lens distortion. At a fold they jump: at one vertex if the fold goes through
-it, otherwise at the two vertices beside it.
+Along a line of vertices on one plane, second differences change slowly, for any tilt and lens distortion. At
+a fold they jump: at one vertex if the fold goes through it, otherwise at the two vertices beside it.
 """
 
 from __future__ import annotations

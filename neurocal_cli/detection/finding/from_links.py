@@ -1,7 +1,7 @@
 """A shortcut for growth: build most of a grid at once, by following links from vertex to vertex.
 
-In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is accepted only if every
-vertex passes the tests of `grow`. Growing layer by layer gives the same result more slowly.
+The lattice is accepted only if every vertex passes the tests of `grow`. Growing layer by layer gives the same
+result more slowly.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
 vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. If linked
 saddles are left over, `straighten` searches again in a view without the distortion of a wide lens.
-
-In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
 
 from __future__ import annotations

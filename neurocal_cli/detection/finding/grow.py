@@ -1,8 +1,7 @@
 """Grow a lattice layer by layer, and remove its outliers.
 
-In: a level and a lattice of at least 2 x 3 vertices. Out: a lattice of the visible part of the board. Every
-new vertex is predicted from its neighbours, searched near the prediction, and accepted if it lies within a
-tolerance of it and the image around it looks like a vertex.
+Every new vertex is predicted from its neighbours, searched near the prediction, and accepted if it lies
+within a tolerance of it and the image around it looks like a vertex.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _ROUNDS = 12  # greatest number of rounds of removing outliers
 def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
     """Add vertices between the known ones and, if `outwards`, around them, until no more are accepted.
 
-    With a reach of 2, growth also steps over a single hidden vertex.
+    The lattice has at least 2 x 3 vertices. With a reach of 2, growth also steps over a single hidden vertex.
     """
     sigma, start = lattice.derivative_sigma, lattice
     tried: set[tuple[int, int, int]] = set()

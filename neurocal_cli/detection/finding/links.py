@@ -1,9 +1,8 @@
 """Link neighbouring saddles along the edges of the squares, and find the blocks of squares that they close.
 
-In: a level. Out: its saddles, and the neighbour of each at its four ports; from these the seeds of grids, the
-most regular ones first, for `grids` to grow. An edge that leaves a vertex at a port followed by a dark sector
-enters the next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects
-an even with an odd port.
+The blocks are the seeds of grids. An edge that leaves a vertex at a port followed by a dark sector enters the
+next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects an even with
+an odd port.
 """
 
 from __future__ import annotations

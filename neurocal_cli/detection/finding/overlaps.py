@@ -1,7 +1,7 @@
 """Let each vertex belong to one lattice, and each board have one lattice.
 
 Copies of a lattice and rows beyond a fold are removed; the parts of a board that an occluder divides are
-joined. In: the lattices of a level. Out: lattices that share no vertices.
+joined.
 """
 
 from __future__ import annotations

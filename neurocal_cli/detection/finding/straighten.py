@@ -4,9 +4,6 @@ Near a wide lens, the squares of a board are bent, and change from one to the ne
 They are linked nevertheless, and an equidistant lens and a plane can be fitted to a group of linked saddles.
 In a view perpendicular to that plane, lines are straight and squares are equal, so growth finds the missing
 vertices (`find_bent`). The image of a very oblique board is stretched across its narrow squares (`stretch`).
-
-In: a level with its linked saddles, and the lattices already known. Out: lattices found in such views, in the
-level's pixels; or a stretched part of the level, which is searched again.
 """
 
 from __future__ import annotations
@@ -107,8 +104,8 @@ def find_bent(
     """Search again around groups of linked saddles that exceed the lattices, and around unfinished lattices.
 
     The links are those of the whole level, including known lattices. Unfinished lattices are known ones that
-    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found has
-    more vertices than the known ones at the same place.
+    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found, in
+    the level's pixels, has more vertices than the known ones at the same place.
     """
     found: list[Lattice] = []
     groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]

@@ -4,9 +4,6 @@ This does not use the package's least-squares core, because the problems are dif
 of independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
 memory traffic, and fits that have not converged with the others continue separately. The small normal
 equations are solved in float64.
-
-In: pixels, their model with derivatives, initial values, a prior. Out: `BatchFit` with values, Fisher
-information and chi2.
 """
 
 from __future__ import annotations

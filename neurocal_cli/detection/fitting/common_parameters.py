@@ -1,7 +1,4 @@
-"""Estimate the common parameters of a board's edges: pixel noise, profile shape, blur, levels.
-
-In: the fits of all edges. Out: weights, profile shape and priors for the next fits.
-"""
+"""Estimate the common parameters of a board's edges for the next fits: noise, profile shape, blur, levels."""
 
 from __future__ import annotations
 

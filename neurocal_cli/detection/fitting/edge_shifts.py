@@ -9,8 +9,6 @@ The terms of the shift that the edges of a board require are unknowns of its map
 
 s is the blur relative to its median. A and B are mean level and half contrast without their medians, in
 median half contrasts.
-
-In: blur and shading of a board, and the residuals of its map. Out: `EdgeShifts`, with the required terms.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Fit all edges of a board in stages, from vertices known to half a pixel to the noise limit.
 
 The stages are: a map through the found vertices, offsets of the edges from moments, a first fit with
-independent levels, common parameters, a last fit, and the map through its edges. In: `GridImage`. Out:
-`GridFit`, for `measuring`.
+independent levels, common parameters, a last fit, and the map through its edges.
 """
 
 from __future__ import annotations
@@ -213,7 +212,7 @@ class GridFit:
 
 
 def fit_grid(grid_image: GridImage) -> GridFit:
-    """Run all stages: map of the found vertices, moments, first fit, common parameters, last fit."""
+    """Run all stages."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     anchors = grid_image.anchors(_START_SIGMA)

@@ -1,7 +1,4 @@
-"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly.
-
-In: levels measured inside squares or by edge fits. Out: `Shading`, the levels and their gradients anywhere.
-"""
+"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly."""
 
 from __future__ import annotations
 

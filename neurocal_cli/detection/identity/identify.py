@@ -1,6 +1,6 @@
 """Identify the vertices of grids with those of the board.
 
-In: a board, the grids of an image, and the image. Out: `Located` grids. The criteria, in this order:
+The criteria, in this order:
 
 1. A grid is placed on a plane of its size. A partly hidden grid must show enough ends of the board that only
    one place is left.
