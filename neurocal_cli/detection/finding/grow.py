@@ -23,7 +23,7 @@ from neurocal_cli.geometry import Array
 _SEARCHED = 0.24  # squares; half width of the search around a prediction ...
 _STEPS = 7  # ... and number of samples in each direction
 _MOST_SPREAD = 5.0  # greatest spread of a prediction that is used
-_OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_tolerance`
+_OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_off`
 _WEAKEST = 0.55  # least contrast, relative to the neighbours
 # Stricter limits outside complete squares: least evenness, and greatest distance in units of the tolerance.
 _EVEN_ALONE, _OFF_ALONE = 0.88, 0.3
@@ -96,7 +96,7 @@ def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: f
     points = refine_saddles(level.image, _steepest_nearby(level, predicted, dark), sigma)
     good = np.isfinite(points[:, 0])
     points = np.where(good[:, None], points, predicted.points)
-    good &= _off(predicted, points) < _tolerance(predicted)
+    good &= _off(predicted, points) < 1
     check = check_vertices(level, points, predicted, dark)
     good &= check.is_vertex & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     row, col = row[good], col[good]
@@ -113,14 +113,10 @@ def _usual_contrast(lattice: Lattice) -> Array:
 
 
 def _off(predicted: PredictedVertices, points: Array) -> Array:
-    """(N,) larger component of the distance between points and their predictions [squares]."""
+    """(N,) larger component of the distance between points and their predictions, over its tolerance."""
     away = np.abs(predicted.in_squares(points - predicted.points))
-    return np.maximum(away[:, 0], away[:, 1])
-
-
-def _tolerance(predicted: PredictedVertices) -> Array:
-    """(N,) greatest distance of a vertex from its prediction [squares]."""
-    return np.asarray(_OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3))
+    tolerance = _OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3)
+    return np.asarray(np.maximum(away[:, 0], away[:, 1]) / tolerance)
 
 
 def _inside(level: Level, points: Array) -> NDArray[np.bool_]:
@@ -153,7 +149,7 @@ def _checked(level: Level, lattice: Lattice) -> tuple[Lattice, VertexCheck, Arra
     check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
     contrast = lattice.contrast.copy()
     contrast[row, col] = check.contrast
-    return lattice.with_contrast(contrast), check, _off(predicted, points) / _tolerance(predicted)
+    return lattice.with_contrast(contrast), check, _off(predicted, points)
 
 
 def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
