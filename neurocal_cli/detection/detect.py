@@ -177,7 +177,7 @@ def _sound(measured: Measured) -> Measured:
     with np.errstate(invalid="ignore", over="ignore"):
         good = (suu > 0) & (svv > 0) & (suu * svv > suv**2) & np.isfinite(suu * svv)
     good &= np.isfinite(measured.pixels).all(axis=1)
-    return measured.only(good)
+    return measured if good.all() else measured.only(good)
 
 
 def label(located: Located, measured: Measured) -> Labels:
