@@ -29,14 +29,8 @@ _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
 _SQUARE = slice(_FIRST + _PROFILE, _FIRST + _PROFILE + 2)  # of m and n
 _REST = _SQUARE.stop
-_LENSES: tuple[tuple[int, ...], ...] = (
-    (8, 9, 10),
-    (8, 9, 10, 11),
-    (8, 9, 10, 11, 12),
-    (8, 9, 10, 11, 12, 13),
-    tuple(range(8, _FIRST + _PROFILE)),
-    tuple(range(8, _REST)),
-)
+# Lenses free c and a_0, then more and more of the others.
+_LENSES = tuple(tuple(range(8, stop)) for stop in (11, 12, 13, 14, _SQUARE.start, _REST))
 # Prior standard deviations of the centre, of the profile beyond a_0, of m and n, and of the polynomial
 # [half diagonals].
 _CENTRE_PRIOR, _PROFILE_PRIOR, _SQUARE_PRIOR, _REST_PRIOR = 0.1, 0.3, 0.02, 0.1
