@@ -53,10 +53,11 @@ def measure(
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
     grid_image = GridImage(light, grid, floor)
-    if len(grid_image.edges.index) == 0:
-        return _nothing(grid)
-    fitted = fit_grid(grid_image)
     vertices = np.full(grid.pixels.shape, np.nan)
+    if len(grid_image.edges.index) == 0:
+        index = np.zeros((0, 2), dtype=np.int64)
+        return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
+    fitted = fit_grid(grid_image)
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
@@ -67,13 +68,6 @@ def measure(
     rim, fitted_rim = fit_rim(grid_image, fitted)
     outer = _midpoints(rim, fitted_rim, fitted.unevenness, vertices)
     return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
-
-
-def _nothing(grid: Grid) -> Measured:
-    none = np.zeros(0)
-    index = np.zeros((0, 2), dtype=np.int64)
-    vertices = np.full(grid.pixels.shape, np.nan)
-    return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
 def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
