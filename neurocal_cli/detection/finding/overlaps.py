@@ -6,6 +6,8 @@ joined.
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from neurocal_cli.detection.finding.grow import frontier
@@ -33,7 +35,7 @@ def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
         reach = _SAME * lattice.width
-        if not any((_distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
+        if not any((distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
             kept.append(lattice)
     return kept
 
@@ -46,8 +48,7 @@ def any_overlap(lattices: list[Lattice]) -> bool:
         boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
     return any(
         bool(((low <= other_high) & (other_low <= high)).all())
-        for k, (low, high) in enumerate(boxes)
-        for other_low, other_high in boxes[:k]
+        for (low, high), (other_low, other_high) in combinations(boxes, 2)
     )
 
 
@@ -86,7 +87,7 @@ def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
     points, width = place
     seen = lattice.seen
     away = np.full(seen.shape, np.inf)
-    away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)
+    away[seen] = distance(lattice.pixels[seen], points) / min(width, lattice.width)
     drop = np.zeros_like(seen)
     for line, inner in _OUTERMOST:
         known = int(seen[line].sum())
@@ -107,7 +108,7 @@ _OUTERMOST = (
 )
 
 
-def _distance(points: Array, others: Array) -> Array:
+def distance(points: Array, others: Array) -> Array:
     """(N,) distance of each point from the nearest of the others [px]."""
     if not len(points) or not len(others):
         return np.full(len(points), np.inf)
@@ -177,7 +178,7 @@ def _continued(base: Lattice, other: Lattice) -> Array:
     """Grid coordinates (N, 2) of the other lattice's vertices on the base, extrapolated by a homography."""
     row, col = np.nonzero(base.seen)
     p, q = base.pixels[row, col], other.pixels[other.seen]
-    away = _distance(p, q)
+    away = distance(p, q)
     # Lens distortion bends the plane, so the vertices near the other lattice have the largest weights.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
     centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)

@@ -19,6 +19,7 @@ from neurocal_cli.detection.finding.from_links import linked_group
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.links import Links, whole_blocks
+from neurocal_cli.detection.finding.overlaps import distance
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
@@ -87,7 +88,7 @@ def any_left(links: Links, known: list[Lattice]) -> bool:
     beside = np.zeros(len(saddles), dtype=bool)
     for lattice in known:
         own = lattice.pixels[lattice.seen]
-        away = np.sqrt(((saddles.points[:, None] - own) ** 2).sum(axis=-1).min(axis=1)) / lattice.width
+        away = distance(saddles.points, own) / lattice.width
         like = saddles.contrast > _LIKE * median(lattice.contrast)
         beside |= linked & like & (away > _OWN) & (away < _BESIDE)
         blocks &= away > _OWN
