@@ -219,13 +219,12 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     found = select_map(start, anchors, np.zeros(1), _GOOD_START)
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
-    dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
+    dark, light, noise = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
         shading = LocalShading.of(shading, dark, light)
-    noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma, levels = _by_moments(grid_image, found, shading)
-    first = _first_fit(grid_image, mapped, sigma, shading, levels, noise)
+    first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
     return _last_fit(grid_image, first)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,6 @@ class Levels:
     place: Array  # (N, 2) [px]
     level: Array  # (N,) [DN]
     variance: Array  # (N,) [DN^2]
-    # (N,) [DN^2] variance of the pixels there, if measured
-    noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @frozen_dataclass(eq=False)
@@ -149,8 +147,11 @@ def _unlike_others(place: Array, value: Array) -> Array:
     return np.asarray(value - _nearness(place, place, itself=False) @ value)
 
 
-def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
-    """Medians inside the dark and the light squares whose four vertices are known."""
+def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels, float]:
+    """Medians inside the dark and the light squares whose four vertices are known.
+
+    The third result is the median variance of the pixels inside a square [DN^2].
+    """
     seen = grid.seen
     whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:] & seen[1:, 1:]
     r, c = np.nonzero(whole)
@@ -166,10 +167,10 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
-        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR), noise[kind])
+        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR))
         for kind in (is_dark, ~is_dark)
     )
-    return dark, light
+    return dark, light, upper_median(noise)
 
 
 def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
