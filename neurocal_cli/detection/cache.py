@@ -24,6 +24,8 @@ from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.writing import write_whole
 
 _FORMAT = 5  # raised when the same image gives other points than before
+# Of a detection; its grids are not cached, which only its picture needs.
+_FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings")
 
 
 class DetectionCache:
@@ -60,34 +62,21 @@ class DetectionCache:
         """
         found, overlay = outcome.detection, outcome.overlay
         tree = {
-            "detection": None if found is None else _tree(found),
+            "detection": None if found is None else {name: getattr(found, name) for name in _FIELDS},
             "problem": outcome.problem,
             "notes": outcome.notes,
             "overlay": None if overlay is None else b64encode(overlay).decode(),
             "shown": outcome.shown,
         }
         os.makedirs(self._folder, exist_ok=True)
-        Context().run(write_whole, self._path(image), json.dumps(tree) + "\n")
+        text = json.dumps(tree, default=np.ndarray.tolist)
+        Context().run(write_whole, self._path(image), text + "\n")
 
     def _path(self, image: bytes) -> str:
         return os.path.join(self._folder, f"{hashlib.sha256(self._request + image).hexdigest()}.json")
 
 
-def _tree(found: Detection) -> dict[str, Any]:
-    return {
-        "ids": found.ids,
-        "world": found.world.tolist(),
-        "pixels": found.pixels.tolist(),
-        "covariance": found.covariance.tolist(),
-        "across": None if found.across is None else found.across.tolist(),
-        "image_size": found.image_size,
-        "rejected": found.rejected,
-        "warnings": found.warnings,
-    }
-
-
 def _detection(tree: dict[str, Any]) -> Detection:
-    """Read a detection back, without its grids, which only its picture needs."""
     ids = tuple(map(str, tree["ids"]))
     width, height = tree["image_size"]
     return Detection(

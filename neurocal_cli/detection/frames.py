@@ -8,6 +8,7 @@ until the next one would hardly differ. So a board that is held still gives one 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -25,8 +26,8 @@ _DIFFERENT = 6.0  # DN rms between thumbnails; the noise of a still camera gives
 
 
 @frozen_dataclass(eq=False)
-class _Best:
-    """The sharpest frame of a stretch."""
+class _Frame:
+    """A frame of a video."""
 
     number: int
     sharpness: float
@@ -40,19 +41,15 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 
     stretch.
     """
     length = int(np.clip(round(_STRETCH * rate), 1, _LONGEST))
-    stretches: list[_Best] = []
-    for number, grey in enumerate(frames):
-        seen = _seen(number, grey)
-        if number % length == 0:
-            stretches.append(seen)
-        elif seen.sharpness > stretches[-1].sharpness:
-            stretches[-1] = seen
-    if not stretches:
+    seen = (_seen(number, grey) for number, grey in enumerate(frames))
+    stretches = groupby(seen, key=lambda frame: frame.number // length)
+    best = [max(stretch, key=lambda frame: frame.sharpness) for _, stretch in stretches]
+    if not best:
         return []
-    sharpness = np.array([one.sharpness for one in stretches])
-    sharp = [one for one in stretches if one.sharpness >= _SHARP * np.median(sharpness)]
-    thumbs = np.stack([one.thumb.ravel() for one in sharp])
-    chosen = [int(np.argmax([one.sharpness for one in sharp]))]
+    least = _SHARP * np.median([frame.sharpness for frame in best])
+    sharp = [frame for frame in best if frame.sharpness >= least]
+    thumbs = np.stack([frame.thumb.ravel() for frame in sharp])
+    chosen = [int(np.argmax([frame.sharpness for frame in sharp]))]
     distance = _distance(thumbs, thumbs[chosen[0]])
     while len(chosen) < most and distance.max() > _DIFFERENT:
         chosen.append(int(np.argmax(distance)))
@@ -60,12 +57,12 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 
     return sorted(sharp[k].number for k in chosen)
 
 
-def _seen(number: int, grey: NDArray[np.uint8]) -> _Best:
+def _seen(number: int, grey: NDArray[np.uint8]) -> _Frame:
     height, width = grey.shape
     factor = min(1.0, _WIDTH / width)
     small = cv2.resize(grey, (round(factor * width), round(factor * height)), interpolation=cv2.INTER_AREA)
     thumb = cv2.resize(small, _THUMB, interpolation=cv2.INTER_AREA).astype(float)
-    return _Best(number, float(cv2.Laplacian(small, cv2.CV_32F).var()), thumb)
+    return _Frame(number, float(cv2.Laplacian(small, cv2.CV_32F).var()), thumb)
 
 
 def _distance(thumbs: Array, one: Array) -> Array:

@@ -20,6 +20,8 @@ from neurocal_cli.geometry import Array
 # Kinds of points: the mid-point of the edge from (c, r) to (c + 1, r), from (c, r) to (c, r + 1),
 # and the vertex (c, r) itself.
 EDGE_H, EDGE_V, VERTEX = 0, 1, 2
+# Rotations of grid coordinates by multiples of 90 degrees.
+TURNS = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
 
 
 @frozen_dataclass(eq=False)

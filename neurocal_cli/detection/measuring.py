@@ -1,7 +1,6 @@
 """Measure the mid-points or vertices of a grid to the limit set by the pixel noise.
 
-In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Each
-edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
+Each edge is fitted to all pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
 curvature of the edges and the position of each mid-point along its edge. The position across the edge comes
 from that edge alone. The outermost mid-points may be measured along their edges as well (`crossing_edges`).
 Gamma, ink spread and blooming displace all edges towards the dark or the light side: an alternating shift
@@ -54,12 +53,12 @@ def measure(
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
     grid_image = GridImage(light, grid, floor)
-    if len(grid_image.edges.index) == 0:
-        return _nothing(grid)
-    fitted = fit_grid(grid_image)
     vertices = np.full(grid.pixels.shape, np.nan)
-    seen = grid.seen
-    vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
+    if len(grid_image.edges.index) == 0:
+        index = np.zeros((0, 2), dtype=np.int64)
+        return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
+    fitted = fit_grid(grid_image)
+    vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
@@ -69,13 +68,6 @@ def measure(
     rim, fitted_rim = fit_rim(grid_image, fitted)
     outer = _midpoints(rim, fitted_rim, fitted.unevenness, vertices)
     return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
-
-
-def _nothing(grid: Grid) -> Measured:
-    none = np.zeros(0)
-    index = np.zeros((0, 2), dtype=np.int64)
-    vertices = np.full(grid.pixels.shape, np.nan)
-    return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
 def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
@@ -155,11 +147,10 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
     uneven = fitted.unevenness
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
-    index = np.argwhere(grid_image.grid.seen)[:, ::-1]
-    vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
+    vertices[grid_image.grid.seen] = np.where(good[:, None], pixels, np.nan)
     return Measured(
-        kind=np.full(len(index), VERTEX, dtype=np.int64),
-        index=index.astype(np.int64),
+        kind=np.full(len(pixels), VERTEX, dtype=np.int64),
+        index=grid_image.vertices.astype(np.int64),
         pixels=pixels,
         covariance=covariance,
         across=None,

@@ -167,9 +167,7 @@ def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> 
     four exactly.
     """
     grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
-    if len(grid) < 5:
-        return np.zeros_like(measured.pixels)
-    H, _ = cv2.findHomography(grid, measured.pixels, 0)
+    H = cv2.findHomography(grid, measured.pixels, 0)[0] if len(grid) >= 5 else None
     if H is None:
         return np.zeros_like(measured.pixels)
     seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T

@@ -3,7 +3,7 @@
 A ray at the angle t from the axis is imaged at the distance focal * t from the centre. This approximates
 fisheye lenses, also beyond 90 degrees. A plane is then a homography from grid coordinates to directions. The
 single focal length distinguishes a wide lens from a crooked board; the deviations of real lenses are smooth
-and small. In: vertices with their grid coordinates. Out: `WideFit`.
+and small.
 """
 
 from __future__ import annotations

@@ -1,10 +1,4 @@
-"""Check points and whole lattices against the image.
-
-`check_vertices` looks at twelve samples around each point: one in each of the four squares, and one on each
-side of the four edges. The last tests tell a fully grown lattice, a chessboard, from clutter: whether it has
-a block of 3 x 3 vertices, whether its vertices lie on a smooth surface, and whether its edges separate dark
-from light.
-"""
+"""Check points against the image (`check_vertices`), and tell fully grown lattices from clutter."""
 
 from __future__ import annotations
 

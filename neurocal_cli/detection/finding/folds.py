@@ -1,8 +1,7 @@
 """Split a lattice that covers two planes at the fold between them.
 
-In: a lattice. Out: one lattice for each plane. Along a line of vertices on one plane, second differences
-change slowly, for any tilt and lens distortion. At a fold they jump: at one vertex if the fold goes through
-it, otherwise at the two vertices beside it.
+Along a line of vertices on one plane, second differences change slowly, for any tilt and lens distortion. At
+a fold they jump: at one vertex if the fold goes through it, otherwise at the two vertices beside it.
 """
 
 from __future__ import annotations
@@ -38,20 +37,15 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
     row, col = (_sharpest_fold(second, width) for second in _second_differences(lattice))
     if row[1] == 0 and col[1] == 0:
         return [lattice]
-    pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
-    position = max(row, col, key=lambda fold: fold[1])[0]
-    index = np.arange(len(pixels))
-    if position in (1, len(pixels) - 2):
+    seen = lattice.seen
+    axis = 0 if row[1] >= col[1] else 1
+    position, last = (row, col)[axis][0], seen.shape[axis] - 1
+    if position in (1, last - 1):
         # This is either a fold or a wrong outermost row: drop only that row.
-        position = 0.0 if position == 1 else len(pixels) - 1
-    parts = []
-    for side in (index < position - 0.25, index > position + 0.25):
-        kept = np.where(side[:, None, None], pixels, np.nan)
-        if pixels is not lattice.pixels:
-            kept = kept.transpose(1, 0, 2)
-        part = lattice.subset(np.isfinite(kept[..., 0]))
-        parts += split_at_folds(part) if part.seen.any() else []
-    return parts
+        position = 0.0 if position == 1 else last
+    index = np.indices(seen.shape)[axis]
+    parts = (lattice.subset(seen & side) for side in (index < position - 0.25, index > position + 0.25))
+    return [piece for part in parts if part.seen.any() for piece in split_at_folds(part)]
 
 
 def largest_second_difference(lattice: Lattice) -> float:

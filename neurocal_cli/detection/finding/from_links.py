@@ -1,7 +1,7 @@
 """A shortcut for growth: build most of a grid at once, by following links from vertex to vertex.
 
-In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is accepted only if every
-vertex passes the tests of `grow`. Growing layer by layer gives the same result more slowly.
+The lattice is accepted only if every vertex passes the tests of `grow`. Growing layer by layer gives the same
+result more slowly.
 """
 
 from __future__ import annotations
@@ -15,13 +15,11 @@ from neurocal_cli.detection.finding.folds import largest_second_difference, spli
 from neurocal_cli.detection.finding.grow import check_lattice
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square
 from neurocal_cli.detection.finding.levels import Level
-from neurocal_cli.detection.finding.links import Links
+from neurocal_cli.detection.finding.links import STEPS, Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
-# Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
-_STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Insensitive: a lattice rejected here is grown instead, which only costs time
 # (tests/benchmarks/test_detection_speed.py).
 _NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
@@ -36,11 +34,11 @@ def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[n
 
     `taken` (N,) marks saddles that belong to other grids. None if the vertices fail the tests.
     """
-    places = _follow(links, middle, taken.tolist())
-    if len(places) < _FEWEST:
+    place, member = _follow(links, middle, taken.tolist())
+    if len(place) < _FEWEST:
         return None
     saddles = links.saddles
-    lattice = _lattice(saddles, places)
+    lattice = _lattice(saddles, place, member)
     row, col = np.nonzero(lattice.seen)
     refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)
     stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
@@ -65,8 +63,7 @@ def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[n
 
 def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
     """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares."""
-    places = _follow(links, middle, [False] * len(links.to))
-    place, member = np.array(list(places)), np.array(list(places.values()))
+    place, member = _follow(links, middle, [False] * len(links.to))
     place -= place.min(axis=0)
     seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
     seen[tuple(place.T)] = True
@@ -80,32 +77,31 @@ def _with(parts: list[Lattice], point: Array) -> Lattice | None:
     return next(near, None)
 
 
-def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
+def _lattice(saddles: Saddles, place: Index, member: Index) -> Lattice:
     """Make a lattice of saddles by their places (c, r), without incomplete squares and sparse outer lines."""
-    place, index = np.array(list(places)), np.array(list(places.values()))
     left, top = place.min(axis=0)
     cols, rows = place.max(axis=0) - (left, top) + 1
-    member = np.full((rows, cols), -1, dtype=np.intp)
-    member[place[:, 1] - top, place[:, 0] - left] = index
-    seen = in_whole_square(member >= 0)
+    index = np.full((rows, cols), -1, dtype=np.intp)
+    index[place[:, 1] - top, place[:, 0] - left] = member
+    seen = in_whole_square(index >= 0)
     for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
         seen[line] &= seen[line].mean() > _WHOLE
     row, col = np.nonzero(seen)
     pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
-    pixels[row, col], contrast[row, col] = (x[member[row, col]] for x in (saddles.points, saddles.contrast))
+    pixels[row, col], contrast[row, col] = (x[index[row, col]] for x in (saddles.points, saddles.contrast))
     # The square between ports 0 and 1 of the middle vertex is dark.
     return Lattice(pixels, contrast, int(left + top) % 2).cropped()
 
 
-def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
-    """Saddles by their places (c, r) relative to the middle one, by a breadth-first search."""
+def _follow(links: Links, middle: int, taken: list[bool]) -> tuple[Index, Index]:
+    """Places (N, 2) relative to the middle saddle, and saddles (N,) there, by a breadth-first search."""
     to, entry = links.lists
     places, along = {(0, 0): middle}, {middle: 0}  # saddle by place, and its port along c
     waiting = deque(places)
     while waiting:
         c, r = waiting.popleft()
         saddle = places[c, r]
-        for turn, (dc, dr) in enumerate(_STEPS):
+        for turn, (dc, dr) in enumerate(STEPS):
             port = (along[saddle] + turn) % 4
             neighbour, there = to[saddle][port], (c + dc, r + dr)
             if neighbour < 0 or taken[neighbour] or there in places or neighbour in along:
@@ -113,4 +109,4 @@ def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int
             places[there] = neighbour
             along[neighbour] = (entry[saddle][port] + 2 - turn) % 4
             waiting.append(there)
-    return places
+    return np.array(list(places)), np.array(list(places.values()))

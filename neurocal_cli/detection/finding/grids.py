@@ -3,8 +3,6 @@
 On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
 vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. If linked
 saddles are left over, `straighten` searches again in a view without the distortion of a wide lens.
-
-In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
 
 from __future__ import annotations
@@ -157,9 +155,7 @@ def _sides(points: Array) -> Array:
     return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
 
 
-def _find_new(
-    level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size] = frozenset()
-) -> list[Lattice]:
+def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size]) -> list[Lattice]:
     """Find further grids in a level; the first grid of an image gets more effort."""
     seeds = find_seeds_3x3(links)
     dark = np.zeros(len(seeds), dtype=np.intp)
@@ -214,7 +210,7 @@ def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     if part is None or links_of_part is None:
         return []
     found = []
-    for lattice in _find_new(part.level, links_of_part, []):
+    for lattice in _find_new(part.level, links_of_part, [], frozenset()):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
         grid = grow(level, refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))

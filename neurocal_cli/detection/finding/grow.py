@@ -1,8 +1,7 @@
 """Grow a lattice layer by layer, and remove its outliers.
 
-In: a level and a lattice of at least 2 x 3 vertices. Out: a lattice of the visible part of the board. Every
-new vertex is predicted from its neighbours, searched near the prediction, and accepted if it lies within a
-tolerance of it and the image around it looks like a vertex.
+Every new vertex is predicted from its neighbours, searched near the prediction, and accepted if it lies
+within a tolerance of it and the image around it looks like a vertex.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.checks import check_vertices
+from neurocal_cli.detection.finding.checks import VertexCheck, check_vertices
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square, signs
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
@@ -24,7 +23,7 @@ from neurocal_cli.geometry import Array
 _SEARCHED = 0.24  # squares; half width of the search around a prediction ...
 _STEPS = 7  # ... and number of samples in each direction
 _MOST_SPREAD = 5.0  # greatest spread of a prediction that is used
-_OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_tolerance`
+_OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_off`
 _WEAKEST = 0.55  # least contrast, relative to the neighbours
 # Stricter limits outside complete squares: least evenness, and greatest distance in units of the tolerance.
 _EVEN_ALONE, _OFF_ALONE = 0.88, 0.3
@@ -35,7 +34,7 @@ _ROUNDS = 12  # greatest number of rounds of removing outliers
 def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
     """Add vertices between the known ones and, if `outwards`, around them, until no more are accepted.
 
-    With a reach of 2, growth also steps over a single hidden vertex.
+    The lattice has at least 2 x 3 vertices. With a reach of 2, growth also steps over a single hidden vertex.
     """
     sigma, start = lattice.derivative_sigma, lattice
     tried: set[tuple[int, int, int]] = set()
@@ -97,7 +96,7 @@ def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: f
     points = refine_saddles(level.image, _steepest_nearby(level, predicted, dark), sigma)
     good = np.isfinite(points[:, 0])
     points = np.where(good[:, None], points, predicted.points)
-    good &= _off(predicted, points) < _tolerance(predicted)
+    good &= _off(predicted, points) < 1
     check = check_vertices(level, points, predicted, dark)
     good &= check.is_vertex & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     row, col = row[good], col[good]
@@ -114,14 +113,10 @@ def _usual_contrast(lattice: Lattice) -> Array:
 
 
 def _off(predicted: PredictedVertices, points: Array) -> Array:
-    """(N,) larger component of the distance between points and their predictions [squares]."""
+    """(N,) larger component of the distance between points and their predictions, over its tolerance."""
     away = np.abs(predicted.in_squares(points - predicted.points))
-    return np.maximum(away[:, 0], away[:, 1])
-
-
-def _tolerance(predicted: PredictedVertices) -> Array:
-    """(N,) greatest distance of a vertex from its prediction [squares]."""
-    return np.asarray(_OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3))
+    tolerance = _OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3)
+    return np.asarray(np.maximum(away[:, 0], away[:, 1]) / tolerance)
 
 
 def _inside(level: Level, points: Array) -> NDArray[np.bool_]:
@@ -147,24 +142,29 @@ def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) ->
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
 
 
-def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
-    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
+def _checked(level: Level, lattice: Lattice) -> tuple[Lattice, VertexCheck, Array]:
+    """The lattice with measured contrasts, its vertices' checks, and how far these are off, in tolerances."""
     row, col, predicted = lattice.predicted
     points = lattice.pixels[row, col]
     check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
     contrast = lattice.contrast.copy()
     contrast[row, col] = check.contrast
-    result = lattice.with_contrast(contrast)
-    right = (
+    return lattice.with_contrast(contrast), check, _off(predicted, points)
+
+
+def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
+    """Measure the contrasts of the vertices, and return a mask of the vertices that pass all tests."""
+    lattice, check, off = _checked(level, lattice)
+    row, col, predicted = lattice.predicted
+    good = np.zeros(lattice.contrast.shape, dtype=bool)
+    good[row, col] = (
         check.is_vertex
-        & (_off(predicted, points) < _tolerance(predicted))
+        & (off < 1)
         & (predicted.area > 4)
         & (predicted.spread < 2 * _MOST_SPREAD)
+        & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     )
-    right &= check.contrast > _WEAKEST * _usual_contrast(result)[row, col]
-    good = np.zeros(contrast.shape, dtype=bool)
-    good[row, col] = right
-    return result, good
+    return lattice, good
 
 
 def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
@@ -173,23 +173,17 @@ def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
         row, col, predicted = lattice.predicted
         if not len(row):
             break
-        pixels, contrast, seen = lattice.pixels, lattice.contrast.copy(), lattice.seen
-        points = pixels[row, col]
-        off = _off(predicted, points) / _tolerance(predicted)
-        off = np.where((predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD), off, np.inf)
-        check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
+        lattice, check, off = _checked(level, lattice)
         # Vertices outside complete squares have fewer neighbours to confirm them.
-        closes = in_whole_square(seen)[row, col]
+        closes = in_whole_square(lattice.seen)[row, col]
         accepted = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
+        accepted &= (predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD)
         off = np.where(accepted, off, np.inf)
-        contrast[row, col] = check.contrast
         if not (off > 1).any():
-            lattice = lattice.with_contrast(contrast)
             break
         # An outlier spoils the predictions of its neighbours, so remove only the worst of a neighbourhood.
-        worst = np.zeros(pixels.shape[:2])
+        worst = np.zeros(lattice.contrast.shape)
         worst[row, col] = off
         bad = (worst > 1) & (worst >= cv2.dilate(worst, np.ones((3, 3), np.uint8)))
-        pixels = np.where(bad[..., None], np.nan, pixels)
-        lattice = Lattice(pixels, np.where(bad, np.nan, contrast), lattice.dark)
+        lattice = lattice.subset(~bad)
     return lattice.cropped()

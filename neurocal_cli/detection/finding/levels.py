@@ -82,8 +82,6 @@ def _grey(image: NDArray[np.generic]) -> Image:
         return image.astype(np.float32)
     if image.dtype == np.uint16:
         return np.asarray(image.astype(np.float32) * np.float32(1 / 257))
-    if image.size == 0:
-        return np.zeros(image.shape, dtype=np.float32)
     real = image.astype(float)
     finite = np.isfinite(real)
     if not finite.any():

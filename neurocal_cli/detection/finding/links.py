@@ -1,9 +1,8 @@
 """Link neighbouring saddles along the edges of the squares, and find the blocks of squares that they close.
 
-In: a level. Out: its saddles, and the neighbour of each at its four ports; from these the seeds of grids, the
-most regular ones first, for `grids` to grow. An edge that leaves a vertex at a port followed by a dark sector
-enters the next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects
-an even with an odd port.
+The blocks are the seeds of grids. An edge that leaves a vertex at a port followed by a dark sector enters the
+next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects an even with
+an odd port.
 """
 
 from __future__ import annotations
@@ -19,6 +18,8 @@ from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+# Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _FEWEST = 9  # saddles, for 3 x 3 vertices
 # Insensitive; tests/test_finding.py.
 _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
@@ -127,12 +128,11 @@ def find_seeds_3x3(links: Links) -> Index:
     centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
     block[:, 1, 1] = centre
-    for p, (c, r) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+    for p, (c, r) in enumerate(STEPS):
         block[:, 1 + r, 1 + c] = links.to[centre, p]
         # The vertex between ports p and p + 1: from the neighbour, through the port before the entry.
         corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
-        c2, r2 = ((1, 1), (-1, 1), (-1, -1), (1, -1))[p]
-        block[:, 1 + r2, 1 + c2] = corner
+        block[:, 1 + r + c, 1 + c - r] = corner
     grid = links.saddles.points[block]
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")

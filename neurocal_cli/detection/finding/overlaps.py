@@ -1,16 +1,19 @@
 """Let each vertex belong to one lattice, and each board have one lattice.
 
 Copies of a lattice and rows beyond a fold are removed; the parts of a board that an occluder divides are
-joined. In: the lattices of a level. Out: lattices that share no vertices.
+joined.
 """
 
 from __future__ import annotations
+
+from itertools import combinations
 
 import numpy as np
 
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.predict import predict_vertices
+from neurocal_cli.detection.grid import TURNS
 from neurocal_cli.geometry import Array
 
 # Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
@@ -24,7 +27,6 @@ _BESIDE = 2.0  # squares; lattices farther apart share no vertices
 _NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
 _LEAST = 4  # least number of vertices compared
-_TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
@@ -33,7 +35,7 @@ def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
         reach = _SAME * lattice.width
-        if not any((_distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
+        if not any((distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
             kept.append(lattice)
     return kept
 
@@ -46,8 +48,7 @@ def any_overlap(lattices: list[Lattice]) -> bool:
         boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
     return any(
         bool(((low <= other_high) & (other_low <= high)).all())
-        for k, (low, high) in enumerate(boxes)
-        for other_low, other_high in boxes[:k]
+        for (low, high), (other_low, other_high) in combinations(boxes, 2)
     )
 
 
@@ -64,8 +65,6 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
     Such rows occur if a lattice has grown across a fold into the other plane.
     """
     result = list(lattices)
-    if len(result) < 2:
-        return result
     for _ in range(2):
         places = [_vertices_and_next(x) for x in result]
         for i, lattice in enumerate(result):
@@ -88,7 +87,7 @@ def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
     points, width = place
     seen = lattice.seen
     away = np.full(seen.shape, np.inf)
-    away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)
+    away[seen] = distance(lattice.pixels[seen], points) / min(width, lattice.width)
     drop = np.zeros_like(seen)
     for line, inner in _OUTERMOST:
         known = int(seen[line].sum())
@@ -109,7 +108,7 @@ _OUTERMOST = (
 )
 
 
-def _distance(points: Array, others: Array) -> Array:
+def distance(points: Array, others: Array) -> Array:
     """(N,) distance of each point from the nearest of the others [px]."""
     if not len(points) or not len(others):
         return np.full(len(points), np.inf)
@@ -163,8 +162,7 @@ def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
     if near.sum() < _LEAST:
         return None
     own = np.stack([col, row], axis=-1)[near]
-    for numbers in _TURNS:
-        turn = np.array(numbers, dtype=np.intp).reshape(2, 2)
+    for turn in np.array(TURNS):
         away = grid[near] - own @ turn.T
         shift = np.rint(np.median(away, axis=0)).astype(np.intp)
         off = np.abs(away - shift).max(axis=1)
@@ -180,7 +178,7 @@ def _continued(base: Lattice, other: Lattice) -> Array:
     """Grid coordinates (N, 2) of the other lattice's vertices on the base, extrapolated by a homography."""
     row, col = np.nonzero(base.seen)
     p, q = base.pixels[row, col], other.pixels[other.seen]
-    away = _distance(p, q)
+    away = distance(p, q)
     # Lens distortion bends the plane, so the vertices near the other lattice have the largest weights.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
     centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)

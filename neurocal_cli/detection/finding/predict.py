@@ -1,9 +1,8 @@
 """Predict a vertex from its neighbours by local regression.
 
-In: an array of known vertices, and places in it. Out: the predicted pixel of each place, the steps to the
-next vertices, and the prediction's spread. The map is a quadratic polynomial of the grid coordinates, fitted
-to the vertices at most three squares away by weighted ridge regression. The ridge keeps second derivatives
-small, as they are under perspective and distortion, so few neighbours give a linear map.
+The map is a quadratic polynomial of the grid coordinates, fitted to the vertices at most three squares away
+by weighted ridge regression. The ridge keeps second derivatives small, as they are under perspective and
+distortion, so few neighbours give a linear map.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Find saddle points of the brightness, the candidates for vertices.
 
-In: a level of the pyramid. Out: saddles with sub-pixel positions, the directions of their four edges, and
-their contrast; `links` connects them. The directions in which the edges leave a vertex are its four *ports*.
-They are numbered by growing angle (from u towards v) such that a dark sector follows ports 0 and 2 and a
-bright one ports 1 and 3.
+The directions in which the edges leave a vertex are its four *ports*. They are numbered by growing angle
+(from u towards v) such that a dark sector follows ports 0 and 2 and a bright one ports 1 and 3.
 """
 
 from __future__ import annotations

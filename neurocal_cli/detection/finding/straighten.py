@@ -4,9 +4,6 @@ Near a wide lens, the squares of a board are bent, and change from one to the ne
 They are linked nevertheless, and an equidistant lens and a plane can be fitted to a group of linked saddles.
 In a view perpendicular to that plane, lines are straight and squares are equal, so growth finds the missing
 vertices (`find_bent`). The image of a very oblique board is stretched across its narrow squares (`stretch`).
-
-In: a level with its linked saddles, and the lattices already known. Out: lattices found in such views, in the
-level's pixels; or a stretched part of the level, which is searched again.
 """
 
 from __future__ import annotations
@@ -22,6 +19,7 @@ from neurocal_cli.detection.finding.from_links import linked_group
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.links import Links, whole_blocks
+from neurocal_cli.detection.finding.overlaps import distance
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
@@ -90,7 +88,7 @@ def any_left(links: Links, known: list[Lattice]) -> bool:
     beside = np.zeros(len(saddles), dtype=bool)
     for lattice in known:
         own = lattice.pixels[lattice.seen]
-        away = np.sqrt(((saddles.points[:, None] - own) ** 2).sum(axis=-1).min(axis=1)) / lattice.width
+        away = distance(saddles.points, own) / lattice.width
         like = saddles.contrast > _LIKE * median(lattice.contrast)
         beside |= linked & like & (away > _OWN) & (away < _BESIDE)
         blocks &= away > _OWN
@@ -107,8 +105,8 @@ def find_bent(
     """Search again around groups of linked saddles that exceed the lattices, and around unfinished lattices.
 
     The links are those of the whole level, including known lattices. Unfinished lattices are known ones that
-    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found has
-    more vertices than the known ones at the same place.
+    a wide lens may have kept from growing. `search` finds the lattices of an image. Each lattice found, in
+    the level's pixels, has more vertices than the known ones at the same place.
     """
     found: list[Lattice] = []
     groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]

@@ -1,7 +1,4 @@
-"""Refine saddle points to sub-pixel accuracy by Newton's method on smoothed derivatives.
-
-In: an image and points about a pixel from saddle points. Out: the saddle points, NaN if there is none.
-"""
+"""Refine saddle points to sub-pixel accuracy by Newton's method on smoothed derivatives."""
 
 from __future__ import annotations
 
@@ -40,7 +37,7 @@ def window(half: int, width: int) -> NDArray[np.intp]:
 
 
 def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
-    """Move points (N, 2) [px] to the nearest saddle points by some rounds of Newton steps.
+    """Move points (N, 2), about a pixel from saddle points [px], to these by some rounds of Newton steps.
 
     Derivatives are smoothed by `sigma` [px], about a sixth of the squares' width. A point becomes NaN if
     there is no saddle point or the window leaves the image.

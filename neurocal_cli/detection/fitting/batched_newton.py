@@ -4,9 +4,6 @@ This does not use the package's least-squares core, because the problems are dif
 of independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
 memory traffic, and fits that have not converged with the others continue separately. The small normal
 equations are solved in float64.
-
-In: pixels, their model with derivatives, initial values, a prior. Out: `BatchFit` with values, Fisher
-information and chi2.
 """
 
 from __future__ import annotations
@@ -19,10 +16,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.fitting.strips import Single
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-Single = NDArray[np.float32]
 Part = NDArray[np.intp] | slice  # indices of some of the fits
 Some = TypeVar("Some", bound="PerFit")
 

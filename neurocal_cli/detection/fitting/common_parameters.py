@@ -1,7 +1,4 @@
-"""Estimate the common parameters of a board's edges: pixel noise, profile shape, blur, levels.
-
-In: the fits of all edges. Out: weights, profile shape and priors for the next fits.
-"""
+"""Estimate the common parameters of a board's edges for the next fits: noise, profile shape, blur, levels."""
 
 from __future__ import annotations
 
@@ -18,7 +15,6 @@ from neurocal_cli.detection.fitting.batched_newton import (
     BatchFit,
     LevelPrior,
     ProfileShape,
-    Single,
     rows_for,
 )
 from neurocal_cli.detection.fitting.edge_fit import OFFSET
@@ -30,9 +26,9 @@ from neurocal_cli.detection.fitting.edge_profile import (
     sharp_profile,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.shading import Shading, excess_variance, quadratic_terms
+from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
 from neurocal_cli.detection.fitting.smooth_map import Frame
-from neurocal_cli.detection.fitting.strips import Lines
+from neurocal_cli.detection.fitting.strips import Lines, Single
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -162,8 +158,6 @@ class BoardBlur:
     @classmethod
     def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
         """Estimate the blur from the good fits of edges with normals (E, 2)."""
-        if not good.any():
-            good = np.ones_like(good)
         sigma, (n_u, n_v) = fit.values[good, BLUR], normal[good].T
         usual = upper_median(sigma)
         terms = np.stack([n_u * n_u, 2 * n_u * n_v, n_v * n_v])
@@ -202,8 +196,6 @@ class FieldBlur:
     @classmethod
     def of(cls, fit: BatchFit, lines: Lines, good: NDArray[np.bool_], frame: Frame) -> FieldBlur:
         """Estimate the blur from the good fits of edges."""
-        if not good.any():
-            good = np.ones_like(good)
         usual = upper_median(fit.values[good, BLUR])
         log = np.log(fit.values[good, BLUR] / usual)
         some = _places_and_directions(frame, lines.middle[good], lines.normal[good])
@@ -241,7 +233,7 @@ def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Arra
 
 def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
     n_u, n_v = normal.T
-    return np.column_stack([quadratic_terms(frame, place), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
+    return np.column_stack([polynomial_terms(frame, place, 6), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: Array, noise: float) -> LevelPrior:

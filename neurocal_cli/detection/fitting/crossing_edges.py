@@ -15,8 +15,6 @@ the errors of all mid-points stay independent of each other.
 The map must be accurate up to the rim. So it contains the lens, with tangential distortion and k3, and no
 polynomial, which would extrapolate badly. If the edges do not agree with it within their noise, as on paper
 boards, the mid-points stay as they are. So do those whose edges to the rim alone do not agree.
-
-In: the fits of all edges. Out: `AlongEdges`.
 """
 
 from __future__ import annotations

@@ -22,12 +22,11 @@ from neurocal_cli.detection.fitting.batched_newton import (
     FitPixels,
     Linearised,
     ProfileShape,
-    Single,
     rows_for,
 )
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response, sharp_profile
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.fitting.strips import Lines, Strips, strip_pixels
+from neurocal_cli.detection.fitting.strips import Lines, Single, Strips, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array

@@ -9,25 +9,24 @@ The terms of the shift that the edges of a board require are unknowns of its map
 
 s is the blur relative to its median. A and B are mean level and half contrast without their medians, in
 median half contrasts.
-
-In: blur and shading of a board, and the residuals of its map. Out: `EdgeShifts`, with the required terms.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur, FieldBlur
 from neurocal_cli.detection.fitting.map_fit import MapFit
-from neurocal_cli.detection.fitting.shading import Shading, quadratic_terms
+from neurocal_cli.detection.fitting.shading import Shading, polynomial_terms
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_KINDS = (slice(1, 2), slice(2, 4), slice(4, 9))  # columns of the terms of blur, levels and place
+_KINDS = (range(1, 2), range(2, 4), range(4, 9))  # columns of the terms of blur, levels and place
 # Insensitive. Excess variance of a map above which terms are tried; chi2 that each must gain, in variances of
 # the residuals left; and number of edges for each unknown.
 _NOT_NOISE, _GAIN, _EDGES = 1.3, 8.0, 4
@@ -40,11 +39,11 @@ class EdgeShifts:
     blur: BoardBlur | FieldBlur
     shading: Shading
     middle: tuple[float, float, float]  # medians of blur [px], mean level and half contrast [DN]
-    used: tuple[slice, ...] = ()  # the required ones of `_KINDS`
+    used: tuple[range, ...] = ()  # the required ones of `_KINDS`
 
     @classmethod
     def of(
-        cls, blur: BoardBlur | FieldBlur, shading: Shading, lines: Lines, used: tuple[slice, ...] = ()
+        cls, blur: BoardBlur | FieldBlur, shading: Shading, lines: Lines, used: tuple[range, ...] = ()
     ) -> EdgeShifts:
         """Terms for the edges of a board."""
         mean, contrast = shading.at(lines.middle)
@@ -55,8 +54,7 @@ class EdgeShifts:
         """(E, K) derivatives of the shifts of edges by the unknowns; the first is the common shift."""
         if not self.used:
             return np.ones((len(lines.length), 1))
-        every = self._every(lines)
-        return np.concatenate([every[:, :1], *(every[:, kind] for kind in self.used)], axis=1)
+        return self._every(lines).take([0, *chain(*self.used)], axis=1)
 
     def beyond_response(self, lines: Lines, shift: Array) -> Array:
         """(E,) shifts [px] without the part that a common response causes, given the unknowns (K,)."""
@@ -73,10 +71,10 @@ class EdgeShifts:
         count = len(variance)
         root = np.sqrt(mapped.weight[:count] / variance)
         every, residual = self._every(lines) * root[:, None], mapped.residual[:count] * root
-        used, columns = self.used, [0, *(k for kind in self.used for k in range(9)[kind])]
+        used, columns = self.used, [0, *chain(*self.used)]
         left = _left(every[:, columns], residual)
         for kind in _KINDS:
-            more = [*columns, *range(9)[kind]]
+            more = [*columns, *kind]
             if kind in used or _EDGES * len(more) > count:
                 continue
             rest = _left(every[:, more], residual)
@@ -91,7 +89,7 @@ class EdgeShifts:
         s = self._relative_blur(lines)
         A, B = self.shading.at(lines.middle)
         levels = [s * (A - mean) / contrast, s * (B - contrast) / contrast]
-        places = s[:, None] * quadratic_terms(self.shading.frame, lines.middle)[:, 1:]
+        places = s[:, None] * polynomial_terms(self.shading.frame, lines.middle, 6)[:, 1:]
         return np.column_stack([np.ones_like(s), s - 1, *levels, places])
 
     def _relative_blur(self, lines: Lines) -> Array:

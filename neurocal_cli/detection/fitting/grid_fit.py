@@ -1,8 +1,7 @@
 """Fit all edges of a board in stages, from vertices known to half a pixel to the noise limit.
 
 The stages are: a map through the found vertices, offsets of the edges from moments, a first fit with
-independent levels, common parameters, a last fit, and the map through its edges. In: `GridImage`. Out:
-`GridFit`, for `measuring`.
+independent levels, common parameters, a last fit, and the map through its edges.
 """
 
 from __future__ import annotations
@@ -213,20 +212,19 @@ class GridFit:
 
 
 def fit_grid(grid_image: GridImage) -> GridFit:
-    """Run all stages: map of the found vertices, moments, first fit, common parameters, last fit."""
+    """Run all stages."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     anchors = grid_image.anchors(_START_SIGMA)
     found = select_map(start, anchors, np.zeros(1), _GOOD_START)
     if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
-    dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
+    dark, light, noise = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
         shading = LocalShading.of(shading, dark, light)
-    noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma, levels = _by_moments(grid_image, found, shading)
-    first = _first_fit(grid_image, mapped, sigma, shading, levels, noise)
+    first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
     return _last_fit(grid_image, first)
 
 
@@ -483,6 +481,7 @@ def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Ar
 
 def _blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:
     """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
+    good = good if good.any() else np.ones_like(good)
     board = BoardBlur.of(fit, edges.normal, good)
     wide = isinstance(at, WideMap)
     if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:

@@ -1,8 +1,4 @@
-"""First fits of a board's edges, each with its own levels, to estimate blur and profile.
-
-In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates the common
-parameters of all edges.
-"""
+"""First fits of a board's edges, each with its own levels, to estimate blur and profile."""
 
 from __future__ import annotations
 

@@ -5,8 +5,6 @@ parameters to about a hundred observations, 0.5 ms each and eight times per grid
 eliminate, Tukey's weights change from step to step, and a fit ends early if a model gains too little.
 
 The selected model is the simplest one of the initial map's `models` that the observations do not contradict.
-
-In: an initial map and observations. Out: the map with its covariance, residuals, weights and excess variance.
 """
 
 from __future__ import annotations

@@ -1,22 +1,18 @@
-"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly.
-
-In: levels measured inside squares or by edge fits. Out: `Shading`, the levels and their gradients anywhere.
-"""
+"""Levels of the dark and the light squares over the image: low-degree polynomials, fitted robustly."""
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
+from neurocal_cli.detection.fitting.strips import Single
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Bilinear weights (64, 4) of a square's corners for samples of its interior, away from the blurred edges.
@@ -46,8 +42,6 @@ class Levels:
     place: Array  # (N, 2) [px]
     level: Array  # (N,) [DN]
     variance: Array  # (N,) [DN^2]
-    # (N,) [DN^2] variance of the pixels there, if measured
-    noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @frozen_dataclass(eq=False)
@@ -62,16 +56,17 @@ class Shading:
 
     def off_levels(self, both: tuple[Levels, Levels]) -> tuple[Array, Array]:
         """Differences of measured dark and light levels from the polynomials [DN]."""
-        dark, light = (
-            levels.level - polynomial_terms(self.frame, levels.place, len(coefficients)) @ coefficients
-            for levels, coefficients in zip(both, (self.dark, self.light), strict=True)
-        )
+        dark, light = (levels.level - self.levels_at(levels.place)[k] for k, levels in enumerate(both))
         return dark, light
+
+    def levels_at(self, place: Array) -> tuple[Array, Array]:
+        """Dark and light level at places (N, 2)."""
+        terms = polynomial_terms(self.frame, place, len(self.dark))
+        return terms @ self.dark, terms @ self.light
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
-        terms = polynomial_terms(self.frame, place, len(self.dark))
-        dark, light = terms @ self.dark, terms @ self.light
+        dark, light = self.levels_at(place)
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
     def spread_at(self, place: Array) -> Array:
@@ -112,63 +107,51 @@ class LocalShading(Shading):
             return smooth
         above = smooth.off_levels((dark, light))
         spread = [
-            min(
-                excess_variance(rest - _Nearby.of(x.place, x.place, itself=False).mean(rest), x.variance),
-                before,
-            )
+            min(excess_variance(_unlike_others(x.place, rest), x.variance), before)
             for x, rest, before in zip((dark, light), above, smooth.spread, strict=True)
         ]
         near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, above, has_border)
 
-    def at(self, place: Array) -> tuple[Array, Array]:
-        """Mean level and half contrast at places (N, 2)."""
-        terms = polynomial_terms(self.frame, place, len(self.dark))
+    def levels_at(self, place: Array) -> tuple[Array, Array]:
+        """Dark and light level at places (N, 2)."""
         dark, light = (
-            terms @ coefficients + _Nearby.of(near, place).mean(above)
-            for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
+            level + _nearness(near, place) @ above
+            for level, near, above in zip(super().levels_at(place), self.near, self.above, strict=True)
         )
-        return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
+        return dark, light
 
     def spread_at(self, place: Array) -> Array:
         """(2, N) variance of single levels [DN^2], which is large at the border of a shadow."""
         if not self.has_border:
             return super().spread_at(place)
-        return np.stack(
-            [
-                base + _Nearby.of(near, place).variance(above)
-                for base, near, above in zip(self.spread, self.near, self.above, strict=True)
-            ]
-        )
+        spread = []
+        for base, near, above in zip(self.spread, self.near, self.above, strict=True):
+            weight = _nearness(near, place)
+            spread.append(base + np.maximum(weight @ above**2 - (weight @ above) ** 2, 0.0))
+        return np.stack(spread)
 
 
-@frozen_dataclass(eq=False)
-class _Nearby:
-    """Weights (N, M) of places near others, normal in their distances."""
-
-    weight: Array
-
-    @classmethod
-    def of(cls, near: Array, place: Array, itself: bool = True) -> _Nearby:
-        """Weights of places `near` (M, 2) at places (N, 2)."""
-        away = ((place[:, None] - near) ** 2).sum(axis=-1)
-        if not itself:
-            np.fill_diagonal(away, np.inf)
-        width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
-        weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
-        return cls(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
-
-    def mean(self, value: Array) -> Array:
-        """(N,) means of values (M,)."""
-        return np.asarray(self.weight @ value)
-
-    def variance(self, value: Array) -> Array:
-        """(N,) variances of values (M,) around their means."""
-        return np.maximum(self.weight @ value**2 - self.mean(value) ** 2, 0.0)
+def _nearness(near: Array, place: Array, itself: bool = True) -> Array:
+    """Weights (N, M) of places `near` (M, 2) at places (N, 2), normal in their distances, with the sum 1."""
+    away = ((place[:, None] - near) ** 2).sum(axis=-1)
+    if not itself:
+        np.fill_diagonal(away, np.inf)
+    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
+    weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
+    return np.asarray(weight / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
 
 
-def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
-    """Medians inside the dark and the light squares whose four vertices are known."""
+def _unlike_others(place: Array, value: Array) -> Array:
+    """Differences of values (N,) at places (N, 2) from the mean of the others nearby."""
+    return np.asarray(value - _nearness(place, place, itself=False) @ value)
+
+
+def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels, float]:
+    """Medians inside the dark and the light squares whose four vertices are known.
+
+    The third result is the median variance of the pixels inside a square [DN^2].
+    """
     seen = grid.seen
     whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:] & seen[1:, 1:]
     r, c = np.nonzero(whole)
@@ -184,10 +167,10 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
-        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR), noise[kind])
+        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR))
         for kind in (is_dark, ~is_dark)
     )
-    return dark, light
+    return dark, light, upper_median(noise)
 
 
 def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
@@ -222,10 +205,7 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     local = LocalShading.of(smooth, dark, light, has_border=True) if shadowed else richer
     if not isinstance(local, LocalShading):
         return richer
-    by_local = [
-        above - _Nearby.of(near, near, itself=False).mean(above)
-        for near, above in zip(local.near, local.above, strict=True)
-    ]
+    by_local = [_unlike_others(near, above) for near, above in zip(local.near, local.above, strict=True)]
     errors = [np.abs(np.concatenate(left)).mean() for left in (richer.off_levels(both), by_local)]
     return local if errors[1] < _CLEARLY * errors[0] else richer
 
@@ -236,7 +216,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     coefficients = np.zeros(_TERMS[-1])
     if n == 0:
         return coefficients, np.inf
-    terms = quadratic_terms(frame, levels.place)
+    terms = polynomial_terms(frame, levels.place, _TERMS[-1])
     residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
     # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
@@ -305,16 +285,8 @@ def excess_variance(residual: Array, variance: Array) -> float:
     return max(upper_median(residual**2) / CHI2_MEDIAN - 2 * upper_median(variance), 0.0)
 
 
-def quadratic_terms(frame: Frame, place: Array) -> Array:
-    """1, x, y, x^2, x y, y^2 of places (N, 2) [px], scaled by the frame; (N, 6)."""
-    x, y = ((place - frame.centre) / frame.unit).T
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-
-
 def polynomial_terms(frame: Frame, place: Array, count: int) -> Array:
     """1, x, y, x^2, x y, y^2, x^3, ... of places (N, 2) [px], scaled by the frame; (N, count)."""
-    if count == _TERMS[-1]:
-        return quadratic_terms(frame, place)
     x, y = ((place - frame.centre) / frame.unit).T
     terms = power = [np.ones_like(x)]
     while len(terms) < count:

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_HOMOGRAPHY, _LENS = 8, 9
-_REST = _HOMOGRAPHY + _LENS
+_HOMOGRAPHY, _REST = 8, 17  # number of its parameters, and position of the first one after the lens
 _TAU, _K3 = slice(14, 16), 16
 _FREE_LENS: tuple[tuple[int, ...], ...] = (
     (),
@@ -85,6 +84,7 @@ class SmoothMap:
     # Those of the lens alone, for places where a polynomial extrapolates badly.
     lens_models: ClassVar[tuple[tuple[int, int], ...]] = tuple((k, 0) for k in range(len(_FREE_LENS)))
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _FREE_LENS  # positions of the free parameters of each set
+    square: ClassVar[slice] = slice(12, 14)  # positions of m and n
     rest: ClassVar[int] = _REST  # position of the first coefficient of the polynomial
 
     frame: Frame
@@ -244,7 +244,7 @@ class SmoothMap:
 
     @property
     def _metric(self) -> Array:
-        m, n = self.parameters[12:14]
+        m, n = self.parameters[self.square]
         return np.array([[1 + m, n], [n, 1 - m]])
 
     def variance(self, grid: Array, direction: Array) -> Array:
@@ -261,7 +261,7 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     zero = np.zeros_like(x)
     upper = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=-1)
     lower = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=-1)
-    values = np.zeros(_HOMOGRAPHY + _LENS)
+    values = np.zeros(_REST)
     values[:8] = np.linalg.lstsq(np.concatenate([upper, lower]), np.concatenate([u, v]), rcond=None)[0]
     return SmoothMap(frame, values)
 

@@ -1,7 +1,4 @@
-"""Lines of a grid in the image, and the strips of pixels along them.
-
-In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, the pixels around each edge.
-"""
+"""Lines of a grid in the image, and the strips of pixels along them."""
 
 from __future__ import annotations
 

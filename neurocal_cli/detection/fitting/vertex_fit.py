@@ -25,14 +25,13 @@ from neurocal_cli.detection.fitting.batched_newton import (
     FitPixels,
     Linearised,
     ProfileShape,
-    Single,
     rows_for,
 )
 from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
 from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response, sharp_profile
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
+from neurocal_cli.detection.fitting.strips import Lines, Single, grid_lines, packed, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array

@@ -29,14 +29,8 @@ _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
 _SQUARE = slice(_FIRST + _PROFILE, _FIRST + _PROFILE + 2)  # of m and n
 _REST = _SQUARE.stop
-_LENSES: tuple[tuple[int, ...], ...] = (
-    (8, 9, 10),
-    (8, 9, 10, 11),
-    (8, 9, 10, 11, 12),
-    (8, 9, 10, 11, 12, 13),
-    tuple(range(8, _FIRST + _PROFILE)),
-    tuple(range(8, _REST)),
-)
+# Lenses free c and a_0, then more and more of the others.
+_LENSES = tuple(tuple(range(8, stop)) for stop in (11, 12, 13, 14, _SQUARE.start, _REST))
 # Prior standard deviations of the centre, of the profile beyond a_0, of m and n, and of the polynomial
 # [half diagonals].
 _CENTRE_PRIOR, _PROFILE_PRIOR, _SQUARE_PRIOR, _REST_PRIOR = 0.1, 0.3, 0.02, 0.1
@@ -55,6 +49,7 @@ class WideMap(SmoothMap):
     richest_lens: ClassVar[int] = len(_LENSES) - 1
     lens_models: ClassVar[tuple[tuple[int, int], ...]] = models[: len(_LENSES)]
     lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
+    square: ClassVar[slice] = _SQUARE
     rest: ClassVar[int] = _REST
 
     turn: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) R
@@ -73,7 +68,7 @@ class WideMap(SmoothMap):
         values = self.parameters
         direction, across, angle = self._seen(ground)
         stretch = angle * (values[_FIRST : _SQUARE.start] @ self._profile(angle)[0]) / across
-        return np.asarray(values[_CENTRE, None] + self._squared @ (stretch * direction[:2]))
+        return np.asarray(values[_CENTRE, None] + self._metric @ (stretch * direction[:2]))
 
     def along(self, places: Places) -> tuple[Array, Array]:
         """Pixels along the places' directions, and their derivatives; see `SmoothMap.along`."""
@@ -91,7 +86,7 @@ class WideMap(SmoothMap):
         out[_CENTRE] = axis
         out[_SQUARE.start] = axis[0] * q[0] - axis[1] * q[1]
         out[_SQUARE.start + 1] = axis[0] * q[1] + axis[1] * q[0]
-        axis = self._squared @ axis
+        axis = self._metric @ axis
         outwards = (axis * towards).sum(axis=0)
         value += radius * outwards
         np.multiply(terms, angle * outwards, out=out[_FIRST : _SQUARE.start])
@@ -123,11 +118,6 @@ class WideMap(SmoothMap):
             terms.append(2 * w * terms[-1] - terms[-2])
             slopes.append(2 * terms[-2] + 2 * w * slopes[-1] - slopes[-2])
         return np.array(terms), np.array(slopes) * (4 * angle / self.widest**2)
-
-    @property
-    def _squared(self) -> Array:
-        m, n = self.parameters[_SQUARE]
-        return np.array([[1 + m, n], [n, 1 - m]])
 
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:

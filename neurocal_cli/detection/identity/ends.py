@@ -1,9 +1,8 @@
 """Decide whether the board ends at a side of a grid, or its pattern continues.
 
-In: an image and a grid. Out: an `End` for each of the four sides. One more ring of squares surrounds the
-outer vertices. If the board ends, the brightness beyond the ring is the same next to dark and light squares,
-and the change is where the next vertices would be. An occluder or the image border cuts the ring at another
-place.
+One more ring of squares surrounds the outer vertices. If the board ends, the brightness beyond the ring is
+the same next to dark and light squares, and the change is where the next vertices would be. An occluder or
+the image border cuts the ring at another place.
 """
 
 from __future__ import annotations

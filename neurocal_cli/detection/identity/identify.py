@@ -1,6 +1,6 @@
 """Identify the vertices of grids with those of the board.
 
-In: a board, the grids of an image, and the image. Out: `Located` grids. The criteria, in this order:
+The criteria, in this order:
 
 1. A grid is placed on a plane of its size. A partly hidden grid must show enough ends of the board that only
    one place is left.
@@ -237,13 +237,12 @@ def _colours(grids: Sequence[Grid], arrangement: _Arrangement) -> tuple[bool, ..
 
 def _same_board(board: Board, grids: Sequence[Grid], first: _Arrangement, second: _Arrangement) -> bool:
     """Whether two arrangements differ by a motion that maps the whole board onto itself."""
-    world: list[list[Array]] = [[], []]
-    for points, arrangement in zip(world, (first, second), strict=True):
-        for grid, placement in zip(grids, arrangement.placements, strict=True):
-            c, r = grid.shape[0] - 1, grid.shape[1] - 1
-            box = placement.apply([[0, 0], [c, 0], [0, r], [c, r]])
-            points.append(board.planes[placement.plane].at(box))
-    moved = rigid_motion(np.concatenate(world[0]), np.concatenate(world[1]))
+
+    def outline(arrangement: _Arrangement) -> Array:
+        pairs = zip(grids, arrangement.placements, strict=True)
+        return np.concatenate([board.planes[p.plane].at(p.apply(_box(*grid.shape))) for grid, p in pairs])
+
+    moved = rigid_motion(outline(first), outline(second))
     if moved is None:
         return False
     R, t = moved
@@ -258,5 +257,9 @@ def _same_board(board: Board, grids: Sequence[Grid], first: _Arrangement, second
 
 
 def _corners(plane: Plane) -> Array:
-    c, r = plane.cols - 1, plane.rows - 1
-    return plane.at([[0, 0], [c, 0], [0, r], [c, r]])
+    return plane.at(_box(plane.cols, plane.rows))
+
+
+def _box(cols: int, rows: int) -> list[list[int]]:
+    """The four outermost vertices (c, r)."""
+    return [[c, r] for r in (0, rows - 1) for c in (0, cols - 1)]

@@ -36,21 +36,16 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
 
     `front` (3,) is, for points in one plane, its normal that must point away from the camera.
     """
-    plane = _plane_coordinates(world, front) if is_flat(world) else None
-    points = world if plane is None else plane
+    flat = is_flat(world)
+    points = _plane_coordinates(world, front) if flat else world
     P, rms = _linear_camera(points, pixels)
-    if not np.isfinite(rms):
-        return CameraFit(np.inf, 0)
     depth = np.column_stack([points, np.ones(len(points))]) @ P[2]
-    if depth.min() < 0 < depth.max():
+    if not np.isfinite(rms) or depth.min() < 0 < depth.max():
         return CameraFit(np.inf, 0)
-    sign = np.sign(depth[0])
-    if plane is not None:
-        handed = 0 if front is None else int(sign * np.sign(np.linalg.det(P)))
-        return CameraFit(rms, handed)
-    if _affine_rms(points, pixels) < _WEAK * rms:
+    undetermined = front is None if flat else _affine_rms(points, pixels) < _WEAK * rms
+    if undetermined:
         return CameraFit(rms, 0)
-    return CameraFit(rms, int(sign * np.sign(np.linalg.det(P[:, :3]))))
+    return CameraFit(rms, int(np.sign(depth[0]) * np.sign(np.linalg.det(P[:, :3]))))
 
 
 def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:

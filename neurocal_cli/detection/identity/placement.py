@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from neurocal_cli.board import Plane
-from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.grid import TURNS, Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -60,8 +60,7 @@ def _without(grid: Grid, side: Side) -> Grid:
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
-_TURNS: tuple[Matrix, ...] = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
-_MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in _TURNS)
+_MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
 
 
 @frozen_dataclass
@@ -99,7 +98,7 @@ def placements(
     """
     last = plane.cols - 1, plane.rows - 1
     cols, rows = grid.shape
-    for matrix in (*_TURNS, *(_MIRRORED if mirrored else ())):
+    for matrix in (*TURNS, *(_MIRRORED if mirrored else ())):
         corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # the grid's, opposite to (0, 0)
         size = abs(corner[0]), abs(corner[1])
         for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
