@@ -7,19 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.slow_cases import slow_but
-from support.targets import photographed
+from support.targets import photographed, stabilised
 
-from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli import Calibration, calibrate
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.moving_centre import MovingCentre
-
-
-def stabilised(points: Correspondences, size: float, seed: int) -> Correspondences:
-    """Every image shifted by another amount, with this rms along u and v [px]."""
-    shift = np.random.default_rng(seed).standard_normal((points.n_views, 2))
-    shift -= shift.mean(axis=0)
-    shift *= size / np.sqrt((shift**2).mean())
-    return replace(points, pixels=points.pixels + shift[points.view_index])
 
 
 def told(calibration: Calibration) -> bool:

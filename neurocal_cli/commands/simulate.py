@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import click
@@ -210,12 +211,13 @@ def _scene(
         from neurocal_cli.io.calibration_tree import read_calibration
         from neurocal_cli.io.exchange.reading import read_intrinsics
 
-        if board_file is None and views is None and camera_file != "-":
-            try:
+        own = board_file is None and views is None and camera_file != "-"
+        if own:
+            with suppress(FormatError):
                 return scenes.calibrated_scene(read_calibration(camera_file)), False
-            except FormatError:
-                note(f"{camera_file} holds no points of its own; the paper's boards are used")
         camera = read_intrinsics(camera_file)
+        if own:
+            note(f"{camera_file} holds no points of its own; the paper's boards are used")
     count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)
     poses = scenes.random_poses(camera, board, count, np.random.default_rng((seed, 2)))
     return scenes.scene_of(camera, board, poses), False

@@ -118,7 +118,11 @@ def detect_points(
     ------
     NoBoardError
         The image does not show the board, or not enough of it. The message gives the reason.
+    InputError
+        Pixels of the image are not finite.
     """
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise InputError("some pixels of the image are not finite numbers; replace them, for example by 0")
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
     identified = _identified(board, found, image)
     located = identified.located

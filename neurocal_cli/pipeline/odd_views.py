@@ -32,6 +32,7 @@ _STARTS = 20
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
+_BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
@@ -55,10 +56,13 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     if zoomed < limit:
         scale = entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
-            return f"it fits another zoom or focus: a focal length of {entries[0]:.5g} px"
+            how = f"it fits another zoom or focus: a focal length of {entries[0]:.5g} px"
+            return how + _or_bent(abs(scale[0] - 1))
     moved, entries = _fit(points, start, _CENTRE)
     if moved < limit:
-        return f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
+        how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
+        shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
+        return how + _or_bent(shift / camera.entries[0])
     free, _ = _fit(points, start, (*_FOCAL, *_CENTRE))
     if free > _BLURRED * pixel_spread(points):
         return otherwise
@@ -71,6 +75,11 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
 def may_be_bent(reason: str) -> bool:
     """Whether a reason of `why_odd` may have the target's shape as its cause."""
     return "bent" in reason
+
+
+def _or_bent(change: float) -> str:
+    """Another cause of a change of this size, over the focal length; "" if it is too large."""
+    return ", or the target is bent" if change < _BY_BENDING else ""
 
 
 def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondences]]:

@@ -9,12 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.outlier_views import least_of_free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.pipeline.point_errors import places_of_views
 from neurocal_cli.target_shape.find import Found, evidence_as_given
 from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
@@ -26,6 +28,7 @@ from neurocal_cli.verdict.given_parameters import (
     reestimate_given,
 )
 from neurocal_cli.verdict.noise import stated_noise
+from neurocal_cli.verdict.turned_images import best_turned, middle_of
 from neurocal_cli.verdict.view_change import view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
@@ -49,7 +52,10 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         return True
     # No camera that changes between views fits better than one of each view's own.
     own = float(least_of_free_networks(solution.adjusted.normal).sum())
-    return _are_two_cameras(solution, found, own) or _changes_between_views(solution, found, own)
+    if _are_two_cameras(solution, found, own):
+        return True
+    rivals = _Rivals.of(solution, found)
+    return rivals.may_explain(own) and (_changes_between_views(rivals) or _are_turned(rivals))
 
 
 def contradicts_sigma(solution: Solution) -> bool:
@@ -100,26 +106,57 @@ def groups_of_views(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
     return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
 
 
-def _changes_between_views(solution: Solution, found: Found, own: float) -> bool:
+@frozen_dataclass(eq=False)
+class _Rivals:
+    """Causes that a small number of unknowns describes, on the given target, beside the found target."""
+
+    solution: Solution
+    spare: float  # equations beyond the unknowns
+    wanted: float  # log evidence of the found target over that of the given one
+
+    @classmethod
+    def of(cls, solution: Solution, found: Found) -> _Rivals:
+        problem = solution.problem
+        wanted = found.evidence - evidence_as_given([(problem, solution.adjusted)])
+        return cls(solution, problem.views.n_equations - problem.n_parameters, wanted)
+
+    def more_probable(self, after: float, choices: float = 1.0) -> bool:
+        """Whether one unknown that leaves this squared error is more probable than the found target.
+
+        The cause was selected among so many.
+        """
+        left = max(after / float(self.solution.adjusted.cost.sum()), 1.0 - _ALL)
+        occam = _OCCAM * np.log(self.solution.problem.views.n_equations) + np.log(choices)
+        return bool(-0.5 * self.spare * np.log(left) - occam > self.wanted)
+
+    def may_explain(self, own: float) -> bool:
+        """Whether a change of the camera may be more probable; `own` is the error with one for each view."""
+        before = float(self.solution.adjusted.cost.sum())
+        return bool(self.solution.problem.free.any()) and self.more_probable(
+            before - min((before - own) / _SURELY, _ALL * before)
+        )
+
+
+def _changes_between_views(rivals: _Rivals) -> bool:
     """Whether a small change of the camera between the views is more probable than the found target.
 
     A change of the image's size by 1 % looks like a target of another shape, or like bends of single views.
     """
-    problem, adjusted = solution.problem, solution.adjusted
+    problem, adjusted, repeated = rivals.solution.problem, rivals.solution.adjusted, rivals.solution.repeated
     views, free = problem.views, problem.free_camera
-    if not problem.free.any():
-        return False
-    repeated = solution.repeated
-    spare = views.n_equations - problem.n_parameters
-    wanted = found.evidence - evidence_as_given([(problem, adjusted)])
-
-    def gain(explained: float) -> float:
-        """Gain in log evidence of one unknown that explains this share of the squared error."""
-        return -0.5 * spare * float(np.log1p(-min(explained, _ALL))) - _OCCAM * np.log(views.n_equations)
-
-    if not gain((1.0 - own / float(adjusted.cost.sum())) / _SURELY) > wanted:
-        return False
     scores = scores_of_poses(adjusted.normal, free, problem.free_poses, repeated)
-    variance = float(adjusted.cost.sum()) / spare
-    change = view_change(views, adjusted.state, free, scores, repeated.group, variance, spare)
-    return change is not None and gain(change.explained) > wanted
+    before = float(adjusted.cost.sum())
+    variance = before / rivals.spare
+    change = view_change(views, adjusted.state, free, scores, repeated.group, variance, rivals.spare)
+    return change is not None and rivals.more_probable((1.0 - change.explained) * before)
+
+
+def _are_turned(rivals: _Rivals) -> bool:
+    """Whether images turned by 180 degrees are more probable than the found target."""
+    problem, adjusted = rivals.solution.problem, rivals.solution.adjusted
+    views, free, size = problem.views, problem.free_camera, problem.points.image_size
+    if size is None or not problem.free[3:].all():
+        return False
+    q = reduced(adjusted.normal, free, problem.free_poses)
+    best, _ = best_turned(views, adjusted, q, free, middle_of(size, views))
+    return rivals.more_probable(float(best.cost.sum()), 2.0**views.n_views)

@@ -319,16 +319,21 @@ class _AtMinimum:
             return None
 
     def _turned(self, contradiction: float) -> tuple[str, ...]:
-        size, special = self.points.image_size, self._is_exact() or self.state.model == "rich"
-        if size is None or special or not (self.free_poses and self.free[3:5].all()):
+        special = self._is_exact() or self.state.model == "rich"
+        if self.points.image_size is None or special or not (self.free_poses and self.free[3:5].all()):
             return ()
-        from neurocal_cli.verdict.turned_images import can_show, turned_images
+        from neurocal_cli.verdict.turned_images import WithBoard, can_show, turned_images
 
         if not can_show(self.views.n_views, contradiction, self.spare):
             return ()
-        _, views = self._as_given()
+        points, views = self._as_given()
+        estimated = None
+        if self.calibration.target is not None:
+            q = reduced(self.normal, self.free, True)
+            estimated = WithBoard(self.views, self.state, q, contradiction)
         try:
-            return turned_images(views, normalised(self.given, views), self.free, size, self.spare)
+            state = normalised(self.given, views)
+            return turned_images(points, views, state, self.free, self.spare, estimated)
         except np.linalg.LinAlgError:  # the views do not determine the camera
             return ()
 

@@ -149,7 +149,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 def _is_explained(e: Evidence) -> bool:
     """Whether a cause is known why no single camera fits."""
-    return bool(e.groups or e.missing or e.proportions or e.stated or e.turned or e.centre)
+    return bool(e.groups or e.missing or e.proportions or e.stated or e.turned)
 
 
 def _by_flexing(e: Evidence, diagonal: float) -> bool:

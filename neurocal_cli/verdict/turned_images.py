@@ -5,7 +5,9 @@ image centre and the distortion are mirrored at the middle of the image. The pos
 rest, so that the image centre seems to move to and fro between the views. The images are turned if a single
 camera fits once they are turned back, nearly as well as one with a centre of its own for each view.
 
-The board is used as it is given, because an estimated one may have adapted to the turned images.
+An estimated board may have adapted to the turned images, and a given one that is bent hides them. So they
+are looked for with both. If the board was estimated, it is estimated again with the images turned back, and
+hardly more than noise must be left.
 """
 
 from __future__ import annotations
@@ -17,16 +19,21 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
+from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.moving_centre import least_with_own_centres
 from neurocal_cli.verdict.view_groups import divided
 
 # Repeated by tests/test_turned_images.py. Turned images of photographs explain 0.83 to 0.98 of what centres
 # of each view explain, and a centre that moves at random 0.77 in 4 views, 0.65 in more.
 _SHARE = 0.8
+_EXCESS = 0.7  # with an estimated board: least share of the error above the noise floor
 _GAIN = 20.0  # least gain in log evidence, as of a moving centre
 _FEWEST = 3  # fewest views
 _STEPS = 30
@@ -39,37 +46,108 @@ def can_show(n_views: int, contradiction: float, spare: float) -> bool:
     return n_views >= _FEWEST and spare * np.log(contradiction) > _GAIN
 
 
+@frozen_dataclass(eq=False)
+class WithBoard:
+    """The camera at its minimum for an estimated board."""
+
+    views: Views
+    state: CameraState  # normalised
+    q: Quadratics  # of the V views in the free parameters, with the board marginalised
+    contradiction: float  # rms error over the noise floor
+
+
 def turned_images(
-    views: Views, state: CameraState, free: NDArray[np.bool_], image_size: tuple[int, int], spare: float
+    points: Correspondences,
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    spare: float,
+    estimated: WithBoard | None,
 ) -> tuple[str, ...]:
     """Names of the images that are turned by 180 degrees; empty if none are.
 
-    If they are half of all, either half may be named. The state is normalised, `free` (5 + K,) are the
-    estimated ones of A's entries and the coefficients, and `spare` are the equations beyond the unknowns.
-    Raises `numpy.linalg.LinAlgError` if the views do not determine the camera.
+    If they are half of all, either half may be named. The points have the board as it is given, `views` are
+    the same, arranged, and the state is normalised. `free` (5 + K,) are the estimated ones of A's entries and
+    the coefficients, and `spare` are the equations beyond the unknowns. Raises `numpy.linalg.LinAlgError` if
+    the views do not determine the camera.
     """
-    middle = ((np.array(image_size) - 1) / 2 - views.pixel_centre) / views.pixel_scale
     common = adjust(views.batches, state, free, True, _STEPS)
-    before = float(common.cost.sum())
     q = reduced(common.normal, free, True)
-    centre = np.flatnonzero(np.isin(np.flatnonzero(free), (3, 4)))
-    member = divided(Quadratics(q.S[:, centre[:, None], centre], q.g[:, centre], q.cost))
-    best, found = common, None
-    for _ in range(_ROUNDS):
-        if member is None or member.all() or not member.any():
-            break
-        tried = _with_turned(views, common.state, member, free, middle)
-        if not tried.cost.sum() < best.cost.sum():
-            break
-        best, found = tried, member
-        member = member ^ _fits_turned(views, tried, member, middle)
-    if found is None:
-        return ()
-    after, least = float(best.cost.sum()), least_with_own_centres(views, common.state, free, q)
-    if before - after < _SHARE * (before - least) or 0.5 * spare * np.log(before / after) < _GAIN:
-        return ()
-    fewer = found if 2 * np.count_nonzero(found) <= len(found) else ~found
+    assert points.image_size is not None
+    middle = middle_of(points.image_size, views)
+    best, member = best_turned(views, common, q, free, middle)
+    if estimated is None:
+        before, after = float(common.cost.sum()), float(best.cost.sum())
+        enough = before - after > _SHARE * (before - least_with_own_centres(views, common.state, free, q))
+        return _names(views, member) if enough and _is_gain(before, after, spare) else ()
+    at = replace(common, state=estimated.state, cost=estimated.q.cost)
+    _, other = best_turned(estimated.views, at, estimated.q, free, middle)
+    before = float(estimated.q.cost.sum()) * views.pixel_scale**2
+    for some in (member, other):
+        if not some.any():
+            continue
+        tried = _with_turned(views, common.state, some, free, middle)
+        after = _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
+        enough = before - after > _EXCESS * before * (1.0 - estimated.contradiction**-2)
+        if enough and _is_gain(before, after, spare):
+            return _names(views, some)
+    return ()
+
+
+def _is_gain(before: float, after: float, spare: float) -> bool:
+    return bool(0.5 * spare * np.log(before / after) > _GAIN)
+
+
+def _names(views: Views, member: NDArray[np.bool_]) -> tuple[str, ...]:
+    """The names of these views, or of all others if those are fewer."""
+    fewer = member if 2 * np.count_nonzero(member) <= len(member) else ~member
     return tuple(np.array(views.names)[fewer].tolist())
+
+
+def middle_of(image_size: tuple[int, int], views: Views) -> Array:
+    """(2,) the middle of the image, normalised."""
+    return np.asarray(((np.array(image_size) - 1) / 2 - views.pixel_centre) / views.pixel_scale)
+
+
+def best_turned(
+    views: Views, common: Adjusted, q: Quadratics, free: NDArray[np.bool_], middle: Array
+) -> tuple[Adjusted, NDArray[np.bool_]]:
+    """The camera with the views (V,) turned with which it fits best, and which these are.
+
+    `common` is the camera for all views as they are, with their quadratics q in the free parameters.
+    """
+    centre = np.flatnonzero(np.isin(np.flatnonzero(free), (3, 4)))
+    tried = divided(Quadratics(q.S[:, centre[:, None], centre], q.g[:, centre], q.cost))
+    best, member = common, np.zeros(views.n_views, dtype=bool)
+    for _ in range(_ROUNDS):
+        if tried is None or tried.all() or not tried.any():
+            break
+        adjusted = _with_turned(views, common.state, tried, free, middle)
+        if not adjusted.cost.sum() < best.cost.sum():
+            break
+        best, member = adjusted, tried
+        tried = tried ^ _fits_turned(views, adjusted, tried, middle)
+    return best, member
+
+
+def _least_with_board(
+    points: Correspondences, views: Views, member: NDArray[np.bool_], adjusted: Adjusted, skew: bool
+) -> float:
+    """Squared error [px^2] with some views turned back, and the board estimated with the camera.
+
+    `views` are turned already, and the points are not.
+    """
+    from neurocal_cli.target_shape.find import find_target
+
+    those = np.isin(np.array(points.view_names), np.array(views.names)[member])[points.view_index]
+    back = np.array(points.image_size) - 1 - points.pixels
+    points = replace(points, pixels=np.where(those[:, None], back, points.pixels))
+    problem = problem_for(points, 1, skew=skew, distortion=Distortion(adjusted.state.model))
+    found = find_target([(replace(problem, views=views), adjusted)])
+    if found is None:
+        return float(adjusted.cost.sum()) * views.pixel_scale**2
+    problem, adjusted = found.fits[0]
+    return float(adjusted.cost.sum()) * problem.views.pixel_scale**2
 
 
 def _with_turned(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -149,3 +149,11 @@ def views_of(
     )
     R, t, offset = (np.stack(parts) for parts in zip(*poses, strict=True))
     return points, R, t, offset
+
+
+def stabilised(points: Correspondences, size: float, seed: int) -> Correspondences:
+    """Every image shifted by another amount, with this rms along u and v [px]."""
+    shift = np.random.default_rng(seed).standard_normal((points.n_views, 2))
+    shift -= shift.mean(axis=0)
+    shift *= size / np.sqrt((shift**2).mean())
+    return replace(points, pixels=points.pixels + shift[points.view_index])

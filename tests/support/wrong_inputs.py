@@ -132,6 +132,17 @@ def shifted(points: Correspondences, which: range | list[int]) -> Correspondence
     return moved(points, world)
 
 
+def turned(points: Correspondences, which: range | list[int]) -> Correspondences:
+    """These views turned by 180 degrees."""
+    back = np.array(SIZE) - 1 - points.pixels
+    return moved(points, pixels=np.where(in_views(points, which)[:, None], back, points.pixels))
+
+
+def off_centre(points: Correspondences) -> Correspondences:
+    """Images of a camera whose centre lies 22 px from the middle."""
+    return moved(points, pixels=points.pixels + np.array([20.0, 10.0]))
+
+
 def of_cameras(focal: list[float], seed: int = 1, shift: float = 0.0) -> Correspondences:
     """Views of different cameras in turn."""
     parts = []
@@ -272,6 +283,8 @@ FLAT: dict[str, Spoiler] = {
     "image stabilisation on": lambda p, rng: moved(
         p, pixels=p.pixels + (8 * rng.normal(size=(10, 2)))[p.view_index]
     ),
+    "some images turned by 180 degrees": lambda p, rng: turned(off_centre(p), range(0, 10, 3)),
+    "one image turned by 180 degrees": lambda p, rng: turned(off_centre(p), [2]),
     "half of the images cropped": lambda p, rng: of_cameras([600.0], shift=-60.0),
     "half of the images at half size": lambda p, rng: moved(
         p, pixels=np.where(in_views(p, range(5))[:, None], p.pixels / 2, p.pixels)
@@ -438,6 +451,8 @@ CAUSES: dict[str, str] = {
     "two cameras mixed, 5 % apart": "two cameras",
     "zoom changing from view to view": "the focal length changes from view to view",
     "image stabilisation on": "the image centre moves from view to view",
+    "some images turned by 180 degrees": "turned by 180 degrees against the other images",
+    "one image turned by 180 degrees": "view02",
     "half of the images cropped": "one part is cropped",
     "half of the images at half size": "of two sizes",
     "one image of another zoom": "view09 (it fits another zoom",
