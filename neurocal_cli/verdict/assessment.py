@@ -330,10 +330,11 @@ class _AtMinimum:
         estimated = None
         if self.calibration.target is not None:
             q = reduced(self.normal, self.free, True)
-            estimated = WithBoard(self.views, self.state, q, contradiction)
+            estimated = WithBoard(self.views, self.state, q)
+        floor = self.cost * self.views.pixel_scale**2 / contradiction**2
         try:
             state = normalised(self.given, views)
-            return turned_images(points, views, state, self.free, self.spare, estimated)
+            return turned_images(points, views, state, self.free, self.spare, floor, estimated)
         except np.linalg.LinAlgError:  # the views do not determine the camera
             return ()
 

@@ -6,8 +6,8 @@ rest, so that the image centre seems to move to and fro between the views. The i
 camera fits once they are turned back, nearly as well as one with a centre of its own for each view.
 
 An estimated board may have adapted to the turned images, and a given one that is bent hides them. So they
-are looked for with both. If the board was estimated, it is estimated again with the images turned back, and
-hardly more than noise must be left.
+are looked for with both. If that is not clear with the given board, it is estimated with the images turned
+back, and hardly more than noise must be left.
 """
 
 from __future__ import annotations
@@ -53,7 +53,6 @@ class WithBoard:
     views: Views
     state: CameraState  # normalised
     q: Quadratics  # of the V views in the free parameters, with the board marginalised
-    contradiction: float  # rms error over the noise floor
 
 
 def turned_images(
@@ -62,34 +61,42 @@ def turned_images(
     state: CameraState,
     free: NDArray[np.bool_],
     spare: float,
+    floor: float,
     estimated: WithBoard | None,
 ) -> tuple[str, ...]:
     """Names of the images that are turned by 180 degrees; empty if none are.
 
     If they are half of all, either half may be named. The points have the board as it is given, `views` are
     the same, arranged, and the state is normalised. `free` (5 + K,) are the estimated ones of A's entries and
-    the coefficients, and `spare` are the equations beyond the unknowns. Raises `numpy.linalg.LinAlgError` if
-    the views do not determine the camera.
+    the coefficients, `spare` are the equations beyond the unknowns, and `floor` is the squared error [px^2]
+    at the noise floor. Raises `numpy.linalg.LinAlgError` if the views do not determine the camera.
     """
     common = adjust(views.batches, state, free, True, _STEPS)
     q = reduced(common.normal, free, True)
     assert points.image_size is not None
     middle = middle_of(points.image_size, views)
     best, member = best_turned(views, common, q, free, middle)
+    members = [member]
+
+    def with_board(some: NDArray[np.bool_]) -> float:
+        tried = _with_turned(views, common.state, some, free, middle)
+        return _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
+
     if estimated is None:
         before, after = float(common.cost.sum()), float(best.cost.sum())
-        enough = before - after > _SHARE * (before - least_with_own_centres(views, common.state, free, q))
-        return _names(views, member) if enough and _is_gain(before, after, spare) else ()
-    at = replace(common, state=estimated.state, cost=estimated.q.cost)
-    _, other = best_turned(estimated.views, at, estimated.q, free, middle)
-    before = float(estimated.q.cost.sum()) * views.pixel_scale**2
-    for some in (member, other):
+        own = least_with_own_centres(views, common.state, free, q)
+        if before - after > _SHARE * (before - own) and _is_gain(before, after, spare):
+            return _names(views, member)
+        before = with_board(np.zeros_like(member)) if member.any() else 0.0
+    else:
+        at = replace(common, state=estimated.state, cost=estimated.q.cost)
+        members.append(best_turned(estimated.views, at, estimated.q, free, middle)[1])
+        before = float(estimated.q.cost.sum()) * views.pixel_scale**2
+    for some in members:
         if not some.any():
             continue
-        tried = _with_turned(views, common.state, some, free, middle)
-        after = _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
-        enough = before - after > _EXCESS * before * (1.0 - estimated.contradiction**-2)
-        if enough and _is_gain(before, after, spare):
+        after = with_board(some)
+        if before - after > _EXCESS * (before - floor) and _is_gain(before, after, spare):
             return _names(views, some)
     return ()
 
