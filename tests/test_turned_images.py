@@ -13,7 +13,7 @@ from support.targets import photographed, stabilised
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.verdict.assessment import gather_evidence
 
-OFF = np.array([40.0, -40.0])  # px; of the image centre from where the simulated cameras have it
+OFF = np.array([45.0, -45.0])  # px; of the image centre from where the simulated cameras have it
 
 
 def turned(points: Correspondences, which: Iterable[int]) -> Correspondences:

@@ -35,15 +35,20 @@ from neurocal_cli.verdict.view_groups import divided
 _SHARE = 0.8
 _EXCESS = 0.85  # with an estimated board: least share of the error above the noise floor
 _GAIN = 20.0  # least gain in log evidence, as of a moving centre
+_BY_NOISE = 3.0  # standard deviations
 _FEWEST = 5  # fewest views; of four, a centre that moves often looks like turned images
-_STEPS = 30
+_STARTS, _STEPS = 5, 30
 _ROUNDS = 5
 _TURN = np.array([-1.0, -1.0, 1.0])
 
 
 def can_show(n_views: int, contradiction: float, spare: float) -> bool:
-    """Whether so many views, with this rms error over the noise floor, can show that images are turned."""
-    return n_views >= _FEWEST and spare * np.log(contradiction) > _GAIN
+    """Whether so many views, with this rms error over the noise floor, can show that images are turned.
+
+    Without a contradiction, noise changes the logarithm of the likelihood by about the square root of the
+    number of views, because a flat target has two conditions in each view.
+    """
+    return n_views >= _FEWEST and spare * np.log(contradiction) > _GAIN + _BY_NOISE * np.sqrt(n_views)
 
 
 @frozen_dataclass(eq=False)
@@ -75,34 +80,42 @@ def turned_images(
     q = reduced(common.normal, free, True)
     assert points.image_size is not None
     middle = middle_of(points.image_size, views)
-    best, member = best_turned(views, common, q, free, middle)
-    members = [member]
+    members = []
+
+    def try_turning(views: Views, adjusted: Adjusted, q: Quadratics) -> Adjusted:
+        """The camera with some views turned, which are kept if that is a gain."""
+        best, member = best_turned(views, adjusted, q, free, middle)
+        if _is_gain(adjusted, best, spare):
+            members.append(member)
+        return best
 
     def with_board(some: NDArray[np.bool_]) -> float:
         tried = _with_turned(views, common.state, some, free, middle)
         return _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
 
-    if estimated is None:
-        before, after = float(common.cost.sum()), float(best.cost.sum())
-        own = least_with_own_centres(views, common.state, free, q)
-        if before - after > _SHARE * (before - own) and _is_gain(before, after, spare):
-            return _names(views, member)
-        before = with_board(np.zeros_like(member)) if member.any() else 0.0
-    else:
-        at = replace(common, state=estimated.state, cost=estimated.q.cost)
-        members.append(best_turned(estimated.views, at, estimated.q, free, middle)[1])
+    own = least_with_own_centres(views, common.state, free, q)
+    before = float(common.cost.sum())
+    if not 0.5 * spare * np.log(before / own) > _GAIN + views.n_views:  # of noise, half of 2 V unknowns
+        return ()
+    best = try_turning(views, common, q)
+    if estimated is None and members:
+        if before - float(best.cost.sum()) > _SHARE * (before - own):
+            return _names(views, members[0])
+        before = with_board(np.zeros_like(members[0]))
+    elif estimated is not None:
+        try_turning(
+            estimated.views, replace(common, state=estimated.state, cost=estimated.q.cost), estimated.q
+        )
         before = float(estimated.q.cost.sum()) * views.pixel_scale**2
     for some in members:
-        if not some.any():
-            continue
         after = with_board(some)
-        if before - after > _EXCESS * (before - floor) and _is_gain(before, after, spare):
+        if before - after > _EXCESS * (before - floor) and 0.5 * spare * np.log(before / after) > _GAIN:
             return _names(views, some)
     return ()
 
 
-def _is_gain(before: float, after: float, spare: float) -> bool:
-    return bool(0.5 * spare * np.log(before / after) > _GAIN)
+def _is_gain(before: Adjusted, after: Adjusted, spare: float) -> bool:
+    return bool(0.5 * spare * np.log(before.cost.sum() / after.cost.sum()) > _GAIN)
 
 
 def _names(views: Views, member: NDArray[np.bool_]) -> tuple[str, ...]:
@@ -123,9 +136,9 @@ def best_turned(
 
     `common` is the camera for all views as they are, with their quadratics q in the free parameters.
     """
-    centre = np.flatnonzero(np.isin(np.flatnonzero(free), (3, 4)))
-    tried = divided(Quadratics(q.S[:, centre[:, None], centre], q.g[:, centre], q.cost))
     best, member = common, np.zeros(views.n_views, dtype=bool)
+    centre = np.flatnonzero(np.isin(np.flatnonzero(free), (3, 4)))
+    tried = divided(Quadratics(q.S[:, centre[:, None], centre], q.g[:, centre], q.cost), _STARTS)
     for _ in range(_ROUNDS):
         if tried is None or tried.all() or not tried.any():
             break

@@ -143,12 +143,12 @@ def _two_cameras(
     return found
 
 
-def divided(quadratics: Quadratics) -> NDArray[np.bool_] | None:
+def divided(quadratics: Quadratics, starts: int = _STARTS) -> NDArray[np.bool_] | None:
     """The best clustering into two groups from several random starts, with the quadratic model."""
     rng = np.random.default_rng(0)
     V = len(quadratics.cost)
     best, division = np.inf, None
-    for _ in range(_STARTS):
+    for _ in range(starts):
         member = rng.random(V) < 0.5
         for _ in range(_ROUNDS):
             steps = quadratics.steps(np.array([member, ~member], dtype=float))

@@ -115,7 +115,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
 def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Constants:
     """Pose of each view with known cameras (type 3)."""
     V = points.points.n_views
-    R, t = np.empty((V, 3, 3)), np.empty((V, 3))
+    R, t = np.full((V, 3, 3), np.nan), np.full((V, 3), np.nan)
     number = {name: k for k, name in enumerate(points.points.view_names)}
     for s, values in enumerate(local):
         distortion = Distortion(lens.model, coefficients_of(values, lens.model))
