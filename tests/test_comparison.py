@@ -109,6 +109,13 @@ def test_wrong_usage_is_refused() -> None:
         assert done.stdout == ""
 
 
+def test_a_camera_that_is_not_there_is_the_only_message(tmp_path: Path) -> None:
+    done = run("simulate", "--camera", tmp_path / "none.yaml")
+    assert done.exit_code == 1
+    assert "none.yaml" in done.stderr
+    assert "no points of its own" not in done.stderr
+
+
 @pytest.mark.slow
 def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: Path) -> None:
     words = [

@@ -177,3 +177,11 @@ def test_images_of_two_sizes_are_refused_by_name() -> None:
         gather({"a": one, "b": other})
     with pytest.raises(InputError, match="no images"):
         gather({})
+
+
+def test_pixels_that_are_not_finite_are_refused() -> None:
+    seen = picture("base", 1)
+    image = seen.image.astype(float)
+    image[:3] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        detect_points(image, BOARD)

@@ -34,12 +34,12 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.absolute_conic import omega_of, product_of
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
 from neurocal_cli.initialisation.view_networks import Group, begin_flat
-from neurocal_cli.verdict.proportions import omega_of, product_of
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
 _SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding

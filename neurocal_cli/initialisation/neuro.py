@@ -2,7 +2,8 @@
 
 1. Each view's network learns the product W V_k from random weights (`view_networks`).
 2. The orthogonality conditions split the products into one W and a pose for each view
-   (`cameras_from_networks`). The paper's trainer goes on with its orthogonality term, eq. (14).
+   (`cameras_from_networks`). The paper's trainer goes on with its orthogonality term
+   (`constrained_training`).
 3. Bundle adjustment minimises the reprojection error (3) over all parameters, with exact rotations
    (`adjust`), also from other starts if another minimum may be lower (`local_minima`).
 
@@ -20,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import OPTIONS, Adjusted
-from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
-from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
+from neurocal_cli.initialisation.constrained_training import train_constrained
 from neurocal_cli.initialisation.local_minima import (
     better_by_view,
     reaches_bound,
@@ -36,7 +37,7 @@ from neurocal_cli.initialisation.local_minima import (
     try_mirrored,
     try_start,
 )
-from neurocal_cli.initialisation.options import MOST_POINTS, Options
+from neurocal_cli.initialisation.options import Options
 from neurocal_cli.initialisation.radial_step import radial_step
 from neurocal_cli.initialisation.view_networks import (
     Group,
@@ -44,7 +45,6 @@ from neurocal_cli.initialisation.view_networks import (
     refuse_few_conditions,
     train_networks,
 )
-from neurocal_cli.training import Task
 
 if TYPE_CHECKING:
     from neurocal_cli.initialisation.random_cameras import Found
@@ -102,7 +102,7 @@ class _Search:
         return adjusted, replace(record, before=before)
 
     def _constrained(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
-        state, iterations = _train_constrained(self.problem, self.options, state)
+        state, iterations = train_constrained(self.problem, self.options, state)
         return self._begin(state, replace(record, iterations=record.iterations + iterations), damping)
 
     def camera_and_poses(self) -> _Found:
@@ -214,27 +214,3 @@ class _Search:
         R[members], t[members] = found.state.R, found.state.t
         record = record.with_starts(members, found.agreed, found.starts, found.iterations)
         return replace(state, R=R, t=t), record
-
-
-def _train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:
-    """Train one view's network further on E_tot, eqs. (14) and (15); the new state, and the iterations.
-
-    Training starts from an upper triangular W and an orthonormal V; from random weights it would stall. W's
-    structural zeros and given weights are fixed. The state is unchanged if the trainer does not support this,
-    if the board is flat, so that V cannot be constrained, or if the result is no valid camera.
-    """
-    views = problem.views
-    if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
-        return state, 0
-    depth = float(state.t[0, 2])
-    # V is scaled so that depths, and so every gamma, are about 1; the constant a of E_orth compensates.
-    V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
-    free_W = np.zeros((3, 3), dtype=bool)
-    free_W[ENTRIES] = problem.free
-    patterns = views.patterns(np.array([0]), False, MOST_POINTS)
-    task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
-    trained = options.constrained(task, 1.0 / depth**2)
-    entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])
-    t = trained.V[:, :, 3] * depth
-    usable = np.isfinite(entries).all() and entries[[0, 2]].min() > 0 and t[0, 2] > 0
-    return CameraState(entries[None], R, t) if usable else state, int(trained.iterations.sum())

@@ -9,6 +9,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
+from neurocal_cli.bundle_adjustment.stored_state import stored_state
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
@@ -17,7 +18,6 @@ from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed
-from neurocal_cli.verdict.assessment import stored_state
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:

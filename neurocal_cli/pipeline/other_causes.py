@@ -123,7 +123,7 @@ class _Rivals:
     def more_probable(self, after: float, choices: float = 1.0) -> bool:
         """Whether one unknown that leaves this squared error is more probable than the found target.
 
-        The cause was selected among so many.
+        `choices` is the number of such causes among which this one was selected.
         """
         left = max(after / float(self.solution.adjusted.cost.sum()), 1.0 - _ALL)
         occam = _OCCAM * np.log(self.solution.problem.views.n_equations) + np.log(choices)

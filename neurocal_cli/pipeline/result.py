@@ -19,6 +19,7 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
 )
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.solution import Solution, TargetPosterior
+from neurocal_cli.bundle_adjustment.stored_state import stored_state
 from neurocal_cli.bundle_adjustment.units import normalised, translations
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -27,7 +28,6 @@ from neurocal_cli.distortion.simpler_model import undetermined_coefficients
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
-from neurocal_cli.verdict.assessment import stored_state
 from neurocal_cli.verdict.odd_points import are_normalised
 
 _XI = 5  # index of xi, after A's five entries

@@ -25,7 +25,8 @@ from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of
 from neurocal_cli.median import median
 from neurocal_cli.stereo.contradiction import FOCAL, Contradiction, contradiction
-from neurocal_cli.stereo.covariance import covariance_by_given, rig_covariance
+from neurocal_cli.stereo.covariance import rig_covariance
+from neurocal_cli.stereo.given_cameras import covariance_by_given
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, relative_poses

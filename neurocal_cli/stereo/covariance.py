@@ -5,7 +5,6 @@
   The delete-one jackknife over the views then gives the covariance, without a model of the differences (Efron
   and Stein 1981). A known change adds the square of the error that it causes.
 * A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
-* Cameras that were given for the rig with an uncertainty of their own (`covariance_by_given`).
 * Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
   single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
   `bundle_adjustment.open_coefficients`), and two stretches of the print if the given target was kept
@@ -22,14 +21,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.given_camera import entry_covariance
 from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, open_of_calibration, spread_of_open
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.least_squares.schur_complement import SchurCovariance, eliminate
-from neurocal_cli.stereo.adjust import Observations, RigFit, RigProblem, RigState
+from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.stereo.adjust import Observations, RigFit, RigProblem
 from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.relative_poses import RelativePoses
 from neurocal_cli.target import Target, is_flat
@@ -222,40 +220,3 @@ def _with_stretches(fit: RigFit, by: Array) -> Array:
         T[:, -3:, D - 1 :] = np.eye(3)
         normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
     return normal
-
-
-def covariance_by_given(
-    problem: RigProblem, state: RigState, normal: Array, free: Mask
-) -> SchurCovariance | None:
-    """Covariance of all shared unknowns and of the poses that the given cameras cause, normalised.
-
-    The rig, a second camera and the poses follow an error d of the given cameras as they would follow these
-    parameters if they were estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared
-    unknowns x. With the covariance S of the given cameras, x has the additional covariance
-    N_ff^-1 N_fd S N_df N_ff^-1, and x and d are correlated. It does not fall with the number of points.
-
-    `normal` (V, D, D) is that at the state, which is a minimum, and `free` (n_shared,) are the unknowns that
-    moved. None if no covariance is known.
-    """
-    columns = state.columns
-    given = np.zeros((columns.n_shared, columns.n_shared))
-    for camera, seen, place in zip(problem.calibrations, problem.observations, columns.cameras, strict=True):
-        if camera.given_names:
-            given[np.ix_(place, place)] = entry_covariance(
-                camera.intrinsics,
-                camera.distortion_model,
-                camera.given_names,
-                camera.given_covariance,
-                seen.pixel_scale,
-            )
-    if not given.any():
-        return None
-    whole, by_shared = eliminate(normal, np.arange(columns.n_shared), columns.pose)
-    whole = whole.sum(axis=0)
-    follow = np.eye(columns.n_shared)
-    follow[free] = -solve_scaled(whole[np.ix_(free, free)], whole[free])
-    follow[np.ix_(free, free)] = 0.0  # the free unknowns themselves have no error of their own here
-    shared = follow @ given @ follow.T
-    by_shared = -by_shared
-    cross = np.swapaxes(by_shared @ shared, 1, 2)
-    return SchurCovariance(shared, by_shared @ shared @ np.swapaxes(by_shared, 1, 2), cross, 1.0)

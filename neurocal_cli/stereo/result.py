@@ -27,7 +27,8 @@ from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import Observations, RigFit
-from neurocal_cli.stereo.covariance import covariance_by_given, covariance_of_choice, not_smaller
+from neurocal_cli.stereo.covariance import covariance_of_choice, not_smaller
+from neurocal_cli.stereo.given_cameras import covariance_by_given
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
 

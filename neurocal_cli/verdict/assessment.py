@@ -6,7 +6,6 @@ fresh result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -19,9 +18,10 @@ from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, Minimum, disa
 from neurocal_cli.bundle_adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
+from neurocal_cli.bundle_adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
+from neurocal_cli.bundle_adjustment.stored_state import stored_state
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
@@ -95,13 +95,6 @@ def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | 
     if not _has_points(calibration) or _views_behind(calibration):
         return None
     return _AtMinimum(calibration).projection()
-
-
-def stored_state(calibration: Calibration, names: Sequence[str]) -> CameraState:
-    """The camera of a calibration and its poses of the named views, in pixels and world units."""
-    poses, camera = [calibration.views[name].pose for name in names], calibration.camera
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    return CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
 
 
 def _has_points(calibration: Calibration) -> bool:

@@ -22,6 +22,7 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.camera.absolute_conic import omega_of, product_of
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
@@ -40,8 +41,6 @@ _REFINED = (0.03, 0.005, 0.001)  # distances in log s of three errors, for the m
 _FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
-# Rows and columns of omega's entries.
-_ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
 @frozen_dataclass
@@ -210,19 +209,6 @@ def _homography(plane: Array, pixels: Array) -> Array:
     H[:, :2] /= size
     H[:, 2] -= H[:, :2] @ middle
     return H
-
-
-def product_of(a: Array, b: Array) -> Array:
-    """Coefficients (V, 6) of a . omega b, for omega's entries 11, 12, 22, 13, 23, 33."""
-    other = np.where(_ROW == _COLUMN, 0.0, 1.0)
-    return np.asarray(a[:, _ROW] * b[:, _COLUMN] + other * a[:, _COLUMN] * b[:, _ROW])
-
-
-def omega_of(entries: Array) -> Array:
-    """The matrix omega (3, 3) from these entries up to sign; the first one becomes positive."""
-    omega = np.zeros((3, 3))
-    omega[_ROW, _COLUMN] = omega[_COLUMN, _ROW] = entries * np.sign(entries[0])
-    return omega
 
 
 def _is_noise(fit: _Fit | None) -> bool:

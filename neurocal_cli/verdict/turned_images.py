@@ -80,33 +80,26 @@ def turned_images(
     q = reduced(common.normal, free, True)
     assert points.image_size is not None
     middle = middle_of(points.image_size, views)
-    members = []
-
-    def try_turning(views: Views, adjusted: Adjusted, q: Quadratics) -> Adjusted:
-        """The camera with some views turned, which are kept if that is a gain."""
-        best, member = best_turned(views, adjusted, q, free, middle)
-        if _is_gain(adjusted, best, spare):
-            members.append(member)
-        return best
+    own, given = least_with_own_centres(views, common.state, free, q), float(common.cost.sum())
+    if not 0.5 * spare * np.log(given / own) > _GAIN + views.n_views:  # of noise, half of 2 V unknowns
+        return ()
+    best, member = best_turned(views, common, q, free, middle)
+    members = [member] if _is_gain(common, best, spare) else []
 
     def with_board(some: NDArray[np.bool_]) -> float:
+        """Squared error [px^2] with some views turned back, and the board estimated."""
         tried = _with_turned(views, common.state, some, free, middle)
         return _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
 
-    own = least_with_own_centres(views, common.state, free, q)
-    before = float(common.cost.sum())
-    if not 0.5 * spare * np.log(before / own) > _GAIN + views.n_views:  # of noise, half of 2 V unknowns
-        return ()
-    best = try_turning(views, common, q)
-    if estimated is None and members:
-        if before - float(best.cost.sum()) > _SHARE * (before - own):
-            return _names(views, members[0])
-        before = with_board(np.zeros_like(members[0]))
-    elif estimated is not None:
-        try_turning(
-            estimated.views, replace(common, state=estimated.state, cost=estimated.q.cost), estimated.q
-        )
+    if estimated is not None:
         before = float(estimated.q.cost.sum()) * views.pixel_scale**2
+        at = replace(common, state=estimated.state, cost=estimated.q.cost)
+        best, member = best_turned(estimated.views, at, estimated.q, free, middle)
+        members += [member] if _is_gain(at, best, spare) else []
+    elif given - float(best.cost.sum()) > _SHARE * (given - own) and members:
+        return _names(views, member)
+    elif members:
+        before = with_board(np.zeros_like(member))
     for some in members:
         after = with_board(some)
         if before - after > _EXCESS * (before - floor) and 0.5 * spare * np.log(before / after) > _GAIN:

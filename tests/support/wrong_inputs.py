@@ -452,7 +452,7 @@ CAUSES: dict[str, str] = {
     "zoom changing from view to view": "the focal length changes from view to view",
     "image stabilisation on": "the image centre moves from view to view",
     "some images turned by 180 degrees": "turned by 180 degrees against the other images",
-    "one image turned by 180 degrees": "view02",
+    "one image turned by 180 degrees": "view02 (its image is turned by 180 degrees",
     "half of the images cropped": "one part is cropped",
     "half of the images at half size": "of two sizes",
     "one image of another zoom": "view09 (it fits another zoom",
