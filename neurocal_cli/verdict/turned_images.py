@@ -36,7 +36,9 @@ _SHARE = 0.8
 _EXCESS = 0.85  # with an estimated board: least share of the error above the noise floor
 _GAIN = 20.0  # least gain in log evidence, as of a moving centre
 _BY_NOISE = 3.0  # standard deviations
-_FEWEST = 5  # fewest views; of four, a centre that moves often looks like turned images
+# Fewest views, and fewest with which the board is estimated: in fewer, a centre that moves often looks
+# like turned images.
+_FEWEST, _FEWEST_WITH_BOARD = 5, 8
 _STARTS, _STEPS = 5, 30
 _ROUNDS = 5
 _TURN = np.array([-1.0, -1.0, 1.0])
@@ -91,13 +93,16 @@ def turned_images(
         tried = _with_turned(views, common.state, some, free, middle)
         return _least_with_board(points, _turned(views, some, middle), some, tried, bool(free[1]))
 
+    clear = bool(members) and given - float(best.cost.sum()) > _SHARE * (given - own)
+    if estimated is None and clear:
+        return _names(views, member)
+    if views.n_views < _FEWEST_WITH_BOARD:
+        return ()
     if estimated is not None:
         before = float(estimated.q.cost.sum()) * views.pixel_scale**2
         at = replace(common, state=estimated.state, cost=estimated.q.cost)
         best, member = best_turned(estimated.views, at, estimated.q, free, middle)
         members += [member] if _is_gain(at, best, spare) else []
-    elif given - float(best.cost.sum()) > _SHARE * (given - own) and members:
-        return _names(views, member)
     elif members:
         before = with_board(np.zeros_like(member))
     for some in members:
