@@ -30,8 +30,9 @@ class Target:
     """Points of a target, given and estimated.
 
     Images determine the shape only up to a similarity transformation. Therefore the estimated points are
-    rotated, moved and scaled as a whole to be nearest to the given ones. Stated standard deviations weight
-    the distances from the given points, and `sizes` then holds the factor by which they were scaled.
+    rotated and moved as a whole to be nearest to the given ones, and scaled so that each plane by itself is
+    nearest to its given size. Stated standard deviations weight the distances from the given points, and
+    `sizes` then holds the factor by which they were scaled.
     """
 
     given: Array  # (n, 3) [world unit]

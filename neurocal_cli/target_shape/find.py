@@ -19,10 +19,11 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_similarity
+from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.bend_evidence import bends_are_valid, most_probable_precision
+from neurocal_cli.target_shape.gauge import nearest_to_given
 from neurocal_cli.target_shape.information import (
     Information,
     Sight,
@@ -367,13 +368,13 @@ class Search:
         return states
 
     def _nearest(self, world: Array) -> tuple[float, Array, Array]:
-        """Scale, rotation and shift that bring common points (n, 3) nearest to the given one.
+        """Scale, rotation and shift that hold the gauge of the common points (n, 3).
 
         Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
             return 1.0, np.eye(3), np.zeros(3)
-        s, R, t = nearest_similarity(world, self.given)
+        s, R, t = nearest_to_given(world, self.given, self.plane)
         held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
         return held * s, R, held * t
 

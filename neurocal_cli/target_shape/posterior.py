@@ -31,6 +31,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target import Target
+from neurocal_cli.target_shape.gauge import Gauge
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import LEAN, NOTHING, STATED, STRETCH, Prior
 from neurocal_cli.target_shape.system import (
@@ -54,8 +55,8 @@ class Posterior:
     sizes: dict[str, float]  # of the prior's parts, by name [world unit]
     determined: float  # effective number of the offsets' unknowns that the data determine
     evidence: float  # log evidence, with a flat prior on the cameras' normalised parameters
-    # The covariance of cameras, offsets and poses and the gauge (3 n, g); None if the points stay as given.
-    joint: tuple[Callable[[], JointCovariance], Array] | None = None
+    # The covariance of cameras, offsets and poses and the gauge; None if the points stay as given.
+    joint: tuple[Callable[[], JointCovariance], Gauge] | None = None
     # Camera and joint covariance with stretch and lean as far as noise may hide them; None if they are that.
     with_open: Callable[[], tuple[Array, Callable[[], JointCovariance]]] | None = None
 
@@ -291,7 +292,7 @@ class _Climb:
     ) -> None:
         self.system, self.names, self.least_gain = system, prior.names, least_gain
         self.spare, self.log_precision = info.spare, info.log_precision
-        self.gauge = prior.gauge if len(info.pose) else prior.gauge[:, :0]
+        self.gauge = prior.gauge if len(info.pose) else Gauge.none(len(info.point))
         held = [flat and name in _OUT_OF_PLANE for name in self.names]
         self.least = np.full(len(self.names), NOTHING * prior.size)
         self.most = np.where(held, self.least, prior.size)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target, is_flat
+from neurocal_cli.target_shape.gauge import Gauge, gauge_of
 
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
@@ -86,9 +87,7 @@ class Prior:
     axes: Array  # (n, 3, 3) columns: each point's axes, two in its plane and the normal
     basis: Array  # (n, 3, m) offsets along these axes for unit coefficients [world unit]
     groups: dict[str, NDArray[np.intp]]  # indices of the coefficients with the same prior size, by name
-    # (3 n, 7) orthonormal gauge directions, which images do not determine: shifts, rotations and scale of the
-    # target.
-    gauge: Array
+    gauge: Gauge
     size: float  # of the target [world unit]
     # (m + 3 n, G) prior variances of the coefficients and of the single points for parts of size 1
     units: Array
@@ -145,7 +144,7 @@ def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
     units = np.zeros((len(names) + 3 * n, len(groups) + len(of_points)))
     units[: len(names), : len(groups)] = np.transpose(of_coefficients)
     units[len(names) :, len(groups) :] = np.transpose(of_points)
-    return Prior(axes, basis, groups, _gauge(given, axes), size, units)
+    return Prior(axes, basis, groups, gauge_of(given, plane, axes), size, units)
 
 
 def surveyed_prior(given: Array, stated: Array) -> Prior:
@@ -155,7 +154,7 @@ def surveyed_prior(given: Array, stated: Array) -> Prior:
     axes = np.broadcast_to(np.eye(3), (n, 3, 3))
     stated = np.maximum(stated, _HELD * size)
     units = stated.reshape(-1, 1) ** 2
-    return Prior(axes, np.zeros((n, 3, 0)), {}, np.zeros((3 * n, 0)), size, units, stated)
+    return Prior(axes, np.zeros((n, 3, 0)), {}, Gauge.none(n), size, units, stated)
 
 
 def prior_of_target(target: Target) -> Prior:
@@ -163,14 +162,6 @@ def prior_of_target(target: Target) -> Prior:
     if target.stated is not None:
         return surveyed_prior(target.given, target.stated)
     return prior_of(target.given, target.plane)
-
-
-def _gauge(given: Array, axes: Array) -> Array:
-    centred = given - given.mean(axis=0)
-    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
-    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
-    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
-    return np.linalg.qr((np.swapaxes(axes, 1, 2) @ world).reshape(3 * len(given), 7))[0]
 
 
 def _axes(given: Array) -> tuple[Array, Array]:

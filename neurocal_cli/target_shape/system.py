@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.coordinates import coordinates_of
+from neurocal_cli.target_shape.gauge import Gauge
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Parts, Prior
 
@@ -64,23 +65,25 @@ class JointCovariance:
     # (p, 6, d) of the rest.
     pose_parts: Callable[[], Iterable[tuple[NDArray[np.intp], Array, Array]]]
 
-    def offset_variance(self, gauge: Array) -> Array:
-        """(n, 3) variance of the offsets, without the gauge: rotations, shifts and scale of all points.
+    def offset_variance(self, gauge: Gauge) -> Array:
+        """(n, 3) variance of the offsets with the gauge held.
 
-        With G the orthonormal gauge directions (3 n, 7), it is the diagonal of (I - G G^T) C (I - G G^T).
+        With the directions G and H^T offsets = 0, it is the diagonal of (1 - G H^T) C (1 - H G^T).
         """
-        root = self.offset_root - (self.offset_root @ gauge) @ gauge.T
-        G = gauge.reshape(*self.own.shape[:2], -1)
-        own = self.own @ G
-        inner = np.einsum("nig,nih->gh", G, own)
+        root = self.offset_root - (self.offset_root @ gauge.held) @ gauge.directions.T
+        G, H = self._of_points(gauge.directions), self._of_points(gauge.held)
+        own = self.own @ H
+        inner = np.einsum("nig,nih->gh", H, own)
         by_own = np.diagonal(self.own, axis1=1, axis2=2) + ((G @ inner - 2 * own) * G).sum(axis=2)
         return np.asarray(np.einsum("ij,ij->j", root, root).reshape(-1, 3) + by_own)
 
-    def poses(self, gauge: Array) -> Array:
+    def _of_points(self, gauge: Array) -> Array:
+        return gauge.reshape(*self.own.shape[:2], -1)
+
+    def poses(self, gauge: Gauge) -> Array:
         """(P, 6, 6) covariance of each pose of a target whose gauge is held."""
-        by_gauge = self.offset_root @ gauge
-        G = gauge.reshape(*self.own.shape[:2], -1)
-        of_gauge = np.linalg.inv(by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", G, self.own @ G))
+        by_gauge, H = self.offset_root @ gauge.held, self._of_points(gauge.held)
+        of_gauge = np.linalg.inv(by_gauge.T @ by_gauge + np.einsum("nig,nih->gh", H, self.own @ H))
         groups = list(self.pose_parts())
         found = np.empty((sum(len(which) for which, *_ in groups), 6, 6))
         for which, own, root in groups:
