@@ -106,6 +106,12 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
         lines.append(
             f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
         )
+        shift, turn = target.displaced()
+        if shift or turn:
+            lines.append(
+                f"target: its planes are up to {shift:.2g} {unit} and {np.degrees(turn):.2g} degrees from "
+                "where they were given"
+            )
     if target.bends is not None:
         lines.append(f"target: bends anew in each view, by {target.bend_of_views():.2g} {unit} rms")
     return lines
@@ -194,9 +200,15 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
         "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
         "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
         "n_points": len(target.found),
+        **_planes_json(target),
         **({} if target.bends is None else {"bend_of_views_rms": target.bend_of_views()}),
         **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
     }
+
+
+def _planes_json(target: Target) -> dict[str, float]:
+    shift, turn = target.displaced()
+    return {"planes_shift": shift, "planes_turn_deg": float(np.degrees(turn))} if target.plane.any() else {}
 
 
 def number_or_none(value: float) -> float | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, distinct_rows
+from neurocal_cli.geometry import Array, distinct_rows, nearest_similarity, rotation_vector
 from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
@@ -146,6 +146,15 @@ class Target:
         one, two = np.linalg.norm(linear, axis=2).T
         cosine = (linear[:, 0] * linear[:, 1]).sum(axis=1) / (one * two)
         return float(np.maximum(one / two, two / one).max() - 1), float(np.abs(np.arcsin(cosine)).max())
+
+    def displaced(self) -> tuple[float, float]:
+        """Largest shift [world unit] and rotation [rad] of a plane of a folded target; 0 for one plane."""
+        if not self.plane.any():
+            return 0.0, 0.0
+        parts = [(self.given[self.plane == k], self.found[self.plane == k]) for k in np.unique(self.plane)]
+        shifts = [np.linalg.norm(found.mean(axis=0) - given.mean(axis=0)) for given, found in parts]
+        turns = [np.linalg.norm(rotation_vector(nearest_similarity(*part)[1])) for part in parts]
+        return float(max(shifts)), float(max(turns))
 
     def _linear(self) -> Iterator[Array]:
         """(2, 2) what becomes of unit vectors along the principal axes of each given plane, as rows."""

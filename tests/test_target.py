@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.real_data import RealFiles
-from support.rigs import corner, random_rig, sides
 from support.slow_cases import slow_but
 from support.targets import photographed_pair
 
@@ -20,7 +19,6 @@ from neurocal_cli.board import Plane
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.geometry import rotation_step
 from neurocal_cli.io.board_yaml import format_board, parse_board
 from neurocal_cli.io.calibration_tree import read_calibration
 from neurocal_cli.io.calibration_yaml import format_calibration
@@ -28,11 +26,9 @@ from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.io.rig_yaml import read_rig
 from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.evaluation import evaluate_stereo
 from neurocal_cli.target import board_of, planes_of
-from neurocal_cli.target_shape.gauge import gauge_of, nearest_to_given
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
 
@@ -222,46 +218,6 @@ def test_real_pairs_of_one_board(kind: str, tmp_path: Path, real_files: RealFile
         rms[target], baseline[target] = rig.rmse_px, rig.baseline
     assert rms["auto"] < 0.75 * rms["given"]
     assert baseline["auto"] == pytest.approx(83.29, abs=0.1)
-
-
-def corner_set_up_by_hand(seed: int) -> tuple[Correspondences, Correspondences, float]:
-    """Four pairs of three boards, each 0.5 mm and 5 mrad from its place, and the baseline."""
-    rng, given, plane = np.random.default_rng(seed), corner(), np.repeat([0, 1, 2], 36)
-    true = given.copy()
-    for k in range(3):
-        middle = given[plane == k].mean(axis=0)
-        turned = (given[plane == k] - middle) @ rotation_step(rng.normal(0, 5e-3, 3)).T
-        true[plane == k] = middle + turned + rng.normal(0, 0.5, 3)
-    ids = tuple(f"{k}/{i % 6}:{i // 6 % 6}" for i, k in enumerate(plane))
-    scene = replace(random_rig(rng, "verging", 4, target=true), ids=ids)
-    left, right = (replace(side, world=np.tile(given, (4, 1))) for side in sides(scene, 0.05, seed))
-    return left, right, float(np.linalg.norm(scene.rig.t))
-
-
-@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 40), marks=pytest.mark.slow)])
-def test_squares_and_not_planes_set_up_by_hand_tell_the_size_of_a_folded_target(seeds: range) -> None:
-    """If the size of the whole were kept, the baseline would be off by 0.2 %, ten standard deviations."""
-    off = []
-    for seed in seeds:
-        left, right, baseline = corner_set_up_by_hand(seed)
-        rig = calibrate_stereo(left, right, skew=False, distortion="none")
-        assert abs(rig.baseline / baseline - 1) < 0.001
-        off.append((rig.baseline - baseline) / rig.std["baseline"])
-    assert np.abs(off).max() < 4
-    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.3
-
-
-@pytest.mark.parametrize("planes", [1, 3])
-def test_the_gauge_is_held_where_the_points_are_aligned(planes: int) -> None:
-    given, rng = corner(), np.random.default_rng(0)
-    plane = np.repeat([0, 1, 2], 36) % planes
-    axes = np.stack([rotation_step(v) for v in rng.normal(0, 1, (len(given), 3))])
-    gauge = gauge_of(given, plane, axes)
-    assert gauge.held.T @ gauge.directions == pytest.approx(np.eye(7), abs=1e-12)
-    found = 1.01 * (given + rng.normal(0, 1e-4, given.shape)) @ rotation_step(rng.normal(0, 0.1, 3)).T + 5.0
-    s, R, t = nearest_to_given(found, given, plane)
-    offsets = (np.swapaxes(axes, 1, 2) @ (s * found @ R.T + t - given)[..., None]).ravel()
-    assert np.abs(gauge.held.T @ offsets).max() < 1e-6
 
 
 @pytest.mark.slow

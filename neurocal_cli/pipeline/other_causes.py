@@ -19,7 +19,7 @@ from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.pipeline.point_errors import places_of_views
 from neurocal_cli.target_shape.find import Found, evidence_as_given
-from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple
+from neurocal_cli.target_shape.lens_and_target import named_lens_is_too_simple, richer_lens_is_better
 from neurocal_cli.verdict.given_parameters import (
     AS_WELL,
     TOLD_APART,
@@ -35,6 +35,7 @@ from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 _OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
 # The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
 _SURELY = 0.5
+_TELL_BENDS = 3  # views that tell bent planes from distortion (tests/test_cli_stereo.py)
 _ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
 
@@ -45,6 +46,9 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
         return True
     named = solution.model_errors is None and solution.straight_lines is None
     if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
+        return True
+    # One or two views of planes that bend and were set up by hand show distortion as another target.
+    if named and problem.views.n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
     if not problem.free_poses:
         return False

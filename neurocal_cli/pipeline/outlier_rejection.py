@@ -34,6 +34,7 @@ from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.pipeline.other_causes import contradicts_sigma
 from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.points import Correspondences
+from neurocal_cli.target import distinct_points, planes_of
 from neurocal_cli.verdict.findings import pixel_spread
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
@@ -113,7 +114,7 @@ class _Search:
         A wide lens displaces points by more than outliers do. So once the lens is known, the consensus is
         repeated on rays.
         """
-        views = arrange(self.points)
+        views = arrange(self._by_plane())
         rng = np.random.default_rng(self.options.seed)
         consensus = find_consensus(views, rng)
         may_be_wide = self.options.distortion == "auto" or self.problem.distortion.wide
@@ -149,12 +150,22 @@ class _Search:
         rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
         return rays if views.order is None else rays[views.order]
 
+    def _by_plane(self) -> Correspondences:
+        """The points, with a view for each plane of a folded target, which may be set up wrongly."""
+        given, label, ids = distinct_points([self.points])
+        planes = planes_of(given, ids)[label]
+        if not planes.any():
+            return self.points
+        return replace(self.points, view=self.points.view_index * (planes.max() + 1) + planes)
+
     def _keep(self, views: Views, consensus: Consensus) -> None:
         """Reset the kept points and the wrong views to a consensus."""
-        self.kept[slice(None) if views.order is None else views.order] = consensus.kept
+        agreed = consensus.kept & ~consensus.hopeless[views.index]
+        self.kept[slice(None) if views.order is None else views.order] = agreed
         self.wrong_views = {}
-        for view in np.flatnonzero(consensus.hopeless):
-            self._drop(views.names[view], "its pixels do not match its points")
+        left = np.bincount(self.points.view_index, self.kept, self.points.n_views)
+        for view in np.flatnonzero(left == 0):
+            self._drop(self.points.view_names[view], "its pixels do not match its points")
 
     def _drop(self, name: str, reason: str) -> None:
         self.wrong_views[name] = reason

@@ -25,7 +25,7 @@ from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.pipeline.point_errors import rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
-from neurocal_cli.target import Target, distinct_points
+from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.view_bends import find_bends
 from neurocal_cli.verdict.view_groups import OWN_STEPS, variance_of_views
@@ -55,17 +55,27 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
-    target, views = known[0].target, known[1].views
-    unexplained = target is None or target.bends is not None
-    if not (unexplained and views and all(map(may_be_bent, views.values()))):
+    if not _may_contradict_only_given(problem, *known):
         return known
-    # Try again with the rejected views, which may contradict only the given target.
     try:
         found = _searched(problem, solution.of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
         return known
-    explained = found[0].target is not None and not found[1].views
+    explained = found[0].target is not None and not found[1].views and len(found[1]) <= len(known[1])
     return found if explained and rms(found[0]) <= NO_WORSE * rms(known[0]) else known
+
+
+def _may_contradict_only_given(problem: Problem, solution: Solution, rejected: Rejected) -> bool:
+    """Whether the rejected views or points may contradict only the given target, so all are tried again."""
+    target, views = solution.target, rejected.views
+    if views:
+        unexplained = target is None or target.bends is not None
+        return unexplained and all(map(may_be_bent, views.values()))
+    if not len(rejected) or problem.views.n_views > 1:
+        return False
+    # A plane that stands elsewhere in the only view; in other views its points would have come back.
+    given, _, ids = distinct_points([problem.points])
+    return bool(planes_of(given, ids).any())
 
 
 def _searched(

@@ -8,7 +8,15 @@ from typing import Any
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.report import align, calibration_json, number_or_none, plural, printable, rounded
+from neurocal_cli.report import (
+    align,
+    calibration_json,
+    number_or_none,
+    plural,
+    printable,
+    rounded,
+    target_lines,
+)
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
@@ -221,6 +229,7 @@ def _fit_lines(rig: Rig) -> list[str]:
         f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
         f"{plural(rig.iterations, 'iteration')}"
     )
+    lines += target_lines(rig.left.target or rig.right.target, rig.unit)
     measures = {} if rig.verdict is None else rig.verdict.measures
     growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
     if growth > _MUCH_WORSE:

@@ -33,13 +33,14 @@ from neurocal_cli.target_shape.information import (
     steps_of_poses,
 )
 from neurocal_cli.target_shape.posterior import (
+    OUT_OF_PLANE,
     Posterior,
     evidence_of_given,
     given_posterior,
     posterior,
     posterior_of,
 )
-from neurocal_cli.target_shape.prior import prior_of
+from neurocal_cli.target_shape.prior import SINGLE, prior_of
 from neurocal_cli.target_shape.system import WithoutPoses
 from neurocal_cli.target_shape.target_validation import folds_of, passes_cross_validation
 
@@ -52,12 +53,14 @@ _EXACT = 1e-6  # px: smaller residuals are rounding
 _EARLY = 0.5  # share of the required gain that the first step must predict
 _NOT_YET = 5.0  # log evidence that another step may add; without it, 56 sets of all shapes end the same
 _SETTLED = 0.02  # of the cameras' standard deviations
-_LARGEST = 0.02  # largest offset over the target's size; more is another target
+# Largest offset over the target's size, of one plane and of planes that are set up by hand; more is another
+# target.
+_LARGEST, _LARGEST_OF_FOLDED = 0.02, 0.05
 # Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
 # estimated target below the first limit may move slightly beyond it when the lens is selected again.
 _STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
 _LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0.02 on one in photographs
-_FEWEST, _FEWEST_OF_FOLDED = 3, 2  # fewest different views of most points
+_FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
 LEAST_GAIN = 6.0
 """Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
 most; tests/test_simulated_targets.py (slow) checks that clean sets keep the given target."""
@@ -81,10 +84,15 @@ class Found:
 def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
     """Whether enough different views show most points to estimate the target.
 
-    Two views determine the angles between the planes of a folded target; the bend of one plane needs three.
+    One view determines how three planes of a folded target stand; the bend of one plane needs three.
     """
     least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
-    return n_different >= least and bool(median(np.bincount(label).astype(float)) >= least)
+    return n_different >= least and _median_views(label) >= least
+
+
+def _median_views(label: NDArray[np.intp]) -> float:
+    """Number of views of most points."""
+    return float(median(np.bincount(label[label >= 0]).astype(float)))
 
 
 def find_target(
@@ -201,6 +209,9 @@ class Search:
             self.sizes = dict(known.sizes)
         self.label = np.split(label, np.cumsum([len(world) for world in worlds])[:-1])
         self.prior = prior_of(self.given, self.plane)
+        self.largest = (_LARGEST_OF_FOLDED if self.plane.any() else _LARGEST) * self.prior.size
+        # Errors of points that are seen once look like noise.
+        self.absent = (OUT_OF_PLANE if flat else ()) + (SINGLE if _median_views(label) < 2 else ())
         found = np.zeros_like(self.given) if known is None else known.offsets
         self.offsets = self.prior.along_axes(found)
         bends = None if known is None else known.bends
@@ -243,7 +254,7 @@ class Search:
                         WithoutPoses(part, np.flatnonzero(folded.fold == k))
                         for k, part in enumerate(folded.parts(info, self._in_offsets))
                     ]
-                found = posterior(info, self.prior, self.sizes, self.flat, noise, step == 0, parts)
+                found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0, parts)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             if known and found.evidence < least - _NOT_YET:
@@ -329,13 +340,13 @@ class Search:
 
     def _moved(self, found: Posterior, info: Information) -> list[CameraState] | None:
         """Move the target, and return the cameras' predicted states in pixels; None if it moves too far."""
-        if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
+        if not np.abs(found.offsets).max() < self.largest:
             return None
         own = steps_of_poses(info, found.camera_step, found.offsets)
         if self.surface is not None:
             self.bends = own[:, 6:]
             bent = self.surface.offsets(self._common()) @ self.bends.T
-            if not np.abs(bent).max() < _LARGEST * self.prior.size:
+            if not np.abs(bent).max() < self.largest:
                 return None
         self.offsets, self.sizes = found.offsets, found.sizes
         return self._predicted(found.camera_step, own[:, :6])

@@ -58,6 +58,11 @@ def _with_other_lens(found: Found, step: int, flat: bool, least: float) -> Found
     return find_target(fits, flat, found.target, least=least)
 
 
+def richer_lens_is_better(found: Found) -> bool:
+    """Whether one more distortion coefficient, with another target, explains the data decidedly better."""
+    return _with_other_lens(found, 1, found.target.flat, found.evidence + _RICHER) is not None
+
+
 def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
     """Whether more distortion coefficients and the given target fit better than the found target.
 

@@ -22,7 +22,7 @@ The evidence, with the noise variance marginalised as well, decides whether ther
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -94,7 +94,8 @@ class Posterior:
         return joint().poses(gauge)
 
 
-_OUT_OF_PLANE = ("curl", "twist", "bend", "height")
+OUT_OF_PLANE = ("curl", "twist", "bend", "height")
+"""Parts that move points out of their plane."""
 _SWITCHED = ("stretch", "lean")
 _START = {
     "fold": 3e-3,
@@ -175,7 +176,7 @@ def posterior(
     info: Information,
     prior: Prior,
     sizes: Mapping[str, float] | None = None,
-    flat: bool = False,
+    absent: Collection[str] = (),
     variance: float | None = None,
     with_stretch: bool = True,
     parts: Sequence[WithoutPoses] = (),
@@ -184,12 +185,12 @@ def posterior(
 
     The quadratic is in the whole offsets from the given target, along each point's axes. With initial sizes
     [world unit], an initial noise variance [px^2] is needed as well, because then the errors on the given
-    target are no noise. Flat means that the points stay in their plane, and `with_stretch` that stretch and
+    target are no noise. Parts that are named as absent stay absent, and `with_stretch` means that stretch and
     lean may be switched on or off. The `parts` are those of different views, if they are known already.
     Raises `numpy.linalg.LinAlgError` if the points do not determine the cameras.
     """
     system = system_of(info, prior, parts)
-    climb = _Climb(info, prior, system, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
+    climb = _Climb(info, prior, system, absent, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = math.sqrt(info.cost / info.spare if variance is None else variance)
     if sizes is not None:
         start = prior.as_array(sizes) / noise
@@ -287,13 +288,13 @@ class _Climb:
         info: Information,
         prior: Prior,
         system: PosesFirst | PointsFirst,
-        flat: bool = False,
+        absent: Collection[str] = (),
         least_gain: float = _NO_GAIN,
     ) -> None:
         self.system, self.names, self.least_gain = system, prior.names, least_gain
         self.spare, self.log_precision = info.spare, info.log_precision
         self.gauge = prior.gauge if len(info.pose) else Gauge.none(len(info.point))
-        held = [flat and name in _OUT_OF_PLANE for name in self.names]
+        held = [name in absent for name in self.names]
         self.least = np.full(len(self.names), NOTHING * prior.size)
         self.most = np.where(held, self.least, prior.size)
         self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
