@@ -13,6 +13,7 @@ from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, distinct_rows, nearest_similarity, rotation_vector
+from neurocal_cli.planes import planes_of
 from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 TARGETS = ("auto", "given", "flat", "free")
 
 _DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
-_THIN = 1e-6  # thickness of a plane up to rounding, relative to its size
 
 
 @frozen_dataclass(eq=False)
@@ -116,14 +116,16 @@ class Target:
         def both_of(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if a is None or b is None else np.concatenate([a, b[new]])
 
+        given, point = np.concatenate([self.given, other.given[new]]), both_of(self.point, other.point)
+        stated = both_of(self.stated, other.stated)
         return replace(
             self,
-            given=np.concatenate([self.given, other.given[new]]),
+            given=given,
             found=np.concatenate([found, other.found[new]]),
             std=np.concatenate([std, other.std[new]]),
-            plane=np.concatenate([self.plane, other.plane[new]]),
-            point=both_of(self.point, other.point),
-            stated=both_of(self.stated, other.stated),
+            plane=planes_of(given, point) if stated is None else np.zeros(len(given), dtype=np.intp),
+            point=point,
+            stated=stated,
         )
 
     def bend(self) -> float:
@@ -267,23 +269,6 @@ def distinct_points(
     if all(points.point is not None for points in some):
         ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
     return world[first], label, ids
-
-
-def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
-    """Plane index (N,) of each given point (N, 3), by the name before the slash in its id; else one plane."""
-    one = np.zeros(len(given), dtype=np.intp)
-    if point is None or not np.char.count(point, "/").astype(bool).all():
-        return one
-    names = np.array([str(label).split("/")[0] for label in point])
-    planes = np.unique(names, return_inverse=True)[1].ravel()
-    some = [given[planes == k] for k in range(int(planes.max()) + 1)]
-    return planes if all(len(part) > 3 and is_flat(part) for part in some) else one
-
-
-def is_flat(given: Array) -> bool:
-    """Whether points (N, 3) lie in one plane, up to rounding."""
-    extent = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
-    return bool(extent[-1] < _THIN * extent[0])
 
 
 def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Correspondences:

@@ -13,6 +13,7 @@ from support.rigs import corner
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.planes import is_flat, planes_of
 from neurocal_cli.report import target_json, target_lines
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.target_shape.gauge import gauge_of, nearest_to_given
@@ -83,6 +84,65 @@ def test_std_of_one_view_hold(type: int, size: float, planes: int) -> None:
         words.append(found.target is not None)
     assert np.mean(words) > 0.7
     assert 0.3 < rms(values) < 1.4
+
+
+@pytest.mark.parametrize("planes", [2, 3])
+def test_points_without_names_are_on_the_same_planes(planes: int) -> None:
+    named, anonymous = (folded(np.random.default_rng(0), 0.5, planes=planes, ids=i) for i in (True, False))
+    points = anonymous.seen(0, 0.1, np.random.default_rng(1))
+    shuffled = np.random.default_rng(2).permutation(len(points))
+    wanted = calibrate(named.seen(0, 0.1, np.random.default_rng(1)), distortion="none", skew=False)
+    for order in (np.arange(len(points)), shuffled):
+        found = calibrate(points.select(order), distortion="none", skew=False)
+        assert found.target is not None
+        assert found.target.plane.max() + 1 == planes
+        assert found.intrinsics.alpha_u == pytest.approx(wanted.intrinsics.alpha_u, rel=1e-4)
+
+
+def grid(*axes: Iterable[float]) -> Array:
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3).astype(float)
+
+
+@pytest.mark.parametrize(
+    ("points", "planes"),
+    [
+        (corner(), 3),
+        (corner()[:72], 2),
+        (corner() @ rotation_step(np.array([0.3, -0.4, 0.5])).T + [10.0, -20.0, 3000.0], 3),
+        (corner(size=40), 3),
+        (corner()[:36], 1),
+        (grid(range(9), range(7), range(2)), 1),
+        (grid(range(5), range(5), range(5)), 1),
+        (grid(range(3), range(3), range(3)), 1),
+        (np.random.default_rng(0).uniform(-1, 1, (440, 3)), 1),
+        (np.concatenate([corner(), [[3.0, 4.0, 5.0]]]), 1),
+        (np.column_stack([np.arange(30.0)] * 3), 1),
+        (np.zeros((1, 3)), 1),
+    ],
+)
+def test_planes_are_told_from_clouds_blocks_and_layers(points: Array, planes: int) -> None:
+    found = planes_of(points, None)
+    assert found.max() + 1 == planes
+    assert all(is_flat(points[found == k]) for k in range(planes) if planes > 1)
+
+
+def test_two_cameras_that_see_other_planes_share_one_numbering() -> None:
+    rng = np.random.default_rng(0)
+    target = folded(rng, 0.5)
+    points = target.seen(0, 0.1, rng)
+    whole = calibrate(points, distortion="none", skew=False).target
+    assert whole is not None
+    parts = []
+    for hidden in (0, 2):
+        rows = np.flatnonzero(whole.plane != hidden)
+        names = None if whole.point is None else whole.point[rows]
+        plane = np.unique(whole.plane[rows], return_inverse=True)[1]
+        some = {name: getattr(whole, name)[rows] for name in ("given", "found", "std")}
+        parts.append(replace(whole, **some, plane=plane, point=names))
+    joined = parts[0].joined(parts[1])
+    assert len(joined.given) == 108
+    assert np.bincount(joined.plane).tolist() == [36, 36, 36]
+    assert all(is_flat(joined.given[joined.plane == k]) for k in range(3))
 
 
 @slow

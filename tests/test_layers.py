@@ -44,7 +44,7 @@ HOMES = {
 LEVELS = (
     {"errors", "frozen_dataclass", "geometry"},
     {"distances", "given_values", "processes"},
-    {"bends", "board", "camera", "least_squares", "median", "network", "points"},
+    {"bends", "board", "camera", "least_squares", "median", "network", "planes", "points"},
     {"target"},
     {"calibration", "printing", "training"},
     {"bundle_adjustment"},

@@ -26,9 +26,10 @@ from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.result_files import write_calibration
 from neurocal_cli.io.rig_yaml import read_rig
 from neurocal_cli.pipeline.common_target import on_one_target
+from neurocal_cli.planes import planes_of
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.evaluation import evaluate_stereo
-from neurocal_cli.target import board_of, planes_of
+from neurocal_cli.target import board_of
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
 

@@ -20,8 +20,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import nearest_similarity, rotation_step
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.pipeline.fit import fit
+from neurocal_cli.planes import planes_of
 from neurocal_cli.points import Correspondences
-from neurocal_cli.target import distinct_points, planes_of
+from neurocal_cli.target import distinct_points
 from neurocal_cli.target_shape import find as find_module
 from neurocal_cli.target_shape import posterior as posterior_module
 from neurocal_cli.target_shape.coordinates import coordinates_of

@@ -13,8 +13,9 @@ from neurocal_cli.bundle_adjustment.stored_state import stored_state
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.planes import planes_of
 from neurocal_cli.points import Correspondences
-from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target import Target, distinct_points
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed

@@ -33,8 +33,9 @@ from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.pipeline.other_causes import contradicts_sigma
 from neurocal_cli.pipeline.point_errors import largest_expected, point_errors, rms
+from neurocal_cli.planes import planes_of
 from neurocal_cli.points import Correspondences
-from neurocal_cli.target import distinct_points, planes_of
+from neurocal_cli.target import distinct_points
 from neurocal_cli.verdict.findings import pixel_spread
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets

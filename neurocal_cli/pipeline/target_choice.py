@@ -25,7 +25,8 @@ from neurocal_cli.pipeline.other_causes import groups_of_views, has_other_cause
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.pipeline.point_errors import rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
-from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.planes import planes_of
+from neurocal_cli.target import Target, distinct_points
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.view_bends import find_bends
 from neurocal_cli.verdict.view_groups import OWN_STEPS, variance_of_views

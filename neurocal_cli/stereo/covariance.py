@@ -27,10 +27,11 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.planes import is_flat
 from neurocal_cli.stereo.adjust import Observations, RigFit, RigProblem
 from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.relative_poses import RelativePoses
-from neurocal_cli.target import Target, is_flat
+from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Information, point_terms
 from neurocal_cli.target_shape.open_stretch import spread_of_stretch, stretched_blocks, stretches
 from neurocal_cli.target_shape.posterior import known_sizes

@@ -21,7 +21,8 @@ from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
-from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
+from neurocal_cli.planes import planes_of
+from neurocal_cli.target import Target, distinct_points, scale_of_points
 from neurocal_cli.target_shape.bend_evidence import bends_are_valid, most_probable_precision
 from neurocal_cli.target_shape.gauge import nearest_to_given
 from neurocal_cli.target_shape.information import (

@@ -23,7 +23,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
-from neurocal_cli.target import is_flat
+from neurocal_cli.planes import is_flat
 from neurocal_cli.target_shape.prior import LEAN, STRETCH
 
 # Prior odds of a stretch, and of a small and a large lean, by its size over STRETCH. Larger odds make clean

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.target import Target, is_flat
+from neurocal_cli.planes import is_flat
+from neurocal_cli.target import Target
 from neurocal_cli.target_shape.gauge import Gauge, gauge_of
 
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py

@@ -10,7 +10,8 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.target import Target, distinct_points, is_flat, planes_of
+from neurocal_cli.planes import is_flat, planes_of
+from neurocal_cli.target import Target, distinct_points
 from neurocal_cli.target_shape.bend_evidence import most_probable_precision
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search
 from neurocal_cli.target_shape.information import of_views, without_points

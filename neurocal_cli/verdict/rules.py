@@ -9,7 +9,8 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration, StopReason, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.target import Target, is_flat
+from neurocal_cli.planes import is_flat
+from neurocal_cli.target import Target
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import (
