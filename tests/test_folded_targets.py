@@ -168,6 +168,19 @@ def test_two_planes_that_are_far_off_are_not_called_outliers(seeds: range) -> No
         assert len(found.rejected) < 8
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_are_found_on_planes_of_few_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    target = folded(rng, 0.0)
+    points = target.seen(0, 0.1, rng)
+    few = points.select(np.flatnonzero(np.arange(36 * 3) % 36 % 6 == 0))  # six points of each plane
+    pixels = few.pixels.copy()
+    pixels[[2, 9]] += [[40.0, -30.0], [-25.0, 35.0]]
+    found = calibrate(replace(few, pixels=pixels), distortion="none", skew=False)
+    assert found.rejected.points is not None
+    assert {2, 9} <= set(np.flatnonzero(np.isin(few.point, found.rejected.points.point)))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_planes_that_stand_as_given_stay_so(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -31,7 +31,8 @@ from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 #
 # For flat (True) and solid targets: points on which a start is trained, and fewest points of a searched view.
 _SEEN = {True: 5, False: 7}
-_FEWEST = {True: 8, False: 11}
+FEWEST_OF_PLANE = 8
+_FEWEST = {True: FEWEST_OF_PLANE, False: 11}
 _STARTS, _ROUNDS = 24, 5
 _FINALISTS = 4  # starts of each round that are trained further
 _PASSES = 6

@@ -26,7 +26,12 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.consensus import Consensus, find_consensus, find_consensus_through_wide_lens
+from neurocal_cli.initialisation.consensus import (
+    FEWEST_OF_PLANE,
+    Consensus,
+    find_consensus,
+    find_consensus_through_wide_lens,
+)
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.initialisation.radial_networks import middle_of_image
 from neurocal_cli.pipeline.fit import fit, fit_again
@@ -152,12 +157,18 @@ class _Search:
         return rays if views.order is None else rays[views.order]
 
     def _by_plane(self) -> Correspondences:
-        """The points, with a view for each plane of a folded target, which may be set up wrongly."""
+        """The points, with a view for each plane of a folded target, which may be set up wrongly.
+
+        Views in which a plane has too few points for a search stay whole.
+        """
         given, label, ids = distinct_points([self.points])
-        planes = planes_of(given, ids)[label]
+        planes, views = planes_of(given, ids)[label], self.points.view_index
         if not planes.any():
             return self.points
-        return replace(self.points, view=self.points.view_index * (planes.max() + 1) + planes)
+        first = views * (planes.max() + 1)
+        few = np.bincount(first + planes)[first + planes] < FEWEST_OF_PLANE
+        whole = np.isin(views, views[few])
+        return replace(self.points, view=np.where(whole, first, first + planes))
 
     def _keep(self, views: Views, consensus: Consensus) -> None:
         """Reset the kept points and the wrong views to a consensus."""
