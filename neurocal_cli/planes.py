@@ -21,12 +21,17 @@ def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
     All points are on one plane, number 0, if they are not on a few planes.
     """
     one = np.zeros(len(given), dtype=np.intp)
-    if point is None or not np.char.count(point, "/").astype(bool).all():
+    if point is None or not planes_are_named(point):
         return one if len(given) < 2 * _FEWEST or is_flat(given) else _by_place(given)
     names = np.array([str(label).split("/")[0] for label in point])
     planes = np.unique(names, return_inverse=True)[1].ravel()
     some = [given[planes == k] for k in range(int(planes.max()) + 1)]
     return planes if all(len(part) > 3 and is_flat(part) for part in some) else one
+
+
+def planes_are_named(point: NDArray[np.str_] | None) -> bool:
+    """Whether the ids (N,) of all points begin with the name of a plane and a slash."""
+    return point is not None and bool(np.char.count(point, "/").astype(bool).all())
 
 
 def is_flat(given: Array) -> bool:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.planes import planes_are_named
 from neurocal_cli.plots.figure import picture, style
 from neurocal_cli.target import Target
 
@@ -35,7 +36,12 @@ def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axe
     rows = target.plane == plane
     given, offsets = target.given[rows], target.offsets[rows]
     centred = given - given.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+    # The world's axis along which the plane is longest is drawn across.
+    across = np.eye(3)[np.ptp(given, axis=0).argmax()]
+    across -= (across @ normal) * normal
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(normal, across), normal])
     axes *= np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
     x, y, _ = axes @ centred.T
     dx, dy, dz = axes @ offsets.T
@@ -43,13 +49,17 @@ def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axe
     drawn = height.tricontourf(x, y, dz, levels=np.linspace(-most, most, _LEVELS), cmap="RdBu_r")
     height.figure.colorbar(drawn, ax=height, label=f"height [{unit}]")
     height.plot(x, y, ".", color="0.3", markersize=2)
-    style(height, f"out of the plane: {np.ptp(dz):.2g} {unit} from end to end")
+    name = ""
+    if target.point is not None and planes_are_named(target.point):
+        name = f"{str(target.point[rows][0]).split('/')[0]}, "
+    style(height, f"{name}out of the plane: {np.ptp(dz):.2g} {unit} from end to end")
     longest = float(np.hypot(dx, dy).max()) or 1.0
     length = _LONGEST * float(np.ptp(x))
     arrows.quiver(
         x, y, dx, dy, color="#1f4e79", angles="xy", scale_units="xy", scale=longest / length, width=3e-3
     )
-    style(arrows, f"in the plane: the longest arrow is {longest:.2g} {unit}")
+    arrows.update_datalim(np.column_stack([x, y]) + np.column_stack([dx, dy]) * length / longest)
+    style(arrows, f"{name}in the plane: the longest arrow is {longest:.2g} {unit}")
     for panel in (height, arrows):
         panel.set_aspect("equal")
         panel.margins(_LONGEST)
