@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.folded import Folded, folded
+from support.folded import Folded, folded, random_corner
 from support.rigs import corner
 
 from neurocal_cli import Calibration, calibrate
@@ -157,6 +157,22 @@ def test_one_photograph_of_a_bent_corner_through_a_lens_gives_the_camera() -> No
         assert found.verdict is not None
         assert not (found.verdict.word == "good" and np.abs(off(found, target)).max() > 5)
     assert 0.4 < rms(values) < 1.25
+
+
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 80), marks=slow)])
+def test_one_photograph_of_any_corner(seeds: range) -> None:
+    """Two or three boards at 70 to 120 degrees, with all defaults but the right angle of the image's axes.
+
+    The standard deviations include p1 and p2 of ordinary lenses, which these lack.
+    """
+    values: list[float] = []
+    for seed in seeds:
+        scene = random_corner(seed)
+        found = calibrate(scene.points, skew=False)
+        assert found.verdict is not None
+        assert not (found.verdict.word == "good" and np.abs(scene.off(found)).max() > 5)
+        values += scene.off(found).tolist()
+    assert rms(values) < 1.2
 
 
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 40), marks=slow)])
