@@ -99,6 +99,18 @@ def test_held_out_points_are_given_as_two_files(cameras: tuple[Path, Path], tmp_
     assert "note: left05, left06: the calibrations have no such images" in result.stderr
 
 
+def test_an_id_at_two_places_is_noted(cameras: tuple[Path, Path], tmp_path: Path) -> None:
+    files = tmp_path / "l.csv", tmp_path / "r.csv"
+    for side, file in enumerate(files):
+        seen = replace(scene(), ids=tuple(f"{k % 9}:{k // 9}" for k in range(54))).points(side)
+        world = seen.world.copy()
+        world[0, 0] += 1.0 - side
+        write_points(replace(seen, world=world), file)
+    result = evaluate(*cameras, "--points", *files)
+    assert f"{files[0]}:" in result.stderr
+    assert "if all views show one target, correct X,Y,Z" in result.stderr
+
+
 def test_a_folded_target_is_judged_in_one_view(tmp_path: Path) -> None:
     made = random_rig(np.random.default_rng(3), "verging", 1, target=corner())
     for name, camera in zip(("l.yaml", "r.yaml"), calibrated(made), strict=True):

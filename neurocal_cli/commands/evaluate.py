@@ -194,7 +194,7 @@ def stereo(
     preparation.check_one_stdin(*cameras, *(points or ()))
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
-    given = None if points is None else _read_pair(points)
+    given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
@@ -215,16 +215,6 @@ def stereo(
     else:
         verdict = evaluation.verdict
         show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
-
-
-def _read_pair(files: tuple[str, str]) -> tuple[Correspondences, Correspondences]:
-    """Points of the left and of the right camera."""
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    pair = read_points(files[0], notes=notes), read_points(files[1], notes=notes)
-    note(*notes)
-    return pair
 
 
 def _evaluate_stereo(
