@@ -361,7 +361,11 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     # are less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
-    return GridFit(lines, fit, mapped, shifts, shading, noise, is_reliable(fit, departure))
+    # Both edges of a square are shifted, so shifts of half its width would leave no squares of one colour.
+    # Where squares are blurred together, fits that failed may agree on such a shift.
+    possible = np.abs(shifts.terms(lines) @ mapped.shift) < 0.5 * lines.width
+    good = is_reliable(fit, np.where(possible, departure, np.inf))
+    return GridFit(lines, fit, mapped, shifts, shading, noise, good)
 
 
 def _fine_fit(
@@ -423,7 +427,8 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # Compare with the other edges, because the edges of a rim that is bad all around agree with each other.
-    good = is_reliable(fit, departure, known=fitted.fit.chi2_per_pixel[fitted.good])
+    # If none of these is reliable, there is nothing to compare with.
+    good = is_reliable(fit, departure, known=fitted.fit.chi2_per_pixel[fitted.good]) & fitted.good.any()
     return edges, replace(fitted, lines=lines, fit=fit, good=good)
 
 
@@ -457,7 +462,8 @@ def fit_grid_vertices(
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
-    return fit, lines, is_reliable(fit, departure)
+    # Map, blur and levels come from the edges: if no edge is reliable, no vertex is.
+    return fit, lines, is_reliable(fit, departure) & fitted.good.any()
 
 
 def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Array:
