@@ -42,11 +42,12 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
     A wide lens may have no single centre of projection. `unit` is that of the world, and `estimated` tells
     whether the target was estimated.
     """
-    if evidence.turned:
+    missing, centre = evidence.missing, evidence.centre
+    simple = missing is not None and _explains(missing.explained, evidence)
+    if evidence.turned and not simple:  # distortion that is left looks like turned images
         yield _turned(evidence.turned)
         return
     change, board, groups = _explanation(evidence, estimated), evidence.board, evidence.groups
-    missing, centre = evidence.missing, evidence.centre
     if centre is not None and not any(
         other is not None and other.explained > _NEARLY * centre.explained
         for other in (change, board, groups, missing)
@@ -58,7 +59,7 @@ def common_errors(evidence: Evidence, unit: str, wide: bool, estimated: bool) ->
             "switch image stabilisation off, or expect that predicted pixels are off by as much",
         )
         return
-    if missing is not None and _explains(missing.explained, evidence):
+    if missing is not None and simple:
         # Residual distortion looks like a bent board, and like several cameras.
         least = missing.explained
         board, change, groups = _above(least, board), _above(least, change), _above(least, groups)
