@@ -226,6 +226,7 @@ WRONG = {
     "turned": last_plane(lambda w: 2 * w.mean(axis=0) - w),
     "one square off": last_plane(lambda w: w + np.array([0, 0, 28])),
     "square 30": last_plane(lambda w: w * 30 / 28),
+    "square 29": last_plane(lambda w: (w - w.mean(axis=0)) * 29 / 28 + w.mean(axis=0)),
     "shuffled": last_plane(lambda w: w[np.random.default_rng(0).permutation(36)]),
     "columns for rows": last_plane(lambda w: w[np.arange(36).reshape(6, 6).T.ravel()]),
 }
