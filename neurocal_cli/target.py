@@ -149,9 +149,10 @@ class Target:
         cosine = (linear[:, 0] * linear[:, 1]).sum(axis=1) / (one * two)
         return float(np.maximum(one / two, two / one).max() - 1), float(np.abs(np.arcsin(cosine)).max())
 
-    def grown(self) -> float:
-        """Largest relative difference between the found and the given size of a plane."""
-        return float(np.abs(np.sqrt(np.abs(np.linalg.det(np.array(list(self._linear()))))) - 1.0).max())
+    def unequal(self) -> float:
+        """Largest relative deviation of a plane's found over given size from the mean of the planes."""
+        scales = np.sqrt(np.abs(np.linalg.det(np.array(list(self._linear())))))
+        return float(np.abs(scales / scales.mean() - 1.0).max())
 
     def displaced(self) -> tuple[float, float]:
         """Largest shift [world unit] and rotation [rad] of a plane of a folded target; 0 for one plane."""

@@ -41,6 +41,14 @@ def with_distances(seed: int, points: Correspondences) -> Correspondences:
     return replace(points, point=ids, distances=tuple(rows))
 
 
+def test_a_bent_board_that_was_printed_larger_is_estimated() -> None:
+    left, _ = photographed_pair(0)
+    points = with_distances(0, left)
+    larger = tuple(replace(d, length=1.05 * d.length) for d in points.distances)
+    found = calibrate(replace(points, distances=larger), distortion="none", skew=False)
+    assert found.target is not None
+
+
 def test_each_distance_counts_by_its_standard_deviation() -> None:
     flat = Board((Plane("", 9, 7, 25.0),))
     rows = (Distance("0:0", "8:0", 200.2, 0.1), Distance("0:0", "0:6", 150.6, 0.3))

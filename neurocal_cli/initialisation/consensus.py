@@ -32,6 +32,7 @@ from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 # For flat (True) and solid targets: points on which a start is trained, and fewest points of a searched view.
 _SEEN = {True: 5, False: 7}
 FEWEST_OF_PLANE = 8
+"""Fewest points of a plane in a view that is searched."""
 _FEWEST = {True: FEWEST_OF_PLANE, False: 11}
 _STARTS, _ROUNDS = 24, 5
 _FINALISTS = 4  # starts of each round that are trained further

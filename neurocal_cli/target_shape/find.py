@@ -281,7 +281,7 @@ class Search:
         given = without if self.surface is None else evidence_of_given(info.straight())
         target = self._target(found, found.evidence - given)
         stretch, lean = target.sides()
-        if not (max(stretch, target.grown()) < self.most_stretched and lean < _LEANING):
+        if not (max(stretch, target.unequal()) < self.most_stretched and lean < _LEANING):
             return None
         return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
 
