@@ -12,74 +12,74 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
-    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.calibration.calibrate import calibrate
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.calibration.rig.fit_rig import fit_rig
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.triangulation import triangulate
+    from neurocal_cli.calibration.zoom.camera_at import camera_at
+    from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
+    from neurocal_cli.calibration.zoom.fit_cameras import fit_lens_cameras
+    from neurocal_cli.calibration.zoom.fit_points import fit_lens
+    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
+    from neurocal_cli.camera.remapping import undistort_image
+    from neurocal_cli.camera.undistortion import undistort_points
     from neurocal_cli.detection.detect import detect_points
-    from neurocal_cli.distortion.remapping import undistort_image
-    from neurocal_cli.distortion.undistortion import undistort_points
     from neurocal_cli.errors import NeurocalError
-    from neurocal_cli.evaluation import evaluate_camera
-    from neurocal_cli.io.board_yaml import read_board
-    from neurocal_cli.io.calibration_tree import read_calibration
-    from neurocal_cli.io.images import read_image
-    from neurocal_cli.io.lens_points import read_lens_data, read_lens_points
-    from neurocal_cli.io.lens_yaml import read_lens, write_lens
-    from neurocal_cli.io.points_csv import read_points, write_points
-    from neurocal_cli.io.result_files import write_calibration, write_rig
-    from neurocal_cli.io.rig_yaml import read_rig
-    from neurocal_cli.methods import calibrate
-    from neurocal_cli.points import Correspondences
-    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-    from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
-    from neurocal_cli.stereo.fit_rig import fit_rig
-    from neurocal_cli.stereo.rig import Rig
-    from neurocal_cli.stereo.triangulation import triangulate
-    from neurocal_cli.zoom_lens.camera_at import camera_at
-    from neurocal_cli.zoom_lens.evaluation import evaluate_lens
-    from neurocal_cli.zoom_lens.fit_cameras import fit_lens_cameras
-    from neurocal_cli.zoom_lens.fit_points import fit_lens
-    from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+    from neurocal_cli.files.board_yaml import read_board
+    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.images import read_image
+    from neurocal_cli.files.lens_points import read_lens_data, read_lens_points
+    from neurocal_cli.files.lens_yaml import read_lens, write_lens
+    from neurocal_cli.files.points_csv import read_points, write_points
+    from neurocal_cli.files.result_files import write_calibration, write_rig
+    from neurocal_cli.files.rig_yaml import read_rig
+    from neurocal_cli.observations.board import Board
+    from neurocal_cli.observations.points import Correspondences
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "ZoomLens": "zoom_lens.zoom_lens",
-    "Board": "board",
-    "Calibration": "calibration",
+    "ZoomLens": "calibration.zoom.zoom_lens",
+    "Board": "observations.board",
+    "Calibration": "calibration.calibration",
     "Camera": "camera.camera",
-    "Correspondences": "points",
+    "Correspondences": "observations.points",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
-    "Rig": "stereo.rig",
-    "calibrate": "methods",
-    "calibrate_stereo": "stereo.calibrate_stereo",
-    "camera_at": "zoom_lens.camera_at",
+    "Rig": "calibration.rig.rig",
+    "calibrate": "calibration.calibrate",
+    "calibrate_stereo": "calibration.rig.calibrate_stereo",
+    "camera_at": "calibration.zoom.camera_at",
     "detect_points": "detection.detect",
-    "evaluate_camera": "evaluation",
-    "evaluate_lens": "zoom_lens.evaluation",
-    "evaluate_rig": "stereo.evaluation",
-    "evaluate_stereo": "stereo.evaluation",
-    "fit_lens": "zoom_lens.fit_points",
-    "fit_lens_cameras": "zoom_lens.fit_cameras",
-    "fit_rig": "stereo.fit_rig",
-    "read_board": "io.board_yaml",
-    "read_calibration": "io.calibration_tree",
-    "read_image": "io.images",
-    "read_lens": "io.lens_yaml",
-    "read_lens_data": "io.lens_points",
-    "read_lens_points": "io.lens_points",
-    "read_points": "io.points_csv",
-    "read_rig": "io.rig_yaml",
-    "triangulate": "stereo.triangulation",
-    "undistort_image": "distortion.remapping",
-    "undistort_points": "distortion.undistortion",
-    "write_calibration": "io.result_files",
-    "write_lens": "io.lens_yaml",
-    "write_points": "io.points_csv",
-    "write_rig": "io.result_files",
+    "evaluate_camera": "calibration.evaluation",
+    "evaluate_lens": "calibration.zoom.evaluation",
+    "evaluate_rig": "calibration.rig.evaluation",
+    "evaluate_stereo": "calibration.rig.evaluation",
+    "fit_lens": "calibration.zoom.fit_points",
+    "fit_lens_cameras": "calibration.zoom.fit_cameras",
+    "fit_rig": "calibration.rig.fit_rig",
+    "read_board": "files.board_yaml",
+    "read_calibration": "files.calibration_tree",
+    "read_image": "files.images",
+    "read_lens": "files.lens_yaml",
+    "read_lens_data": "files.lens_points",
+    "read_lens_points": "files.lens_points",
+    "read_points": "files.points_csv",
+    "read_rig": "files.rig_yaml",
+    "triangulate": "calibration.rig.triangulation",
+    "undistort_image": "camera.remapping",
+    "undistort_points": "camera.undistortion",
+    "write_calibration": "files.result_files",
+    "write_lens": "files.lens_yaml",
+    "write_points": "files.points_csv",
+    "write_rig": "files.result_files",
 }
 
 __all__ = [

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from simulated_zoom import SimulatedZoom
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.io.lens_points import write_lens_points
-from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.points import Correspondences
+from neurocal_cli.files.lens_points import write_lens_points
+from neurocal_cli.files.points_csv import write_points
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.points import Correspondences
 
 HERE = Path(__file__).resolve().parent
 SIGMA = 0.1  # px, of the simulated detector

@@ -11,10 +11,10 @@ import numpy as np
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import rotation_step
-from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.points import Correspondences
+from neurocal_cli.files.points_csv import write_points
+from neurocal_cli.observations.points import Correspondences
 
 HERE = Path(__file__).resolve().parent
 SIZE = (1280, 960)

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.board import Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.io.images import encode_png
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.files.images import encode_png
+from neurocal_cli.files.writing import write_whole
+from neurocal_cli.observations.board import Plane
 from neurocal_cli.simulation.rendering import Background, Scene, Sensor, Target, render
 
 HERE = Path(__file__).resolve().parent

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from neurocal_cli.calibration.zoom.settings import LensPoints
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose, entries_of
 from neurocal_cli.camera.projection import image_points
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.settings import LensPoints
+from neurocal_cli.observations.points import Correspondences
 
 
 @dataclass(frozen=True, eq=False)

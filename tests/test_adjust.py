@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from support.distorted import BENT, SIGMA, bent_set
 from support.slow_cases import slow_but
 
-from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.adjustment.problem import intrinsic_matrix, problem_for
+from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.neuro import solve
-from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.neuro import solve
+from neurocal_cli.network.options import options_for
 
 FREE = {
     "type 1": [1, 1, 1, 1, 1],

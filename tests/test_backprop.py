@@ -16,10 +16,12 @@ from support.gradients import gradients
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
+from neurocal_cli.camera.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array, euler_to_rotation, similarity
-from neurocal_cli.network import (
+from neurocal_cli.network import backprop_blocks as blocks
+from neurocal_cli.network.backprop import BackpropOptions, _Run, train_backprop
+from neurocal_cli.network.network import (
     Patterns,
     e_2d,
     e_orth,
@@ -29,9 +31,7 @@ from neurocal_cli.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.training import Task
-from neurocal_cli.training import backprop_blocks as blocks
-from neurocal_cli.training.backprop import BackpropOptions, _Run, train_backprop
+from neurocal_cli.network.trainers import Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
 CENTRED = UPPER & (np.arange(3) < 2)
@@ -171,7 +171,7 @@ def intrinsic_errors(scene: Scene, product: Array) -> Array:
 
 def plain_rule(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The kernel's module loaded once more, without a compiler."""
-    from neurocal_cli.training import backprop_kernel
+    from neurocal_cli.network import backprop_kernel
 
     monkeypatch.setitem(sys.modules, "numba", None)
     spec = util.spec_from_file_location("plain_rule", backprop_kernel.__file__)
@@ -222,7 +222,7 @@ def test_a_block_moves_the_weights_down_the_exact_gradient(points: int, method: 
 def present(method: Method) -> Any:
     if method == "blocks":
         return blocks.present
-    from neurocal_cli.training import backprop_kernel
+    from neurocal_cli.network import backprop_kernel
 
     return backprop_kernel.present
 
@@ -243,7 +243,7 @@ def test_compiled_and_plain_kernels_give_the_same_numbers(
     pull: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("numba")
-    from neurocal_cli.training import backprop_kernel
+    from neurocal_cli.network import backprop_kernel
 
     compiled = kernel_arguments(15, pull, epochs=20)
     compiled["free_W"][1, 0] = compiled["free_V"][2, 1] = False
@@ -516,14 +516,14 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    load = "import sys; from neurocal_cli.training import backprop, backprop_blocks;"
+    load = "import sys; from neurocal_cli.network import backprop, backprop_blocks;"
     assert run(f"{load} print('numba' in sys.modules)") == "False\n"
 
 
 def test_without_numba_training_goes_in_blocks() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
-        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks\n"
+        "from neurocal_cli.network import backprop, backprop_kernel, backprop_blocks as blocks\n"
         "print(backprop_kernel.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
         " backprop._presenter('patterns')[0] is backprop_kernel.present)"
     )
@@ -539,7 +539,7 @@ def test_machine_code_that_cannot_be_kept_is_compiled_each_time(monkeypatch: pyt
     def caching(*, cache: bool) -> Any:
         return lambda function: njit(function, cache=cache)
 
-    from neurocal_cli.training import backprop_kernel
+    from neurocal_cli.network import backprop_kernel
 
     fake = SimpleNamespace(njit=lambda function=None, **k: caching(**k) if k else njit(function))
     monkeypatch.setattr(backprop_kernel, "_NUMBA", fake)

@@ -14,9 +14,9 @@ from support.distorted import through
 from support.scenes import Scene, pinhole, random_flat_set, random_solid, table_1
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_calibration, write_points
-from neurocal_cli.baselines.calibrate_by import calibrate_by
-from neurocal_cli.baselines.linear import smallest
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.problem import problem_for
+from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
+from neurocal_cli.calibration.other_methods.linear import smallest
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import NeurocalError, UsageError
 

@@ -14,21 +14,21 @@ from support.simulated_targets import draw, outcome
 from support.targets import board
 
 from neurocal_cli import calibrate
-from neurocal_cli.bends import Bends, surface_of
-from neurocal_cli.board import Board
-from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.adjustment.board.uncertainty import covariance_basis
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.common_target import _fit as fit_of
+from neurocal_cli.calibration.common_target import on_one_target
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.camera.geometry import rotation_step
+from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.detection.detect import detect_points, gather
 from neurocal_cli.errors import FormatError
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.geometry import rotation_step
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.result_files import write_calibration
-from neurocal_cli.pipeline.common_target import _fit as fit_of
-from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.report import calibration_report
-from neurocal_cli.target_shape.uncertainty import covariance_basis
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.result_files import write_calibration
+from neurocal_cli.observations.bends import Bends, surface_of
+from neurocal_cli.observations.board import Board
 
 FLEXING = draw("flexing", 29)  # eight views
 
@@ -100,7 +100,7 @@ def test_files_keep_the_bends_and_reproduce_the_error(
 ) -> None:
     kept = found()
     if long:  # tables as texts
-        monkeypatch.setattr("neurocal_cli.io.calibration_yaml._MOST_VIEWS", 4)
+        monkeypatch.setattr("neurocal_cli.files.calibration_yaml._MOST_VIEWS", 4)
     write_calibration(kept, tmp_path / "c.yaml")
     again = read_calibration(tmp_path / "c.yaml")
     assert (bends(again).coefficients == bends(kept).coefficients).all()

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import Board, Plane
 
 WALL = Plane("wall", 8, 6, 28.0, (28, 0, 28), (1, 0, 0), (0, 0, 1))
 

@@ -13,7 +13,7 @@ from support.real_data import RealFiles
 from support.scenes import table_1
 
 from neurocal_cli import Calibration, calibrate, read_points
-from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
 
 
 def curled(by: float, seed: int, n: int = 14) -> Calibration:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.board_yaml import format_board, parse_board, read_board, write_board
+from neurocal_cli.files.board_yaml import format_board, parse_board, read_board, write_board
+from neurocal_cli.observations.board import Board, Plane
 
 TWO = """unit: mm
 planes:

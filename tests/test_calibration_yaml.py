@@ -14,15 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.made_calibration import made_calibration
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import calibration_lines, format_calibration
-from neurocal_cli.io.result_files import write_calibration
-from neurocal_cli.io.yaml_text import number, quoted, text
-from neurocal_cli.io.yaml_tree import parse_yaml
-from neurocal_cli.points import Correspondences
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import calibration_lines, format_calibration
+from neurocal_cli.files.result_files import write_calibration
+from neurocal_cli.files.yaml_text import number, quoted, text
+from neurocal_cli.files.yaml_tree import parse_yaml
+from neurocal_cli.observations.points import Correspondences
 
 # Without NUL, which NumPy drops at the end of a label.
 NAMES = st.text(
@@ -189,9 +189,9 @@ def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
 @pytest.fixture
 def all_files_are_long():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurocal_cli.io.calibration_yaml._MOST_POINTS", 0)
-        patch.setattr("neurocal_cli.io.text_columns.LONGEST", 2)
-        patch.setattr("neurocal_cli.io.observations_yaml.LONGEST", 2)
+        patch.setattr("neurocal_cli.files.calibration_yaml._MOST_POINTS", 0)
+        patch.setattr("neurocal_cli.files.text_columns.LONGEST", 2)
+        patch.setattr("neurocal_cli.files.observations_yaml.LONGEST", 2)
         yield
 
 
@@ -407,7 +407,7 @@ LONG_FAULTS = [
     ("pattern", "replacement", "expected"), LONG_FAULTS, ids=[f[2][:50] for f in LONG_FAULTS]
 )
 def test_a_fault_in_columns_is_named_too(path, monkeypatch, pattern, replacement, expected):
-    monkeypatch.setattr("neurocal_cli.io.calibration_yaml._MOST_POINTS", 0)
+    monkeypatch.setattr("neurocal_cli.files.calibration_yaml._MOST_POINTS", 0)
     content, count = re.subn(pattern, lambda _: replacement, format_calibration(made_calibration(2)), count=1)
     assert count == 1
     assert complaint(path, content).startswith(expected)

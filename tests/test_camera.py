@@ -14,13 +14,13 @@ from support.distorted import LENSES
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
-from neurocal_cli.calibration import camera_of
+from neurocal_cli.calibration.calibration import camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion, distort
+from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.geometry import Array, euler_to_rotation
 
 FLAT = Intrinsics(500.0, 500.0, 320.0, 240.0)
 

@@ -13,9 +13,9 @@ from support.made_calibration import made_calibration
 from support.real_data import RealFiles
 
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.calibration_tree import read_extrinsics
-from neurocal_cli.io.exchange.reading import read_intrinsics
-from neurocal_cli.io.result_files import write_calibration
+from neurocal_cli.files.calibration_tree import read_extrinsics
+from neurocal_cli.files.exchange.reading import read_intrinsics
+from neurocal_cli.files.result_files import write_calibration
 
 K = [[600.0, 0.5, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]]
 FLAT = [x for row in K for x in row]

@@ -14,10 +14,7 @@ from support.distorted import bent_set
 from support.made_calibration import made_calibration
 
 from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, write_calibration
-from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.errors import InputError
-from neurocal_cli.io.result_files import lean_calibration
-from neurocal_cli.planning.advice import (
+from neurocal_cli.calibration.advice import (
     Candidate,
     _Known,
     _target,
@@ -27,7 +24,10 @@ from neurocal_cli.planning.advice import (
     view_information,
     worst_std,
 )
-from neurocal_cli.planning.report import advice_lines
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.commands.show.advice_report import advice_lines
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.result_files import lean_calibration
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")
 

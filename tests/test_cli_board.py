@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from support.command_line import run
 
 from neurocal_cli import Board, Camera, Intrinsics, Pose, read_board, read_calibration
-from neurocal_cli.board import Plane
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
-from neurocal_cli.printing.sheet import PAPERS, Sheet, default_board, on_paper, paper_size
-from neurocal_cli.printing.unfolding import unfolded
+from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
+from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.printed_sheet import PAPERS, Sheet, default_board, on_paper, paper_size
+from neurocal_cli.observations.unfolding import unfolded
 
 MM = 72 / 25.4  # points
 CORNER = """\

@@ -15,7 +15,7 @@ from support.made_calibration import CAMERA, made_calibration, made_points
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
 from neurocal_cli.commands.streams import ProgressBar
-from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 
@@ -47,7 +47,7 @@ def refuse_to_work(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Non
     def fail(*args: object, **kwargs: object) -> None:
         raise error
 
-    monkeypatch.setattr("neurocal_cli.methods.calibrate", fail)
+    monkeypatch.setattr("neurocal_cli.calibration.calibrate.calibrate", fail)
 
 
 def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(printed: Result) -> None:
@@ -273,7 +273,7 @@ def test_an_answer_that_did_not_converge_is_written_with_exit_code_3(
     points: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unfinished = replace(made_calibration(), converged=False, warnings=("careful",))
-    monkeypatch.setattr("neurocal_cli.methods.calibrate", lambda *args, **kwargs: unfinished)
+    monkeypatch.setattr("neurocal_cli.calibration.calibrate.calibrate", lambda *args, **kwargs: unfinished)
     out = tmp_path / "camera.yaml"
     result = run("calibrate", points, "-o", out)
     assert result.exit_code == 3

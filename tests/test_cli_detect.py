@@ -19,8 +19,8 @@ from click.testing import Result
 from support.command_line import run
 
 from neurocal_cli import Board, read_image, read_points
-from neurocal_cli.board import Plane
 from neurocal_cli.detection.detect import Detection
+from neurocal_cli.observations.board import Plane
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)

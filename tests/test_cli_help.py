@@ -209,8 +209,8 @@ def test_mandoc_has_nothing_to_complain_of() -> None:
 
 
 def test_defaults_of_the_options_are_those_of_the_library() -> None:
-    from neurocal_cli.methods import DISTORTIONS, METHODS, OUTLIERS, TRAINERS, calibrate
-    from neurocal_cli.training.backprop import BackpropOptions
+    from neurocal_cli.calibration.calibrate import DISTORTIONS, METHODS, OUTLIERS, TRAINERS, calibrate
+    from neurocal_cli.network.backprop import BackpropOptions
 
     library = inspect.signature(calibrate).parameters
     command = neurocal.get_command(click.Context(neurocal), "calibrate")

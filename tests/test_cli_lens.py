@@ -14,13 +14,13 @@ from click.testing import Result
 from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
+from neurocal_cli.calibration.zoom.camera_at import camera_at
+from neurocal_cli.calibration.zoom.fit_points import fit_lens
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.lens_points import read_lens_data, read_lens_points, write_lens_points
-from neurocal_cli.io.lens_yaml import format_lens, read_lens, write_lens
-from neurocal_cli.zoom_lens.camera_at import camera_at
-from neurocal_cli.zoom_lens.fit_points import fit_lens
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.lens_points import read_lens_data, read_lens_points, write_lens_points
+from neurocal_cli.files.lens_yaml import format_lens, read_lens, write_lens
 
 CAMERAS = "zoom,alpha_u,alpha_v,u0,v0\n" + "".join(
     f"{z},{100 * z + 3 * (z % 7)},{100 * z},640,{480 + 0.1 * (z % 3)}\n" for z in range(20, 70, 5)
@@ -324,8 +324,8 @@ def test_the_options_are_those_of_the_library() -> None:
 
     import click
 
+    from neurocal_cli.calibration.zoom.fit_points import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
     from neurocal_cli.commands.lens import fit
-    from neurocal_cli.zoom_lens.fit_points import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
 
     library = inspect.signature(fit_lens).parameters
     options = {option.name: option for option in fit.params}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.command_line import run
 
-from neurocal_cli.io.outputs import Outputs
+from neurocal_cli.files.outputs import Outputs
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 
@@ -170,7 +170,7 @@ def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
     def fail(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("neurocal_cli.io.rig_yaml.format_rig", fail)
+    monkeypatch.setattr("neurocal_cli.files.rig_yaml.format_rig", fail)
     quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
     result = run("stereo", left, right, *quick, "-o", rig, "--ros", ros, tmp_path / "right.yaml")
     assert result.exit_code == 1

@@ -25,15 +25,15 @@ from neurocal_cli import (
     write_points,
     write_rig,
 )
-from neurocal_cli.calibration import Verdict
+from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.rectified_pair import rectified_pair, rectify_points, row_error
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.neurocal import as_rig
-from neurocal_cli.io.exchange.reading import FORMATS
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.stereo.rectified_pair import rectified_pair, rectify_points, row_error
-from neurocal_cli.stereo.report import rig_report
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.show.rig_report import rig_report
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.reading import FORMATS
 
 SIZE = (320, 240)
 VERGING = Pose.from_euler(0.02, 0.12, -0.03, np.array([-80.0, 3.0, 5.0]))

@@ -16,12 +16,12 @@ from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 
 from neurocal_cli import write_calibration, write_points, write_rig
-from neurocal_cli.calibration import Rejected, Verdict
-from neurocal_cli.html_report.drawings import enlargement, error_bars, heat_map, residual_map
-from neurocal_cli.io.images import encode_png, parse_image
-from neurocal_cli.io.result_files import write_result
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.calibration import Rejected, Verdict
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.commands.show.html_drawings import enlargement, error_bars, heat_map, residual_map
+from neurocal_cli.files.images import encode_png, parse_image
+from neurocal_cli.files.result_files import write_result
 
 VOID = {"meta", "br"}
 

@@ -15,14 +15,14 @@ from support.command_line import run
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.result_files import write_rig
-from neurocal_cli.io.rig_yaml import read_rig
-from neurocal_cli.io.table import stream_table
-from neurocal_cli.io.table_header import Schema
-from neurocal_cli.stereo.fit_rig import fit_rig
-from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.triangulation import triangulate
+from neurocal_cli.calibration.rig.fit_rig import fit_rig
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.triangulation import triangulate
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.files.result_files import write_rig
+from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli.files.table import stream_table
+from neurocal_cli.files.table_header import Schema
 
 NUMBERS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar")
 

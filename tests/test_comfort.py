@@ -22,8 +22,8 @@ from neurocal_cli.commands.detect import _another_board, _shown
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.outcome import Outcome
-from neurocal_cli.io.image_headers import stated_sizes
-from neurocal_cli.io.image_paths import find_images, natural_order
+from neurocal_cli.files.image_headers import stated_sizes
+from neurocal_cli.files.image_paths import find_images, natural_order
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 

@@ -9,8 +9,8 @@ import pytest
 from support.scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences
-from neurocal_cli.bundle_adjustment.common_noise import common_share, with_common_share
-from neurocal_cli.geometry import Array
+from neurocal_cli.adjustment.common_noise import common_share, with_common_share
+from neurocal_cli.camera.geometry import Array
 
 
 def stated(n: int, rng: np.random.Generator) -> Array:

@@ -13,8 +13,8 @@ from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
 from neurocal_cli.commands import options
-from neurocal_cli.comparison.by_method import METHODS, calibrate_with
-from neurocal_cli.comparison.compare import compare
+from neurocal_cli.simulation.by_method import METHODS, calibrate_with
+from neurocal_cli.simulation.comparison import compare
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 CORNER = """

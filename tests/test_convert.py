@@ -18,11 +18,11 @@ from support.made_calibration import made_calibration
 
 from neurocal_cli import Camera, Intrinsics, Pose, Rig, read_calibration, read_rig, write_calibration
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
-from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.reading import FORMATS, read_cameras, read_intrinsics
+from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)
 HOLDS = {name: target.models for name, target in FORMATS.items()}

@@ -14,11 +14,11 @@ from support.command_line import run
 from support.real_data import RealFiles
 
 from neurocal_cli import Board, Correspondences, calibrate, read_points, write_points
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.corner_texts import corner_text
-from neurocal_cli.io.exchange.corners import read_corners
-from neurocal_cli.io.exchange.matlab import saved
+from neurocal_cli.files.exchange.corner_texts import corner_text
+from neurocal_cli.files.exchange.corners import read_corners
+from neurocal_cli.files.exchange.matlab import saved
 
 BOARD = Board.single(5, 4, 25.0)
 SIZE = ["--cols", 5, "--rows", 4, "--square", 25]

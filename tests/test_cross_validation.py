@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
-from neurocal_cli.bundle_adjustment.cross_validation import (
-    Minimum,
-    disagreement,
-    held_out,
-    held_out_points,
-    reduced,
-)
-from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.least_squares.leave_out import inverse_or_nan
-from neurocal_cli.points import Correspondences
+from neurocal_cli.adjustment.adjust import Adjusted, adjust
+from neurocal_cli.adjustment.cross_validation import Minimum, disagreement, held_out, held_out_points, reduced
+from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.observations.points import Correspondences
 
 FREE = np.array([True, False, True, True, True])
 

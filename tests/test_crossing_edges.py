@@ -11,9 +11,9 @@ from support.real_data import RealFiles
 from support.rendered import condition, rendered
 from support.slow_cases import slow_but
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
@@ -21,8 +21,8 @@ from neurocal_cli.detection.fitting.crossing_edges import edges_served, position
 from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridImage, fit_grid
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.wide_map import WideMap
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.images import read_image
+from neurocal_cli.files.images import read_image
+from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import Background, Scene, Sensor, Target
 
 

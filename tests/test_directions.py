@@ -13,9 +13,9 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WIDE, project_directions
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import largest_angle, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import Array
 
 every_wide_model = pytest.mark.parametrize("model", list(WIDE))
 quick = settings(max_examples=25, deadline=None)

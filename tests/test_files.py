@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from neurocal_cli.errors import FormatError, NeurocalError
-from neurocal_cli.io.files import decode, read_blocks, read_bytes
-from neurocal_cli.io.writing import write_chunks, write_whole
+from neurocal_cli.files.files import decode, read_blocks, read_bytes
+from neurocal_cli.files.writing import write_chunks, write_whole
 
 AS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 

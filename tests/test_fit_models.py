@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.maps import some_map
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import ProfileShape
 from neurocal_cli.detection.fitting.edge_fit import EdgePixels, edge_model
 from neurocal_cli.detection.fitting.edge_profile import (
@@ -26,7 +27,6 @@ from neurocal_cli.detection.fitting.edge_profile import (
 )
 from neurocal_cli.detection.fitting.smooth_map import homography_start
 from neurocal_cli.detection.fitting.vertex_fit import VertexPixels, vertex_model
-from neurocal_cli.geometry import Array
 
 STEP = 1e-5
 

@@ -10,6 +10,7 @@ from support.maps import some_map
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
@@ -28,7 +29,6 @@ from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.geometry import Array
 
 GRID = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 
 Decorator = Callable[[type], Any]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import (
+from neurocal_cli.camera.geometry import (
     Array,
     cross_matrix,
     distinct_rows,

@@ -27,11 +27,11 @@ from neurocal_cli import (
     write_calibration,
     write_points,
 )
+from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.exchange.reading import read_given_camera
-from neurocal_cli.stereo.triangulation import triangulate
+from neurocal_cli.files.exchange.reading import read_given_camera
 
 SIZE = (640, 480)
 TRUE = {

@@ -12,13 +12,13 @@ from support.targets import photographed
 from support.wrong_inputs import flat
 
 from neurocal_cli import Correspondences, Intrinsics, calibrate
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.camera.monotonic import largest_angle
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import rotation_step
-from neurocal_cli.verdict.assessment import gather_evidence
 
 
 def four_views() -> Correspondences:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
-from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
-from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, inverse_scaled, solve_scaled
-from neurocal_cli.least_squares.schur_complement import eliminate, schur_covariance, schur_step
+from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
+from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, inverse_scaled, solve_scaled
+from neurocal_cli.adjustment.schur_complement import eliminate, schur_covariance, schur_step
+from neurocal_cli.camera.geometry import Array
 
 Residuals = Callable[[Array], tuple[Array, Array]]  # p (n,) -> r (m,) and dr/dp (m, n)
 TIGHT = DescentOptions(tolerance=1e-15, flat=1e-13, max_iterations=1000)

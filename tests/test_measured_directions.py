@@ -14,8 +14,17 @@ from support.scenes import pinhole
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.bundle_adjustment.common_noise import Noise, noise_of
-from neurocal_cli.bundle_adjustment.measured_directions import (
+from neurocal_cli.adjustment.common_noise import Noise, noise_of
+from neurocal_cli.adjustment.residual_correlation import correlation
+from neurocal_cli.adjustment.views import arrange, noise_model
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.lens_choice.collinear_points import find_lines
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.measured_directions import (
     LEAST,
     equations,
     loosened,
@@ -23,15 +32,6 @@ from neurocal_cli.bundle_adjustment.measured_directions import (
     rounded,
     unit,
 )
-from neurocal_cli.bundle_adjustment.residual_correlation import correlation
-from neurocal_cli.bundle_adjustment.views import arrange, noise_model
-from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.collinear_points import find_lines
-from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.verdict.assessment import gather_evidence
 
 NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 

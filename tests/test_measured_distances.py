@@ -11,15 +11,15 @@ from support.command_line import run
 from support.targets import COLS, ROWS, board, offsets, photographed_pair
 
 from neurocal_cli import Board, calibrate, read_board, read_calibration, read_points
-from neurocal_cli.board import Plane
-from neurocal_cli.distances import Distance, fitted_scale
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.board_yaml import format_board, parse_board, write_board
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.points import Correspondences
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.target import scale_of
+from neurocal_cli.files.board_yaml import format_board, parse_board, write_board
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.points_csv import write_points
+from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.distances import Distance, fitted_scale
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import scale_of
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 OPTIONS = {"distortion": "none", "skew": False}

@@ -17,11 +17,11 @@ from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.geometry import Array
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)
 BOARD = np.array([(30.0 * x, 30.0 * y, 0.0) for y in range(6) for x in range(9)])

@@ -13,8 +13,8 @@ from support.scenes import Scene, random_solid, table_1
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
+from neurocal_cli.calibration.lens_choice.candidate_models import _Chain
 from neurocal_cli.camera.distortion import MODELS
-from neurocal_cli.distortion.candidate_models import _Chain
 from neurocal_cli.errors import DegenerateGeometryError
 
 

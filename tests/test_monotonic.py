@@ -14,6 +14,7 @@ from neurocal_cli.camera.distortion import (
     distort,
     distort_with_jacobian,
 )
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import (
     is_monotonic,
     monotonic_radius,
@@ -21,7 +22,6 @@ from neurocal_cli.camera.monotonic import (
     reaches,
     undistort,
 )
-from neurocal_cli.geometry import Array
 
 SPREAD = {
     "k1": [0.4],

@@ -5,11 +5,11 @@ import pytest
 from support.scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
-from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
-from neurocal_cli.bundle_adjustment.views import arrange
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.reprojection import normal_blocks
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.geometry import Array
 
 UNKNOWNS = {1: 11, 2: 9, 3: 6, 4: 5}
 

@@ -10,8 +10,8 @@ from support.slow_cases import slow_but
 from support.targets import photographed, stabilised
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.moving_centre import MovingCentre
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.moving_centre import MovingCentre
 
 
 def told(calibration: Calibration) -> bool:

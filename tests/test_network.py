@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from support.gradients import gradients
 
-from neurocal_cli.geometry import Array
-from neurocal_cli.network import (
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.network import (
     Patterns,
     e_2d,
     e_orth,

@@ -10,7 +10,7 @@ from support.wrong_inputs import flat, moved, scaled
 from support.wrong_rigs import scene, seen
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.verdict.odd_points import odd_pixels, points_given_twice, views_of_another_scale
+from neurocal_cli.calibration.verdict.odd_points import odd_pixels, points_given_twice, views_of_another_scale
 
 POINTS = flat()
 

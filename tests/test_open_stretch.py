@@ -12,20 +12,20 @@ from support.scenes import random_rotation
 from support.targets import photographed
 
 from neurocal_cli import calibrate
-from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.open_coefficients import SpreadOfOpen
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.board import open_stretch as open_stretch_module
+from neurocal_cli.adjustment.board.open_stretch import open_stretch, spread_of_stretch, stretches
+from neurocal_cli.adjustment.open_coefficients import SpreadOfOpen
+from neurocal_cli.adjustment.problem import problem_for
+from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.rig import covariance
+from neurocal_cli.calibration.rig.adjust import adjust_rig
+from neurocal_cli.calibration.rig.covariance import covariance_of_stretch
+from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.problem import rig_problem
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.options import options_for
-from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.stereo import covariance
-from neurocal_cli.stereo.adjust import adjust_rig
-from neurocal_cli.stereo.covariance import covariance_of_stretch
-from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import rig_problem
-from neurocal_cli.target_shape import open_stretch as open_stretch_module
-from neurocal_cli.target_shape.open_stretch import open_stretch, spread_of_stretch, stretches
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.options import options_for
 
 EPS = 1e-6
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
-from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.orthogonality import _Conditions, pose_from_product, shared_intrinsics
+from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.orthogonality import _Conditions, pose_from_product, shared_intrinsics
 
 CAMERA = np.array([1.9, 0.05, 2.0, 0.1, -0.1])
 ALL = np.ones(5, dtype=bool)

@@ -11,7 +11,7 @@ import pytest
 from support.command_line import run
 
 from neurocal_cli.detection.other_targets import other_target
-from neurocal_cli.io.images import read_image
+from neurocal_cli.files.images import read_image
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 

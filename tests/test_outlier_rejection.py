@@ -12,7 +12,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
 
 
 def reject(points, **more):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.rendered import condition, picture
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure, plane_residuals
-from neurocal_cli.geometry import Array
 
 
 @pytest.fixture(scope="module")

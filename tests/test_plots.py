@@ -15,13 +15,13 @@ from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
 
 from neurocal_cli import NeurocalError, write_calibration, write_points
-from neurocal_cli.calibration import Calibration
-from neurocal_cli.plots import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
-from neurocal_cli.plots.camera_panels import Subject
-from neurocal_cli.plots.pages import draw_camera, draw_points_in_space, draw_rig
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
-from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.commands.show import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
+from neurocal_cli.commands.show.camera_panels import Subject
+from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_rig
 
 BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
 
@@ -63,7 +63,7 @@ def test_missing_matplotlib_is_said_with_what_to_install(monkeypatch: pytest.Mon
 def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
     code = (
         "import sys; from support.made_calibration import made_calibration;"
-        "from neurocal_cli.plots.pages import Subject, draw_camera;"
+        "from neurocal_cli.commands.show.plot_pages import Subject, draw_camera;"
         "draw_camera(Subject.of(made_calibration()));"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )

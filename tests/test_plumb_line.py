@@ -21,17 +21,17 @@ from support.scenes import Scene, board_midpoints, random_flat_set, random_rotat
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
-from neurocal_cli.board import Board
-from neurocal_cli.bundle_adjustment.views import noise_model
+from neurocal_cli.adjustment.views import noise_model
+from neurocal_cli.calibration.lens_choice.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
+from neurocal_cli.calibration.lens_choice.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
+from neurocal_cli.calibration.lens_choice.straightness import distorted_lines
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
-from neurocal_cli.distortion.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
-from neurocal_cli.distortion.straightness import distorted_lines
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, UsageError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.io.result_files import write_calibration
+from neurocal_cli.files.points_csv import write_points
+from neurocal_cli.files.result_files import write_calibration
+from neurocal_cli.observations.board import Board
 
 SIZE = (1000, 800)
 

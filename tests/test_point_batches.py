@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
-from neurocal_cli.geometry import Array
+from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.camera.geometry import Array
 
 counts_of = st.lists(
     st.one_of(st.integers(1, 9), st.sampled_from([511, 512, 513, 1500])), min_size=1, max_size=7

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 
 N = 6
 WORLD = np.arange(3.0 * N).reshape(N, 3)

@@ -12,16 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from neurocal_cli.errors import InputError, NeurocalError
-from neurocal_cli.io.points_csv import (
-    POINTS,
-    format_points,
-    ids_at_two_places,
-    read_points,
-    write_points,
-)
-from neurocal_cli.io.table import parse_table, read_in_bulk, read_line_by_line
-from neurocal_cli.io.table_header import find_layout
-from neurocal_cli.points import Correspondences
+from neurocal_cli.files.points_csv import POINTS, format_points, ids_at_two_places, read_points, write_points
+from neurocal_cli.files.table import parse_table, read_in_bulk, read_line_by_line
+from neurocal_cli.files.table_header import find_layout
+from neurocal_cli.observations.points import Correspondences
 
 CONTRACT = """\
 # image_size: 640 480

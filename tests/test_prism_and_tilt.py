@@ -15,7 +15,7 @@ from support.scenes import random_flat_set
 from neurocal_cli import Calibration, Camera, Intrinsics, calibrate
 from neurocal_cli.camera.distortion import WITH_PRISM, Distortion, coefficient_names
 from neurocal_cli.camera.polynomial import tilted, untilted
-from neurocal_cli.io.exchange.reading import read_intrinsics
+from neurocal_cli.files.exchange.reading import read_intrinsics
 
 SIZE = (1200, 900)
 PLAIN = [-0.15, 0.04, 8e-4, -5e-4, -0.004, 0.0, 0.0, 0.0]

@@ -11,7 +11,7 @@ from support.scenes import pinhole, table_1
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.distortion.rich_fit import averaged_over_sizes
-from neurocal_cli.geometry import Array
+from neurocal_cli.calibration.lens_choice.rich_fit import averaged_over_sizes
+from neurocal_cli.camera.geometry import Array
 
 NODES, SEEN, NOISE = np.arange(1.0, 7.0), 4, 0.1
 ALIKE = np.exp(-0.5 * (np.subtract.outer(NODES, NODES) / 2.5) ** 2) + 1e-8 * np.eye(6)

@@ -24,9 +24,9 @@ from support.wrong_inputs import (
 )
 
 from neurocal_cli import Correspondences, Pose, calibrate
+from neurocal_cli.calibration.verdict.proportions import proportions
 from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.verdict.proportions import proportions
 
 ALL = range(10)
 

@@ -10,10 +10,10 @@ from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, calibrate, read_points
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.initialisation.options import options_for
-from neurocal_cli.initialisation.radial_networks import radial_start
+from neurocal_cli.network.options import options_for
+from neurocal_cli.network.radial_networks import radial_start
 
 # Scenes in which a pinhole sees parallel boards, or views that contradict each other.
 STRONG = (552, 629, 1217, 2316)

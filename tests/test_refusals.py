@@ -11,10 +11,10 @@ from support.plain_projection import project
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
-from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
-from neurocal_cli.training.backprop import BackpropOptions
+from neurocal_cli.network.backprop import BackpropOptions
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)
 BOARD = np.array([(30.0 * x, 30.0 * y, 0.0) for y in range(6) for x in range(9)]) - [120.0, 75.0, 0.0]

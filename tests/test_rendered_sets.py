@@ -10,13 +10,13 @@ from support.distorted import coefficients
 from support.image_bound import camera_bound
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
-from neurocal_cli.board import Board, Plane
+from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.detect import gather
 from neurocal_cli.detection.measuring import Points
-from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
+from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import (
     Background,
     Rendered,

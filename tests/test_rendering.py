@@ -18,12 +18,12 @@ from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bo
 from support.rendered import CONDITIONS, OTHERS, RECIPES, condition, picture
 from support.slow_cases import slow_but
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.monotonic import monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import (
     Background,
     Illumination,

@@ -14,11 +14,11 @@ from support.picture_bound import noise_free
 from support.rendered import board_pose, condition
 from support.slow_cases import slow_but
 
-from neurocal_cli.board import Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Plane
 from neurocal_cli.simulation.rendering import (
     Background,
     Illumination,

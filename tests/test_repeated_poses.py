@@ -9,12 +9,12 @@ from support.real_data import RealFiles
 from support.scenes import random_flat_set
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
-from neurocal_cli.bundle_adjustment.cross_validation import FOLDS
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
-from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.bundle_adjustment.views import arrange
+from neurocal_cli.adjustment.cross_validation import FOLDS
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
+from neurocal_cli.adjustment.reprojection import CameraState
+from neurocal_cli.adjustment.residual_correlation import point_residuals
+from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.views import arrange
 
 
 def repeats(found: Calibration) -> RepeatedPoses:

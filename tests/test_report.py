@@ -12,7 +12,13 @@ from support.wrong_inputs import corner
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, evaluate_camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.report import align, calibration_report, evaluation_json, evaluation_tables, rounded
+from neurocal_cli.commands.show.camera_report import (
+    align,
+    calibration_report,
+    evaluation_json,
+    evaluation_tables,
+    rounded,
+)
 
 
 @pytest.mark.parametrize(

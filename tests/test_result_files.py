@@ -23,12 +23,12 @@ from neurocal_cli import (
     write_points,
     write_rig,
 )
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.result_files import write_result
-from neurocal_cli.io.rig_yaml import format_rig
-from neurocal_cli.io.yaml_tree import parse_yaml
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.result_files import write_result
+from neurocal_cli.files.rig_yaml import format_rig
+from neurocal_cli.files.yaml_tree import parse_yaml
 
 
 @pytest.fixture(scope="module")

@@ -13,18 +13,18 @@ from support.distorted import BENT, SIGMA, bent_set
 from support.random_lenses import KINDS, RandomLens, random_lens
 from support.targets import SHAPES, photographed
 
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import rich_choice
+from neurocal_cli.calibration.calibrate import calibrate, fit_poses
+from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import REACHES
+from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.methods import calibrate, fit_poses
-from neurocal_cli.pipeline import rich_choice
-from neurocal_cli.points import Correspondences
-from neurocal_cli.report import calibration_report
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.observations.points import Correspondences
 
 NOISE, SIZE = 0.15, (1000, 800)
 

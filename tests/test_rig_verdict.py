@@ -15,11 +15,11 @@ from support.rigs import random_rig, sides
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 
 from neurocal_cli import calibrate, calibrate_stereo, fit_rig, read_points, triangulate
-from neurocal_cli.io.rig_yaml import read_rig
-from neurocal_cli.points import Correspondences
-from neurocal_cli.stereo.assessment import assess_rig
-from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
-from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli.observations.points import Correspondences
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 

@@ -12,12 +12,12 @@ import yaml
 from support.rigs import random_rig
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration import Verdict
+from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.rig.fit_rig import fit_rig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.result_files import write_rig
-from neurocal_cli.io.rig_yaml import format_rig, read_rig
-from neurocal_cli.stereo.fit_rig import fit_rig
-from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.files.result_files import write_rig
+from neurocal_cli.files.rig_yaml import format_rig, read_rig
 
 
 @pytest.fixture(scope="module")

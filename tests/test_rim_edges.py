@@ -13,11 +13,11 @@ from support.real_data import RealFiles
 from support.rendered import condition, rendered
 
 from neurocal_cli import calibrate
-from neurocal_cli.board import Board
 from neurocal_cli.detection.detect import Detection, detect_points, gather
-from neurocal_cli.io.board_yaml import format_board, parse_board
+from neurocal_cli.files.board_yaml import format_board, parse_board
+from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.target import Target, board_of
 from neurocal_cli.simulation.rendering import Scene, Sides
-from neurocal_cli.target import Target, board_of
 
 SEEDS = range(4)
 

@@ -10,18 +10,23 @@ from support.plain_projection import project
 from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Camera, Intrinsics, Pose, calibrate
-from neurocal_cli.baselines.nonlinear import nonlinear
-from neurocal_cli.board import Board
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.problem import problem_for
+from neurocal_cli.calibration.other_methods.nonlinear import nonlinear
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.comparison.report import text_of
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.show.comparison_report import text_of
+from neurocal_cli.commands.show.simulation_plots import draw_rates
+from neurocal_cli.commands.show.simulation_report import (
+    noise_json,
+    rates_json,
+    rates_tables,
+    simulation_tables,
+)
 from neurocal_cli.errors import InputError, NeurocalError
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Board
 from neurocal_cli.simulation.noise import NoiseStudy, cramer_rao, study_noise
 from neurocal_cli.simulation.pictures import pictures, visible_points
-from neurocal_cli.simulation.plots import draw_rates
 from neurocal_cli.simulation.rates import data_set, study_rates
-from neurocal_cli.simulation.report import noise_json, rates_json, rates_tables, simulation_tables
 from neurocal_cli.simulation.scenes import (
     PAPER_BOARD,
     PAPER_CAMERA,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array
-from neurocal_cli.network import Patterns
-from neurocal_cli.training import Task, Trained
-from neurocal_cli.training.starts import Agreement, Learnt, learn
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.network import Patterns
+from neurocal_cli.network.starts import Agreement, Learnt, learn
+from neurocal_cli.network.trainers import Task, Trained
 
 K, N = 3, 8
 

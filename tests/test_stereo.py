@@ -15,13 +15,13 @@ from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import Rig, calibrate
+from neurocal_cli.calibration.rig.adjust import adjust_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.problem import rig_problem
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.adjust import adjust_rig
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import rig_problem
 
 
 def flat(kind: str = "verging", n_views: int = 8, seed: int = 5, lens: str = "none") -> RigScene:
@@ -77,7 +77,7 @@ def test_the_views_poses_go_through_the_rig() -> None:
 
 
 def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() -> None:
-    from neurocal_cli.stereo.fit_rig import fit_rig
+    from neurocal_cli.calibration.rig.fit_rig import fit_rig
 
     points = sides(flat(), 0.3)
     apart = fit_rig(*(calibrate(p, skew=False) for p in points))

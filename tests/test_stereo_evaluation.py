@@ -10,12 +10,12 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
+from neurocal_cli.calibration.rig.fit_rig import fit_rig
+from neurocal_cli.calibration.rig.triangulation import METHODS
+from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.stereo.evaluation import evaluate_stereo
-from neurocal_cli.stereo.fit_rig import fit_rig
-from neurocal_cli.stereo.triangulation import METHODS
 
 
 def calibrated(

@@ -5,11 +5,11 @@ import pytest
 from support.rigs import RigScene, all_residuals, random_rig
 
 from neurocal_cli import calibrate
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.adjust import RigProblem, RigState, adjust_rig
-from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.problem import rig_problem
-from neurocal_cli.stereo.sound_pairs import find_consensus
+from neurocal_cli.calibration.rig.adjust import RigProblem, RigState, adjust_rig
+from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.problem import rig_problem
+from neurocal_cli.calibration.rig.sound_pairs import find_consensus
+from neurocal_cli.camera.geometry import Array
 
 
 def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigProblem, RigState]:

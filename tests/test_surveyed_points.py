@@ -13,20 +13,20 @@ from support.slow_cases import slow_but
 from support.surveyed import K, surveyed
 
 from neurocal_cli import calibrate, read_calibration
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.adjustment.board import posterior as posterior_module
+from neurocal_cli.adjustment.board.find import sight_of
+from neurocal_cli.adjustment.board.information import Information, information_of
+from neurocal_cli.adjustment.board.posterior import known_sizes
+from neurocal_cli.adjustment.board.prior import Prior, surveyed_prior
+from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst
+from neurocal_cli.adjustment.problem import problem_for
+from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import rotation_step
-from neurocal_cli.initialisation.options import options_for
-from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.target import distinct_points
-from neurocal_cli.target_shape import posterior as posterior_module
-from neurocal_cli.target_shape.find import sight_of
-from neurocal_cli.target_shape.information import Information, information_of
-from neurocal_cli.target_shape.posterior import known_sizes
-from neurocal_cli.target_shape.prior import Prior, surveyed_prior
-from neurocal_cli.target_shape.system import PointsFirst, PosesFirst
+from neurocal_cli.files.points_csv import write_points
+from neurocal_cli.network.options import options_for
+from neurocal_cli.observations.target import distinct_points
 
 OPTIONS = {"distortion": "none", "skew": False}
 

@@ -15,21 +15,21 @@ from support.slow_cases import slow_but
 from support.targets import photographed_pair
 
 from neurocal_cli import Board, calibrate
-from neurocal_cli.board import Plane
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.common_target import on_one_target
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.io.board_yaml import format_board, parse_board
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.points_csv import read_points
-from neurocal_cli.io.result_files import write_calibration
-from neurocal_cli.io.rig_yaml import read_rig
-from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.planes import planes_of
-from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.stereo.evaluation import evaluate_stereo
-from neurocal_cli.target import board_of
+from neurocal_cli.files.board_yaml import format_board, parse_board
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.points_csv import read_points
+from neurocal_cli.files.result_files import write_calibration
+from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.target import board_of
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
 
@@ -213,7 +213,7 @@ def test_real_pairs_of_one_board(kind: str, tmp_path: Path, real_files: RealFile
         points = tmp_path / "left.csv", tmp_path / "right.csv"
         result = run("stereo", *points, "--target", target, "--no-skew", "-o", tmp_path / "rig.yaml")
         assert result.exit_code == 0, result.stderr
-        from neurocal_cli.io.rig_yaml import read_rig
+        from neurocal_cli.files.rig_yaml import read_rig
 
         rig = read_rig(tmp_path / "rig.yaml")
         rms[target], baseline[target] = rig.rmse_px, rig.baseline

@@ -8,10 +8,10 @@ from support.rigs import KINDS, RigScene, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Pose
+from neurocal_cli.calibration.rig.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 

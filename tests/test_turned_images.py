@@ -11,7 +11,7 @@ from support.slow_cases import slow_but
 from support.targets import photographed, stabilised
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
 
 OFF = np.array([45.0, -45.0])  # px; of the image centre from where the simulated cameras have it
 

@@ -12,12 +12,12 @@ from support.scenes import pinhole, random_flat_set, random_solid
 from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences
-from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
-from neurocal_cli.bundle_adjustment.views import arrange
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
-from neurocal_cli.geometry import Array
 
 
 def parameters(cal: Calibration) -> Array:

@@ -21,11 +21,11 @@ from neurocal_cli import (
     read_rig,
     undistort_points,
 )
+from neurocal_cli.calibration.rig.evaluation import evaluate_rig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.points_csv import format_points, write_points
-from neurocal_cli.io.result_files import write_calibration
-from neurocal_cli.stereo.evaluation import evaluate_rig
+from neurocal_cli.files.points_csv import format_points, write_points
+from neurocal_cli.files.result_files import write_calibration
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 BEFORE = "the points are undistorted already"

@@ -20,10 +20,10 @@ from support.slow_cases import slow_but
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.undistortion import new_matrix, sources, undistort_pixels, undistorted_camera
+from neurocal_cli.camera.undistortion import new_matrix, sources, undistort_pixels, undistorted_camera
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
 
 SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
@@ -285,7 +285,7 @@ def test_nothing_is_mirrored_beyond_the_fold() -> None:
     assert np.isnan(su[radius > fold + 0.01]).all()
     naive = cv2.undistort(white, cam.A, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.A)
     assert naive[radius > 1.5].any()  # what others show there
-    from neurocal_cli.distortion.remapping import Remapping
+    from neurocal_cli.camera.remapping import Remapping
 
     done = Remapping(cam, zoomed_out, SIZE)(white)
     assert done[radius < fold - 0.05].min() == 255

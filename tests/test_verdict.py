@@ -15,11 +15,11 @@ from support.targets import board, views_of
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
-from neurocal_cli.io.calibration_tree import read_calibration
-from neurocal_cli.io.calibration_yaml import format_calibration
-from neurocal_cli.io.result_files import write_calibration
-from neurocal_cli.verdict.assessment import assess, gather_evidence
-from neurocal_cli.verdict.rules import reach_verdict
+from neurocal_cli.calibration.verdict.assessment import assess, gather_evidence
+from neurocal_cli.calibration.verdict.rules import reach_verdict
+from neurocal_cli.files.calibration_tree import read_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.result_files import write_calibration
 
 BENT = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
 
@@ -71,7 +71,7 @@ def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
 @pytest.mark.slow
 def test_the_error_on_data_left_out_is_that_on_new_data() -> None:
     """On views of the same camera that it does not know, poses fitted."""
-    from neurocal_cli.evaluation import evaluate_camera
+    from neurocal_cli.calibration.evaluation import evaluate_camera
 
     told, found = [], []
     for seed in range(30):

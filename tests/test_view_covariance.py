@@ -9,16 +9,16 @@ from support.grouped_views import ALPHA, LENS, photographed, poses
 from support.scenes import random_flat_set
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.bundle_adjustment import view_covariance
-from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.cross_validation import reduced
-from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.bundle_adjustment.view_covariance import counting_views
-from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.least_squares.chi_squared import chi_squared, exceeded_by_chance
-from neurocal_cli.least_squares.leave_out import Quadratics
-from neurocal_cli.verdict.assessment import _AtMinimum
+from neurocal_cli.adjustment import view_covariance
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.chi_squared import chi_squared, exceeded_by_chance
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.cross_validation import reduced
+from neurocal_cli.adjustment.leave_out import Quadratics
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.adjustment.view_covariance import counting_views
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.calibration.verdict.assessment import _AtMinimum
 
 NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
 

@@ -10,8 +10,8 @@ from support.slow_cases import slow_but
 from support.wrong_inputs import of_cameras
 
 from neurocal_cli import calibrate
-from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.view_groups import ViewGroups
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.view_groups import ViewGroups
 
 ODD = ("view01", "view03", "view05", "view07", "view09")
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.geometry import Array, euler_to_rotation
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 
 COUNTS = (30, 7, 12)
 

@@ -12,12 +12,12 @@ from support.slow_cases import slow_but
 from support.wide_boards import WideRecipe, in_circle, mixture, wide_picture
 from support.wide_camera import WideCamera
 
-from neurocal_cli.board import Board
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.wide_lens import WideLens, fit_wide_lens
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Board
 from neurocal_cli.simulation.rendering import PlaneTruth, render
 
 cv2 = pytest.importorskip("cv2")

@@ -12,14 +12,14 @@ from support.wide_cameras import wide_camera, wide_points
 from support.wide_scenes import WideScene, wide_set
 
 from neurocal_cli import Calibration, calibrate
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.rig.triangulation import METHODS, triangulate
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.triangulation import METHODS, triangulate
-from neurocal_cli.verdict.assessment import gather_evidence
 
 # A rich lens has its own tests.
 every_wide_model = pytest.mark.parametrize("model", [name for name in WIDE if name != "rich"])

@@ -14,8 +14,8 @@ from support.made_calibration import made_calibration
 from support.rigs import random_rig
 
 from neurocal_cli import write_calibration, write_rig
-from neurocal_cli.io.exchange.camera_set import CameraSet
-from neurocal_cli.io.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.neurocal import as_rig
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 POINTS = SAMPLES / "points.csv"

@@ -12,10 +12,8 @@ from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
-from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.baseline_models import (
+from neurocal_cli.calibration.evaluation import evaluate_camera
+from neurocal_cli.calibration.zoom.baseline_models import (
     baselines_of,
     grid_axes,
     monomials,
@@ -23,14 +21,16 @@ from neurocal_cli.zoom_lens.baseline_models import (
     spline_matrix,
     thin_plate_matrix,
 )
-from neurocal_cli.zoom_lens.camera_at import camera_at
-from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.evaluation import _baseline_error, _rms, _squares, evaluate_lens
-from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
-from neurocal_cli.zoom_lens.fit_points import fit_lens
-from neurocal_cli.zoom_lens.judgement import judge_lens
-from neurocal_cli.zoom_lens.settings import LensPoints
-from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+from neurocal_cli.calibration.zoom.camera_at import camera_at
+from neurocal_cli.calibration.zoom.committee import Budget, fit_committee
+from neurocal_cli.calibration.zoom.evaluation import _baseline_error, _rms, _squares, evaluate_lens
+from neurocal_cli.calibration.zoom.fit_cameras import LensCameras, fit_lens_cameras
+from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.settings import LensPoints
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
+from neurocal_cli.observations.points import Correspondences
 
 FEW = ((0, 2),)  # a topology that a smooth lens needs no more than
 
@@ -245,7 +245,7 @@ def test_a_lens_of_a_moving_board() -> None:
 
 
 def board_view(alpha: float, u0: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    from neurocal_cli.geometry import rotation_step
+    from neurocal_cli.camera.geometry import rotation_step
 
     board = np.column_stack(
         [(np.stack(np.meshgrid(range(8), range(6)), -1).reshape(-1, 2) - [3.5, 2.5]) * 25, np.zeros(48)]

@@ -10,13 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.zoom_laws import grid, seen
 
-from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.joint_training import JointLearner, take_turns, train_joint
-from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
-from neurocal_cli.zoom_lens.network_training import Schedule, train
-from neurocal_cli.zoom_lens.parameter_networks import (
+from neurocal_cli.calibration.zoom.committee import Budget, fit_committee
+from neurocal_cli.calibration.zoom.joint_training import JointLearner, take_turns, train_joint
+from neurocal_cli.calibration.zoom.mlfn import Topology, respond, respond_with_jacobian
+from neurocal_cli.calibration.zoom.network_training import Schedule, train
+from neurocal_cli.calibration.zoom.parameter_networks import (
     SCALES,
     LensNets,
     ParameterNet,
@@ -25,15 +23,17 @@ from neurocal_cli.zoom_lens.parameter_networks import (
     outputs_to_local,
     to_scale,
 )
-from neurocal_cli.zoom_lens.quadratic_error import with_scatter
-from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
-from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
-from neurocal_cli.zoom_lens.static_calibration import (
+from neurocal_cli.calibration.zoom.quadratic_error import with_scatter
+from neurocal_cli.calibration.zoom.setting_normals import Constants, PixelData
+from neurocal_cli.calibration.zoom.settings import LensPoints, scaled_controls
+from neurocal_cli.calibration.zoom.static_calibration import (
     calibrate_each,
     common_tables,
     first_constants,
     local_covariance,
 )
+from neurocal_cli.camera.geometry import Array, rotation_step
+from neurocal_cli.observations.points import Correspondences
 
 STEP = 1e-6
 

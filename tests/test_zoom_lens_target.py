@@ -9,13 +9,13 @@ import pytest
 from support.targets import COLS, ROWS, board, offsets
 
 from neurocal_cli import Correspondences
-from neurocal_cli.geometry import rotation_step
-from neurocal_cli.io.lens_yaml import read_lens, write_lens
-from neurocal_cli.zoom_lens.evaluation import evaluate_lens
-from neurocal_cli.zoom_lens.fit_points import fit_lens
-from neurocal_cli.zoom_lens.settings import LensPoints
-from neurocal_cli.zoom_lens.target import lens_target, on_target
-from neurocal_cli.zoom_lens.zoom_lens import with_target_uncertain
+from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
+from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.settings import LensPoints
+from neurocal_cli.calibration.zoom.target import lens_target, on_target
+from neurocal_cli.calibration.zoom.zoom_lens import with_target_uncertain
+from neurocal_cli.camera.geometry import rotation_step
+from neurocal_cli.files.lens_yaml import read_lens, write_lens
 
 SIGMA = 0.1
 ZOOMS = np.linspace(0, 1000, 6)

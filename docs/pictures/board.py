@@ -5,8 +5,8 @@ from __future__ import annotations
 from style import HERE, SAMPLES, figure, save
 
 from neurocal_cli import Board, read_image
-from neurocal_cli.io.board_pictures import board_svg
-from neurocal_cli.printing.sheet import PAPERS, on_paper
+from neurocal_cli.files.board_pictures import board_svg
+from neurocal_cli.observations.printed_sheet import PAPERS, on_paper
 
 
 def main() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from style import HERE, SAMPLES
 
 from neurocal_cli import calibrate, read_points
-from neurocal_cli.planning.advice import advise
-from neurocal_cli.planning.plots import draw_advice
+from neurocal_cli.calibration.advice import advise
+from neurocal_cli.commands.show.advice_plot import draw_advice
 
 
 def main() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from neurocal_cli import calibrate, read_points
-from neurocal_cli.plots.camera_panels import Subject
-from neurocal_cli.plots.pages import draw_camera
+from neurocal_cli.commands.show.camera_panels import Subject
+from neurocal_cli.commands.show.plot_pages import draw_camera
 
 HERE = Path(__file__).resolve().parent
 SAMPLES = HERE.parents[1] / "sample_data"

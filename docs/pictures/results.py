@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neurocal_cli.processes import usable_cores
+from neurocal_cli.commands.show.simulation_plots import draw_rates, draw_simulation
+from neurocal_cli.files.processes import usable_cores
 from neurocal_cli.simulation.noise import study_noise
-from neurocal_cli.simulation.plots import draw_rates, draw_simulation
 from neurocal_cli.simulation.rates import study_rates
 from neurocal_cli.simulation.scenes import paper_scene
 from neurocal_cli.simulation.starts import study_starts

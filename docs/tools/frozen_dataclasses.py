@@ -12,6 +12,6 @@ class FrozenDataclasses(Extension):
 
     def on_class_instance(self, *, cls: Class, **_: Any) -> None:
         for decorator in cls.decorators:
-            if decorator.callable_path == "neurocal_cli.frozen_dataclass.frozen_dataclass":
+            if decorator.callable_path == "neurocal_cli.camera.frozen_dataclass.frozen_dataclass":
                 decorator.value = ExprName("dataclass", parent="dataclasses")
                 cls.labels.add("dataclass")

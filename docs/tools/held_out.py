@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, calibrate, read_points
+from neurocal_cli.calibration.calibrate import fit_poses
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import in_cameras
-from neurocal_cli.methods import fit_poses
 
 PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 # Rows and columns of omega's entries.
 _ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])

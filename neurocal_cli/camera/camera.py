@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera import projection
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import checked_size, real_array
 from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
-from neurocal_cli.given_values import checked_size, real_array
 
 
 @frozen_dataclass(eq=False)

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera import rich_lens
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.polynomial import Coefficients, distorted_with_jacobian
-from neurocal_cli.geometry import Array
 
 WIDE = {
     "fisheye": ("k1", "k2", "k3", "k4"),

@@ -15,11 +15,11 @@ from dataclasses import field
 import numpy as np
 
 from neurocal_cli.camera.directions import WIDE, project_directions
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.polynomial import Coefficients, Distorted, distorted, distorted_with_jacobian
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
-from neurocal_cli.given_values import real_array
 
 MODELS = {
     "none": (),

@@ -20,8 +20,8 @@ from neurocal_cli.camera.distortion import (
     distort_with_jacobian,
     radial_part,
 )
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.polynomial import first_eight, untilted
-from neurocal_cli.geometry import Array
 
 # Start and end of Newton's method. Random models of tests/test_monotonic.py are inverted to 1e-8 up to 95 %
 # of the radius at which they cease to be monotonic, random wide lenses of tests/test_directions.py to 1e-9 up

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
+from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
-from neurocal_cli.given_values import real_array
 
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
 POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 # A number, or an array that broadcasts against the points.
 Coefficients = Sequence[Any] | Array

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.directions import WIDE, project_directions
 from neurocal_cli.camera.distortion import Distortion, distort, distort_with_jacobian
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.polynomial import Coefficients
-from neurocal_cli.geometry import Array
 
 # Rows and columns of A's free entries, in the order of every vector of intrinsics: A11, A12, A22, A13, A23.
 ENTRIES = (np.array([0, 0, 1, 0, 1]), np.array([0, 1, 1, 2, 2]))

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 RADII, GRID = 16, 12  # nodes of the profile, and of the field in each direction
 REACHES = ("reach", "reach_x", "reach_y")  # extents of the nodes; never estimated

@@ -10,11 +10,11 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
-    from neurocal_cli.printing.sheet import Sheet
+    from neurocal_cli.observations.board import Board
+    from neurocal_cli.observations.printed_sheet import Sheet
 
 _ENDINGS = (".svg", ".pdf", ".png")
 
@@ -71,19 +71,19 @@ def board(
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
     beside = None if board.file is not None else os.path.splitext(output)[0] + ".yaml"
     preparation.check_outputs((output, beside), (board.file,))
-    from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
+    from neurocal_cli.observations.printed_sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
     target = board.read() or default_board(size)
     sheet = on_paper(target, size)
-    from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
+    from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
 
     if ending == ".png":
         write_whole(output, board_png(sheet, dpi))
     else:
         write_whole(output, board_svg(sheet) if ending == ".svg" else board_pdf(sheet))
     if beside is not None:
-        from neurocal_cli.io.board_yaml import write_board
+        from neurocal_cli.files.board_yaml import write_board
 
         write_board(target, beside)
     _report(target, sheet, beside, as_json)

@@ -7,8 +7,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.streams import ProgressBar, conclude, warn
-from neurocal_cli.plots import CAMERA_PANELS
 
 
 @click.command(cls=options.Command)
@@ -80,15 +80,15 @@ def calibrate(
     preparation.check_outputs((output, html, *(file for _, file in plots)), inputs)
     given, arguments = estimation.prepare(preparation.given_points(*points))
 
-    from neurocal_cli.io.result_files import write_result
-    from neurocal_cli.methods import calibrate as learn
-    from neurocal_cli.report import calibration_json, calibration_report
+    from neurocal_cli.calibration.calibrate import calibrate as learn
+    from neurocal_cli.commands.show.camera_report import calibration_json, calibration_report
+    from neurocal_cli.files.result_files import write_result
 
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     if plots:
-        from neurocal_cli.plots.camera_panels import Subject
-        from neurocal_cli.plots.pages import draw_camera
+        from neurocal_cli.commands.show.camera_panels import Subject
+        from neurocal_cli.commands.show.plot_pages import draw_camera
 
         write_plots(plots, draw_camera, Subject.of(calibration))
     warn(*write_result(calibration, output, lean=lean))

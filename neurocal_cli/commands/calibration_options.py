@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
-    from neurocal_cli.points import Correspondences
+    from neurocal_cli.observations.points import Correspondences
 
 # Options of back-propagation only, and their names in `BackpropOptions`.
 _BACKPROP = {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}
@@ -84,7 +84,7 @@ class Estimation:
         arguments |= {"type": int(self.type), "skew": not self.no_skew}
         values = {to: getattr(self, name) for name, to in _BACKPROP.items()}
         if given := {to: value for to, value in values.items() if value is not None}:
-            from neurocal_cli.training.backprop import BackpropOptions
+            from neurocal_cli.network.backprop import BackpropOptions
 
             arguments["backprop"] = BackpropOptions(**given)
         if self.type == "2":
@@ -95,7 +95,7 @@ class Estimation:
             if not getattr(camera, "known_covariance", ((), None))[0]:
                 _note_exact(f"{self.intrinsics} does not say how accurate its camera is, so it")
         elif self.extrinsics is not None:
-            from neurocal_cli.io.calibration_tree import read_extrinsics
+            from neurocal_cli.files.calibration_tree import read_extrinsics
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
             _note_exact("each given pose")

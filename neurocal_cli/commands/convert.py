@@ -13,13 +13,13 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.io.files import repeatable_stdin
-from neurocal_cli.io.writing import check_places, make_folder, write_whole
+from neurocal_cli.files.files import repeatable_stdin
+from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
-    from neurocal_cli.io.exchange.camera_set import CameraSet
-    from neurocal_cli.points import Correspondences
+    from neurocal_cli.files.exchange.camera_set import CameraSet
+    from neurocal_cli.observations.board import Board
+    from neurocal_cli.observations.points import Correspondences
 
 
 @click.command(cls=options.Command)
@@ -125,7 +125,7 @@ def convert(
     preparation.check_outputs(() if folder else (output,), (*files, board.file))
     described = board.file is not None or board.square is not None
     target_board = (board if described else replace(board, unit=None)).read()
-    from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.files.exchange.camera_set import CameraSet
 
     with repeatable_stdin() if "-" in files else nullcontext():
         found = _read(files, target_board, board.unit, image_size)
@@ -144,7 +144,7 @@ def convert(
 
 def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
     """Write points; return the summary for programs."""
-    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+    from neurocal_cli.files.exchange.corner_texts import corner_text, points_lost
 
     text = corner_text(points, target, os.path.splitext(output)[1].lower())
     losses, remarks = points_lost(points, target)
@@ -159,8 +159,8 @@ def _write_cameras(
     cameras: CameraSet, target: str, model: str | None, force: bool, output: str
 ) -> dict[str, Any]:
     """Write cameras; return the summary for programs."""
-    from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
-    from neurocal_cli.io.exchange.reading import FORMATS
+    from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
+    from neurocal_cli.files.exchange.reading import FORMATS
 
     wanted = FORMATS[target]
     adapted = adapt_cameras(cameras, wanted, force, model)
@@ -190,8 +190,8 @@ def _read(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | CameraSet:
     """The points of the files or, if they hold none, the cameras; with values that the files lack."""
-    from neurocal_cli.io.exchange.colmap import is_folder
-    from neurocal_cli.io.exchange.corners import read_corners
+    from neurocal_cli.files.exchange.colmap import is_folder
+    from neurocal_cli.files.exchange.corners import read_corners
 
     notes: list[str] = []
     points = None if is_folder(files[0]) else read_corners(files, board, notes, unit)
@@ -204,7 +204,7 @@ def _read(
         raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
     if len(files) > 2:
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
-    from neurocal_cli.io.exchange.reading import read_cameras
+    from neurocal_cli.files.exchange.reading import read_cameras
 
     return _completed(read_cameras(files), unit, size)
 

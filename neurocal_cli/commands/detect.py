@@ -25,15 +25,15 @@ from neurocal_cli.commands.streams import (
     where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
-from neurocal_cli.io.image_headers import stated_sizes
-from neurocal_cli.io.image_paths import find_images, view_names
-from neurocal_cli.io.writing import make_folder, write_whole
+from neurocal_cli.files.image_headers import stated_sizes
+from neurocal_cli.files.image_paths import find_images, view_names
+from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions
     from neurocal_cli.detection.measuring import Points
     from neurocal_cli.detection.outcome import Outcome
+    from neurocal_cli.observations.board import Board
 
 _SECOND = 2  # images of another size that are no longer a single stray one
 
@@ -146,7 +146,7 @@ def detect(
     outcomes = of_one_size(outcomes)
     _report(outcomes, target, as_json)
     from neurocal_cli.detection.detect import gather
-    from neurocal_cli.io.points_csv import format_points
+    from neurocal_cli.files.points_csv import format_points
 
     text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
     if overlay is not None:
@@ -173,7 +173,7 @@ def _wanted(
 ) -> DetectionOptions:
     from neurocal_cli.detection.batch import DetectionOptions
     from neurocal_cli.detection.cache import DetectionCache
-    from neurocal_cli.io.board_yaml import format_board
+    from neurocal_cli.files.board_yaml import format_board
 
     kind = cast("Points", points)
     known = None
@@ -246,7 +246,7 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
 
 def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     """Warn of images that were turned differently: each way of turning has its own image centre."""
-    from neurocal_cli.io.images import BY_EXIF
+    from neurocal_cli.files.images import BY_EXIF
 
     turns = Counter(
         next((text.split(BY_EXIF)[0] for text in outcome.notes if BY_EXIF in text), "as stored")

@@ -8,17 +8,17 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
+from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
-from neurocal_cli.plots import CAMERA_PANELS, SPACE_PANELS
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration, Verdict
+    from neurocal_cli.calibration.calibration import Calibration, Verdict
+    from neurocal_cli.calibration.evaluation import CameraEvaluation
+    from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.camera import Camera
-    from neurocal_cli.evaluation import CameraEvaluation
-    from neurocal_cli.points import Correspondences
-    from neurocal_cli.stereo.evaluation import StereoEvaluation
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.observations.points import Correspondences
 
 
 @click.group()
@@ -80,13 +80,13 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     given = None if points is None else preparation.given_points(points)
     evaluation, verdict, judged = _evaluate_camera(calibration, given)
     if plots:
-        from neurocal_cli.plots.camera_panels import Subject
-        from neurocal_cli.plots.pages import draw_camera
+        from neurocal_cli.commands.show.camera_panels import Subject
+        from neurocal_cli.commands.show.plot_pages import draw_camera
 
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     _tell(evaluation)
-    from neurocal_cli.report import evaluation_json, evaluation_tables
-    from neurocal_cli.verdict.report import verdict_lines
+    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.verdict_report import verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
@@ -98,10 +98,10 @@ def _evaluate_camera(
     name: str, points: Correspondences | None
 ) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
     """Evaluate a calibration or, if points are given, any camera file, with all poses fitted."""
-    from neurocal_cli.calibration import Calibration
-    from neurocal_cli.evaluation import evaluate_camera
-    from neurocal_cli.verdict.assessment import assess
-    from neurocal_cli.verdict.given_points import judged_by_points
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.verdict.assessment import assess
+    from neurocal_cli.calibration.verdict.given_points import judged_by_points
 
     camera, points = preparation.calibration_or_camera(name, points)
     evaluation = evaluate_camera(camera, points)
@@ -197,11 +197,15 @@ def stereo(
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
-        from neurocal_cli.plots.pages import draw_points_in_space
+        from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
-    from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
-    from neurocal_cli.verdict.report import verdict_lines
+    from neurocal_cli.commands.show.rig_report import (
+        stereo_evaluation_json,
+        stereo_evaluation_tables,
+        views_alone,
+    )
+    from neurocal_cli.commands.show.verdict_report import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -220,14 +224,14 @@ def stereo(
 def _evaluate_stereo(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
 ) -> tuple[StereoEvaluation, Rig | None]:
-    from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
 
     if len(cameras) == 1:
-        from neurocal_cli.io.rig_yaml import read_rig
+        from neurocal_cli.files.rig_yaml import read_rig
 
         rig = read_rig(cameras[0])
         return evaluate_rig(rig, points, method=method), rig
-    from neurocal_cli.io.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_tree import read_calibration
 
     if points is None:
         left, right = (read_calibration(name) for name in cameras)
@@ -238,8 +242,8 @@ def _evaluate_stereo(
 
 def _with_poses(name: str, points: Correspondences) -> Calibration:
     """Read a calibration, or any camera file; poses that the file does not hold are fitted to the points."""
-    from neurocal_cli.calibration import Calibration, undistorted_before
-    from neurocal_cli.methods import calibrate
+    from neurocal_cli.calibration.calibrate import calibrate
+    from neurocal_cli.calibration.calibration import Calibration, undistorted_before
 
     camera, seen = preparation.calibration_or_camera(name, points, "; the poses are fitted")
     if isinstance(camera, Calibration):

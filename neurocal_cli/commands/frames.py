@@ -28,7 +28,7 @@ _PAUSE = 0.3  # seconds between two checks; a file that is still being copied gr
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
     """Replace videos by their best frames; also the folder of these, with a separator, for messages."""
-    from neurocal_cli.io.video import is_video
+    from neurocal_cli.files.video import is_video
 
     if not any(map(is_video, paths)):
         yield tuple(paths), ""
@@ -42,7 +42,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 
 def _frames(path: str, folder: str, most: int) -> list[str]:
     from neurocal_cli.detection.frames import choose_frames
-    from neurocal_cli.io.video import frame_rate, save_frame, video_frames
+    from neurocal_cli.files.video import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
     with ProgressBar() as progress:
@@ -138,10 +138,10 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
         complain(outcome.problem)
         return
     found = detections(alike)
+    from neurocal_cli.calibration.advice import advise
+    from neurocal_cli.calibration.calibrate import calibrate
+    from neurocal_cli.commands.show.advice_report import advice_lines
     from neurocal_cli.detection.detect import gather
-    from neurocal_cli.methods import calibrate
-    from neurocal_cli.planning.advice import advise
-    from neurocal_cli.planning.report import advice_lines
 
     views = "1 view" if len(found) == 1 else f"{len(found)} views"
     head = f"{os.path.basename(path)}: {len(outcome.detection.ids)} points, {views}"

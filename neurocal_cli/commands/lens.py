@@ -135,11 +135,11 @@ def fit(
     preparation.check_summary(as_json, output)
     options.check_plot(plot, output)
     preparation.check_outputs((output, plot), points)
-    from neurocal_cli.io.lens_points import read_lens_data
-    from neurocal_cli.io.lens_yaml import write_lens
-    from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
-    from neurocal_cli.zoom_lens.fit_points import fit_lens
-    from neurocal_cli.zoom_lens.report import lens_json, lens_report
+    from neurocal_cli.calibration.zoom.fit_cameras import LensCameras, fit_lens_cameras
+    from neurocal_cli.calibration.zoom.fit_points import fit_lens
+    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
+    from neurocal_cli.files.lens_points import read_lens_data
+    from neurocal_cli.files.lens_yaml import write_lens
 
     notes: list[str] = []
     data = read_lens_data(points, notes=notes)
@@ -163,7 +163,7 @@ def fit(
                 progress=progress,
             )
     if plot is not None:
-        from neurocal_cli.zoom_lens.plots import draw_lens
+        from neurocal_cli.commands.show.zoom_plots import draw_lens
 
         write_plot(plot, draw_lens, learnt)
     write_lens(learnt, output)
@@ -205,21 +205,21 @@ def camera(
     options.check_camera_name(camera_name)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), (lens_file,))
-    from neurocal_cli.io.lens_yaml import read_lens
-    from neurocal_cli.io.result_files import write_calibration
-    from neurocal_cli.zoom_lens.camera_at import camera_at
+    from neurocal_cli.calibration.zoom.camera_at import camera_at
+    from neurocal_cli.files.lens_yaml import read_lens
+    from neurocal_cli.files.result_files import write_calibration
 
     learnt = read_lens(lens_file)
     setting, _ = learnt.setting_of({"zoom": zoom, "focus": focus}, extrapolate)
     calibration = camera_at(learnt, setting, camera_name, extrapolate=extrapolate)
     write_calibration(calibration, output)
     if as_json:
-        from neurocal_cli.report import calibration_json
+        from neurocal_cli.commands.show.camera_report import calibration_json
 
         chosen = dict(zip(learnt.controls, setting.tolist(), strict=True))
         print_summary({"setting": chosen, **calibration_json(calibration)})
     elif output != "-":
-        from neurocal_cli.zoom_lens.report import camera_report
+        from neurocal_cli.commands.show.zoom_report import camera_report
 
         say(camera_report(calibration))
     warn(*calibration.warnings)
@@ -257,11 +257,11 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     preparation.check_one_stdin(lens_file, points)
     options.check_plot(plot)
     preparation.check_outputs((plot,), (lens_file, points))
-    from neurocal_cli.io.lens_points import read_lens_points
-    from neurocal_cli.io.lens_yaml import read_lens
-    from neurocal_cli.zoom_lens.evaluation import evaluate_lens
-    from neurocal_cli.zoom_lens.judgement import judge_lens
-    from neurocal_cli.zoom_lens.report import evaluation_json, evaluation_report
+    from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
+    from neurocal_cli.calibration.zoom.judgement import judge_lens
+    from neurocal_cli.commands.show.zoom_report import evaluation_json, evaluation_report
+    from neurocal_cli.files.lens_points import read_lens_points
+    from neurocal_cli.files.lens_yaml import read_lens
 
     learnt = read_lens(lens_file)
     notes: list[str] = []
@@ -270,7 +270,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
-        from neurocal_cli.zoom_lens.plots import draw_evaluation
+        from neurocal_cli.commands.show.zoom_plots import draw_evaluation
 
         write_plot(plot, draw_evaluation, evaluation, learnt.controls)
     if as_json:

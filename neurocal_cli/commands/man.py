@@ -12,7 +12,7 @@ import click
 
 from neurocal_cli import __version__
 from neurocal_cli.commands import options
-from neurocal_cli.io.writing import make_folder, write_whole
+from neurocal_cli.files.writing import make_folder, write_whole
 
 _EXIT_STATUS = (
     ("0", "Done."),

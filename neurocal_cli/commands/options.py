@@ -16,13 +16,13 @@ import click
 from click.core import ParameterSource
 from click.types import FloatParamType
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.commands.show.figure import check_available
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.plots.figure import check_available
 
 if TYPE_CHECKING:
-    from neurocal_cli.board import Board
+    from neurocal_cli.observations.board import Board
 
 NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
@@ -53,7 +53,7 @@ COMMON_MODELS = f"auto {_USUAL} fisheye"
 """Those from which "auto" chooses by cross-validation."""
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
-"""Those of `comparison.by_method`, which a test compares."""
+"""Those of `simulation.by_method`, which a test compares."""
 
 
 class Argument(click.Argument):
@@ -235,7 +235,7 @@ class BoardOptions:
 
     def read(self) -> Board | None:
         """The board; None if no option describes one, a UsageError if they contradict each other."""
-        from neurocal_cli.board import Board
+        from neurocal_cli.observations.board import Board
 
         self.check_unit()
         cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
@@ -244,7 +244,7 @@ class BoardOptions:
                 raise UsageError(
                     "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
                 )
-            from neurocal_cli.io.board_yaml import read_board
+            from neurocal_cli.files.board_yaml import read_board
 
             return read_board(self.file)
         if (cols, rows, square, unit) == (None,) * 4:

@@ -12,12 +12,12 @@ import click
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
-from neurocal_cli.io.files import read_bytes
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.files.files import read_bytes
+from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.rig import Rig
 
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
@@ -80,9 +80,9 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
     import hashlib
     import shlex
 
-    from neurocal_cli.html_report.page import Origin, versions
-    from neurocal_cli.html_report.reports import calibration_page, rig_page
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.commands.show.html_page import Origin, versions
+    from neurocal_cli.commands.show.html_reports import calibration_page, rig_page
 
     files = {}
     for name in inputs:

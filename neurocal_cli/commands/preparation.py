@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
-from neurocal_cli.io.outputs import held_back
-from neurocal_cli.io.writing import STDOUT_NAMES, check_places
+from neurocal_cli.files.outputs import held_back
+from neurocal_cli.files.writing import STDOUT_NAMES, check_places
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.camera import Camera
-    from neurocal_cli.points import Correspondences
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.observations.points import Correspondences
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
@@ -64,7 +64,7 @@ def compute_in_one_thread() -> None:
 
 def given_points(*names: str) -> Correspondences:
     """Read points, and report rows of their files that were left out."""
-    from neurocal_cli.io.points_csv import ids_at_two_places, read_points
+    from neurocal_cli.files.points_csv import ids_at_two_places, read_points
 
     notes: list[str] = []
     points = read_points(names, notes=notes)
@@ -77,7 +77,7 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
 
     Of a neurocal file it is a Calibration without poses and points, but with its covariance.
     """
-    from neurocal_cli.io.exchange.reading import read_given_camera
+    from neurocal_cli.files.exchange.reading import read_given_camera
 
     camera = read_given_camera(path)
     if camera.image_size is not None:
@@ -96,8 +96,8 @@ def calibration_or_camera(
     name: str, points: Correspondences | None, besides: str = ""
 ) -> tuple[Calibration | Camera, Correspondences | None]:
     """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
-    from neurocal_cli.calibration import camera_of
-    from neurocal_cli.io.calibration_tree import read_calibration
+    from neurocal_cli.calibration.calibration import camera_of
+    from neurocal_cli.files.calibration_tree import read_calibration
 
     try:
         return read_calibration(name), points

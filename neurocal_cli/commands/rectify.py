@@ -13,14 +13,14 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
-from neurocal_cli.io.image_paths import find_images, is_image, view_names
-from neurocal_cli.io.writing import make_folder, write_whole
+from neurocal_cli.files.image_paths import find_images, is_image, view_names
+from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.distortion.remapping import Remapping
-    from neurocal_cli.points import Correspondences
-    from neurocal_cli.stereo.rectified_pair import RectifiedPair, RowError
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.calibration.rig.rectified_pair import RectifiedPair, RowError
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.camera.remapping import Remapping
+    from neurocal_cli.observations.points import Correspondences
 
 _Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera
 _SIDES = ("left", "right")
@@ -99,7 +99,7 @@ def rectify(
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
     _check_folders(output, sides)
-    from neurocal_cli.stereo.rectified_pair import rectified_pair
+    from neurocal_cli.calibration.rig.rectified_pair import rectified_pair
 
     found = _read_rig(rig)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
@@ -115,8 +115,8 @@ def rectify(
 
 
 def _read_rig(name: str) -> Rig:
-    from neurocal_cli.io.exchange.neurocal import as_rig
-    from neurocal_cli.io.exchange.reading import read_cameras
+    from neurocal_cli.files.exchange.neurocal import as_rig
+    from neurocal_cli.files.exchange.reading import read_cameras
 
     cameras = read_cameras([name])
     if (count := len(cameras.cameras)) != 2:
@@ -170,7 +170,7 @@ class _Work:
     @cached_property
     def remappings(self) -> list[Remapping]:
         """Tables of both cameras' images, made only for images or for files of tables."""
-        from neurocal_cli.distortion.remapping import Remapping
+        from neurocal_cli.camera.remapping import Remapping
 
         sides = zip(self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True)
         return [
@@ -180,8 +180,8 @@ class _Work:
 
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
-        from neurocal_cli.report import number_or_none
-        from neurocal_cli.stereo.rectified_pair import row_error_of_rig
+        from neurocal_cli.calibration.rig.rectified_pair import row_error_of_rig
+        from neurocal_cli.commands.show.camera_report import number_or_none
 
         self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
@@ -193,9 +193,9 @@ class _Work:
 
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
-        from neurocal_cli.io.points_csv import format_points
-        from neurocal_cli.report import number_or_none
-        from neurocal_cli.stereo.rectified_pair import row_error
+        from neurocal_cli.calibration.rig.rectified_pair import row_error
+        from neurocal_cli.commands.show.camera_report import number_or_none
+        from neurocal_cli.files.points_csv import format_points
 
         if len(sides[0]) > 1:
             raise UsageError("give one CSV file of points for each camera")
@@ -220,9 +220,9 @@ class _Work:
 
     def _rectified(self, side: int, path: str) -> Correspondences:
         """Read and rectify the points of one camera, 0 left or 1 right."""
-        from neurocal_cli.calibration import undistorted_before
-        from neurocal_cli.io.points_csv import read_points
-        from neurocal_cli.stereo.rectified_pair import rectify_points
+        from neurocal_cli.calibration.calibration import undistorted_before
+        from neurocal_cli.calibration.rig.rectified_pair import rectify_points
+        from neurocal_cli.files.points_csv import read_points
 
         notes: list[str] = []
         points = read_points(path, notes=notes)
@@ -245,8 +245,8 @@ class _Work:
         self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
 
     def _rectify_pair(self, pair: tuple[str, str]) -> None:
-        from neurocal_cli.io.images import encode_image, encode_png, read_picture
-        from neurocal_cli.stereo.rectified_pair import pair_picture
+        from neurocal_cli.calibration.rig.rectified_pair import pair_picture
+        from neurocal_cli.files.images import encode_image, encode_png, read_picture
 
         pictures = []
         for remapping, path in zip(self.remappings, pair, strict=True):
@@ -266,7 +266,7 @@ class _Work:
 
     def write_maps(self) -> None:
         """Write the tables and matrices."""
-        from neurocal_cli.io.exchange.dictionary import npz_bytes
+        from neurocal_cli.files.exchange.dictionary import npz_bytes
 
         tree = {}
         for side, remapping in zip(_SIDES, self.remappings, strict=True):

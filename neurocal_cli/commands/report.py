@@ -9,13 +9,13 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
-from neurocal_cli.io.files import decode, read_bytes
-from neurocal_cli.io.image_paths import photographs_of
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.files.files import decode, read_bytes
+from neurocal_cli.files.image_paths import photographs_of
+from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration
-    from neurocal_cli.io.tree_fields import Field
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.files.tree_fields import Field
 
 _MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third more
 
@@ -62,7 +62,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     preparation.check_outputs((output,), (result,))
     import hashlib
 
-    from neurocal_cli.io.file_storage import parse_tree
+    from neurocal_cli.files.file_storage import parse_tree
 
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
@@ -71,17 +71,17 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
-    from neurocal_cli.html_report.page import Origin
-    from neurocal_cli.html_report.reports import calibration_page, lens_page, rig_page
+    from neurocal_cli.commands.show.html_page import Origin
+    from neurocal_cli.commands.show.html_reports import calibration_page, lens_page, rig_page
 
     if "neurocal_lens" in root:
-        from neurocal_cli.io.lens_yaml import lens_from_field
+        from neurocal_cli.files.lens_yaml import lens_from_field
 
         if images:
             raise UsageError("the page of a zoom lens shows no photographs; leave out --images")
         return lens_page(lens_from_field(root), Origin(files))
     if "stereo" in root:
-        from neurocal_cli.io.rig_yaml import rig_from_field
+        from neurocal_cli.files.rig_yaml import rig_from_field
 
         rig = rig_from_field(root)
         words = images * (3 - len(images))
@@ -90,7 +90,7 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         ]
         origin = Origin(files, versions=_versions(root["left"]))
         return rig_page(rig, origin, (shown[0], shown[1]) if shown else None)
-    from neurocal_cli.io.calibration_tree import calibration_from_field
+    from neurocal_cli.files.calibration_tree import calibration_from_field
 
     calibration = calibration_from_field(root)
     if len(images) > 1:
@@ -107,7 +107,7 @@ def _versions(root: Field) -> dict[str, str]:
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
     """Thumbnails of the views' photographs, for the page."""
-    from neurocal_cli.io.images import thumbnails
+    from neurocal_cli.files.images import thumbnails
 
     views = calibration.points.view_names
     images = photographs_of(views, word)

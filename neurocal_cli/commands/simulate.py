@@ -12,7 +12,7 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import write_plot
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
-from neurocal_cli.io.writing import make_folder, write_whole
+from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
@@ -165,7 +165,7 @@ def simulate(
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
 
-    from neurocal_cli.processes import usable_cores
+    from neurocal_cli.files.processes import usable_cores
 
     jobs = jobs or usable_cores()
     if rates:
@@ -175,15 +175,15 @@ def simulate(
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
-    from neurocal_cli.comparison.report import text_of
+    from neurocal_cli.commands.show.comparison_report import text_of
+    from neurocal_cli.commands.show.simulation_report import simulation_json, simulation_tables
     from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import simulation_json, simulation_tables
 
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
         starts = _starts(scene, random_starts, seed, jobs, progress)
     if plot is not None:
-        from neurocal_cli.simulation.plots import draw_simulation
+        from neurocal_cli.commands.show.simulation_plots import draw_simulation
 
         write_plot(plot, draw_simulation, study, starts, scene.unit)
     if as_json:
@@ -204,12 +204,12 @@ def _scene(
         return scenes.paper_scene(), True
     camera, board = scenes.PAPER_CAMERA, scenes.PAPER_BOARD
     if board_file is not None:
-        from neurocal_cli.io.board_yaml import read_board
+        from neurocal_cli.files.board_yaml import read_board
 
         board = read_board(board_file)
     if camera_file is not None:
-        from neurocal_cli.io.calibration_tree import read_calibration
-        from neurocal_cli.io.exchange.reading import read_intrinsics
+        from neurocal_cli.files.calibration_tree import read_calibration
+        from neurocal_cli.files.exchange.reading import read_intrinsics
 
         own = board_file is None and views is None and camera_file != "-"
         if own:
@@ -239,14 +239,14 @@ def _starts(
 
 
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
-    from neurocal_cli.comparison.report import text_of
+    from neurocal_cli.commands.show.comparison_report import text_of
+    from neurocal_cli.commands.show.simulation_report import rates_json, rates_tables
     from neurocal_cli.simulation.rates import study_rates
-    from neurocal_cli.simulation.report import rates_json, rates_tables
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     if plot is not None:
-        from neurocal_cli.simulation.plots import draw_rates
+        from neurocal_cli.commands.show.simulation_plots import draw_rates
 
         write_plot(plot, draw_rates, study)
     if as_json:
@@ -259,9 +259,9 @@ def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, im
     """Write the truth and the data simulated from it; the noisy points are those of the first trial."""
     import numpy as np
 
-    from neurocal_cli.io.board_yaml import write_board
-    from neurocal_cli.io.points_csv import write_points
-    from neurocal_cli.io.result_files import write_calibration
+    from neurocal_cli.files.board_yaml import write_board
+    from neurocal_cli.files.points_csv import write_points
+    from neurocal_cli.files.result_files import write_calibration
     from neurocal_cli.simulation.scenes import true_calibration
 
     make_folder(folder)
@@ -274,7 +274,7 @@ def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, im
     if scene.board is not None:
         write_board(scene.board, os.path.join(folder, "board.yaml"))
     if images:
-        from neurocal_cli.io.images import encode_png
+        from neurocal_cli.files.images import encode_png
         from neurocal_cli.simulation.pictures import pictures, visible_points
 
         drawn = list(pictures(scene, seed))

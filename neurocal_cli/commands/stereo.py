@@ -11,13 +11,13 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.show import RIG_PANELS
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
-from neurocal_cli.io.writing import write_whole
-from neurocal_cli.plots import RIG_PANELS
+from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.calibration.rig.rig import Rig
 
 
 @click.command(cls=options.Command)
@@ -119,9 +119,9 @@ def stereo(
     if len(set(names)) < len(names):
         raise UsageError("-o and --ros name the same file twice; give three different files")
     preparation.check_outputs((output, html, *ros_files, *(file for _, file in plots)), inputs)
-    from neurocal_cli.io.result_files import write_result
-    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
+    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.commands.show.rig_report import rig_json, rig_report, views_alone
+    from neurocal_cli.files.result_files import write_result
 
     prepared = [
         side.prepare(preparation.given_points(name)) for name, side in zip((left, right), sides, strict=True)
@@ -130,7 +130,7 @@ def stereo(
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     if plots:
-        from neurocal_cli.plots.pages import draw_rig
+        from neurocal_cli.commands.show.plot_pages import draw_rig
 
         write_plots(plots, draw_rig, rig)
     if ros is not None:
@@ -142,7 +142,7 @@ def stereo(
 
 
 def _write_ros(rig: Rig, files: tuple[str, str], alpha: float | None) -> None:
-    from neurocal_cli.io.rig_yaml import format_ros_pair
+    from neurocal_cli.files.rig_yaml import format_ros_pair
 
     for name, text in zip(files, format_ros_pair(rig, alpha), strict=True):
         write_whole(name, text)

@@ -209,7 +209,7 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
 
 def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
     """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
-    from neurocal_cli.report import align
+    from neurocal_cli.commands.show.camera_report import align
 
     if not is_terminal(sys.stdout):
         blocks = [*map(align, tables), *([below] if below else [])]

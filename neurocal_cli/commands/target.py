@@ -37,10 +37,10 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output, plot), (camera,))
 
-    from neurocal_cli.io.board_yaml import write_board
-    from neurocal_cli.io.calibration_tree import read_calibration
-    from neurocal_cli.report import target_json, target_lines
-    from neurocal_cli.target import board_of
+    from neurocal_cli.commands.show.camera_report import target_json, target_lines
+    from neurocal_cli.files.board_yaml import write_board
+    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.observations.target import board_of
 
     calibration = read_calibration(camera)
     if calibration.target is None:
@@ -49,7 +49,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
             "another shape, calibrate with --target free"
         )
     if plot is not None:
-        from neurocal_cli.target_plot import draw_target
+        from neurocal_cli.commands.show.target_plot import draw_target
 
         write_plot(plot, draw_target, calibration.target, calibration.unit)
     board = board_of(calibration.target, calibration.unit, calibration.points.distances)

@@ -12,12 +12,12 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import UsageError
-from neurocal_cli.io.writing import write_chunks
+from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:
-    from neurocal_cli.io.triangulation_csv import Matches
-    from neurocal_cli.stereo.rig import Rig
-    from neurocal_cli.stereo.triangulation import Triangulated
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.triangulation import Triangulated
+    from neurocal_cli.files.triangulation_csv import Matches
 
 _USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
@@ -93,8 +93,8 @@ def triangulate(
     for side, camera in (("left", rig.left), ("right", rig.right)):
         if camera.points.undistorted:
             note(f"the {side} camera was calibrated from undistorted points; undistort its pixels alike")
-    from neurocal_cli.io.triangulation_csv import format_space_points, read_matches
-    from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
+    from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
+    from neurocal_cli.files.triangulation_csv import format_space_points, read_matches
 
     sigma = _noise(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
@@ -112,13 +112,13 @@ def triangulate(
 
 def _rig(names: tuple[str, ...]) -> Rig:
     if len(names) == 1:
-        from neurocal_cli.io.rig_yaml import read_rig
+        from neurocal_cli.files.rig_yaml import read_rig
 
         rig = read_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
-    from neurocal_cli.io.calibration_tree import read_calibration
-    from neurocal_cli.stereo.fit_rig import fit_rig
+    from neurocal_cli.calibration.rig.fit_rig import fit_rig
+    from neurocal_cli.files.calibration_tree import read_calibration
 
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)
@@ -148,7 +148,7 @@ class _Tally:
 
     def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
         """The points of each batch of matches, and their names."""
-        from neurocal_cli.stereo.triangulation import triangulate as solve
+        from neurocal_cli.calibration.rig.triangulation import triangulate as solve
 
         rig = self.rig
         for batch in batches:
@@ -184,7 +184,7 @@ class _Tally:
 
     def _fault(self) -> str:
         """Why most points do not fit the rig, or what to check."""
-        from neurocal_cli.stereo.match_faults import fault_of_matches
+        from neurocal_cli.calibration.rig.match_faults import fault_of_matches
 
         assert self.first is not None
         left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]

@@ -12,7 +12,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import is_terminal, note_once, print_summary, say
 from neurocal_cli.errors import UsageError
-from neurocal_cli.io.image_paths import find_images, is_image
+from neurocal_cli.files.image_paths import find_images, is_image
 
 _NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
 
@@ -110,9 +110,9 @@ def undistort(
     if not files and options.typed("output"):
         raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
     preparation.check_summary(as_json, new_camera, maps, output if files else None)
+    from neurocal_cli.camera.undistortion import chosen_view
     from neurocal_cli.commands.undistorting import Undistorting
-    from neurocal_cli.distortion.undistortion import chosen_view
-    from neurocal_cli.io.exchange.reading import read_intrinsics
+    from neurocal_cli.files.exchange.reading import read_intrinsics
 
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):

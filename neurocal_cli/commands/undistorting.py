@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration import undistorted_before
+from neurocal_cli.calibration.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.commands.streams import each_of, note, say, warn
-from neurocal_cli.distortion.undistorted_view import Panorama, Undistorted, field_of_view
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.image_paths import is_image
-from neurocal_cli.io.writing import make_folder, write_whole
+from neurocal_cli.files.image_paths import is_image
+from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.distortion.remapping import Remapping
+    from neurocal_cli.camera.remapping import Remapping
 
 _UNTOLD = 2.0  # degrees of field of view whose loss is not reported
 
@@ -42,7 +42,7 @@ class Undistorting:
 
     def remap(self) -> Remapping:
         """The tables of images of the known size."""
-        from neurocal_cli.distortion.remapping import Remapping  # imports OpenCV, which points do not need
+        from neurocal_cli.camera.remapping import Remapping
 
         if self.size is None:
             raise InputError(
@@ -88,7 +88,7 @@ class Undistorting:
 
     def write_camera(self, path: str) -> None:
         """Write the camera of the undistorted results."""
-        from neurocal_cli.io.camera_info import format_camera_info, format_panorama
+        from neurocal_cli.files.camera_info import format_camera_info, format_panorama
 
         new = self.new()
         if isinstance(new, Panorama):
@@ -98,7 +98,7 @@ class Undistorting:
 
     def write_maps(self, path: str) -> None:
         """Write the remapping tables, and the camera of the images that they produce."""
-        from neurocal_cli.io.exchange.dictionary import npz_bytes
+        from neurocal_cli.files.exchange.dictionary import npz_bytes
 
         u, v = self.remap().tables()
         write_whole(path, npz_bytes({"u": u, "v": v, **self._described()}))
@@ -124,7 +124,7 @@ class Undistorting:
         write_whole(output, content)
 
     def _image(self, path: str, output: str) -> bytes:
-        from neurocal_cli.io.images import encode_image, read_picture
+        from neurocal_cli.files.images import encode_image, read_picture
 
         pixels, source, notes = read_picture(path)
         self.size = self.size or (pixels.shape[1], pixels.shape[0])
@@ -139,8 +139,8 @@ class Undistorting:
         return content
 
     def _points(self, path: str) -> str:
-        from neurocal_cli.distortion.undistortion import map_points, shown
-        from neurocal_cli.io.points_csv import format_points, read_points
+        from neurocal_cli.camera.undistortion import map_points, shown
+        from neurocal_cli.files.points_csv import format_points, read_points
 
         notes: list[str] = []
         points = read_points(path, notes=notes)

@@ -9,7 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from neurocal_cli.board import Board
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.detection.cache import DetectionCache
 from neurocal_cli.detection.detect import Detection, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
@@ -18,10 +18,10 @@ from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.outcome import Outcome
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.io.files import read_bytes
-from neurocal_cli.io.images import Image, encode_png, parse_image
-from neurocal_cli.processes import start_worker, usable_cores, work_through
+from neurocal_cli.files.files import read_bytes
+from neurocal_cli.files.images import Image, encode_png, parse_image
+from neurocal_cli.files.processes import start_worker, usable_cores, work_through
+from neurocal_cli.observations.board import Board
 
 _WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
 _KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli import __version__
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import Detection
 from neurocal_cli.detection.outcome import Outcome
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.files import read_bytes
-from neurocal_cli.io.writing import write_whole
+from neurocal_cli.files.files import read_bytes
+from neurocal_cli.files.writing import write_whole
 
 _FORMAT = 5  # raised when the same image gives other points than before
 # Of a detection; its grids are not cached, which only its picture needs.

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.board import Board, Plane
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Identified, Located, identify
@@ -18,9 +19,8 @@ from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.points import Correspondences
 
 _FEWEST = 8  # points; fewer determine little more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge

@@ -15,6 +15,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.crossing_edges import AlongEdges, positions_along_edges
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
@@ -30,7 +31,6 @@ from neurocal_cli.detection.fitting.grid_fit import (
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.geometry import Array
 
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 MAD_TO_SIGMA = 1.4826  # ratio of standard deviation to median absolute deviation for a normal distribution
 CHI2_MEDIAN = 0.455  # median of chi-squared with one degree of freedom

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.detection.detect import Detection
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 
 @frozen_dataclass(eq=False)

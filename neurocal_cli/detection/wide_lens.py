@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 
 # Initial focal lengths put the outermost vertex at these angles from the axis [rad].
 _ANGLES = np.geomspace(0.12, 2.1, 16)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
 from neurocal_cli.simulation.scenes import SimulatedScene
 

@@ -21,18 +21,18 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.views import arrange
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_rotation
-from neurocal_cli.initialisation.options import Progress, options_for
-from neurocal_cli.methods import calibrate
-from neurocal_cli.network import output, random_weights
-from neurocal_cli.points import Correspondences
-from neurocal_cli.processes import work_through
-from neurocal_cli.training import Task
-from neurocal_cli.training.backprop import BackpropOptions, train_backprop
-from neurocal_cli.training.starts import learn
+from neurocal_cli.files.processes import work_through
+from neurocal_cli.network.backprop import BackpropOptions, train_backprop
+from neurocal_cli.network.network import output, random_weights
+from neurocal_cli.network.options import Progress, options_for
+from neurocal_cli.network.starts import learn
+from neurocal_cli.network.trainers import Task
+from neurocal_cli.observations.points import Correspondences
 
 RATES_WEIGHTS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 RATES_GAMMA = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6, 2.0)

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.board import Board, Plane
-from neurocal_cli.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.calibration import Calibration, ViewResult
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.points import Correspondences
 
 # The camera of Table 1, whose theta of 1.5708 is a rounded right angle.
 PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))

@@ -24,20 +24,20 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.nonlinear import descend, least_squares, nonlinear
-from neurocal_cli.bundle_adjustment.observability import check_points
-from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.observability import check_points
+from neurocal_cli.adjustment.problem import Problem, problem_for
+from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.calibration.other_methods.nonlinear import descend, least_squares, nonlinear
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_rotation
-from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
-from neurocal_cli.initialisation.given_poses import solve_given_poses
-from neurocal_cli.initialisation.options import Progress, options_for
-from neurocal_cli.initialisation.view_networks import begin_flat, train_networks
-from neurocal_cli.network import random_weights
-from neurocal_cli.processes import work_through
+from neurocal_cli.files.processes import work_through
+from neurocal_cli.network.cameras_from_networks import cameras_from_products, candidate_intrinsics
+from neurocal_cli.network.given_poses import solve_given_poses
+from neurocal_cli.network.network import random_weights
+from neurocal_cli.network.options import Progress, options_for
+from neurocal_cli.network.view_networks import begin_flat, train_networks
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 _SAME = 1.001  # greatest ratio to the best rms error

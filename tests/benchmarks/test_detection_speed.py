@@ -10,11 +10,11 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from support.real_data import RealFiles
 from support.rendered import picture
 
-from neurocal_cli.board import Board
 from neurocal_cli.detection.batch import retain_freed_memory
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.measuring import measure
+from neurocal_cli.observations.board import Board
 
 cv2 = pytest.importorskip("cv2")
 CONDITIONS = ["base", "2 Mpx", "5 Mpx", "clutter only"]

@@ -19,7 +19,7 @@ from support.scenes import random_flat_set, table_1
 from support.targets import COLS, photographed
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
-from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.files.calibration_yaml import format_calibration
 
 VIEWS = [13, 100, 1000]
 GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep", "--target", "given"]

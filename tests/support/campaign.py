@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 
 Array = NDArray[np.float64]
 

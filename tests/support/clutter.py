@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.simulation.rendering.layers import half_plane
 from neurocal_cli.simulation.rendering.scene import Background
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import rq
 
+from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.geometry import Array, nearest_rotation
 
 
 def decompose(P: Array) -> tuple[Intrinsics, Pose]:

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.bundle_adjustment.views import arrange
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.reprojection import CameraState
+from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.camera.distortion import Distortion, distort
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import is_monotonic, monotonic_radius
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
-from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 from support.plain_projection import project
 from support.scenes import Scene, random_flat_set
 

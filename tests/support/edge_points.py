@@ -8,8 +8,8 @@ import numpy as np
 
 from neurocal_cli import Correspondences
 from neurocal_cli.camera.distortion import distort
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import Array
 from support.distorted import without_camera
 from support.plain_projection import project
 from support.scenes import board_midpoints, random_flat_set

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli import Calibration, Correspondences
 from neurocal_cli.camera.distortion import Distortion, distort
-from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.camera.geometry import Array, rotation_step
 from support.rigs import RigScene, corner, random_rig
 
 _PER_PLANE = 36

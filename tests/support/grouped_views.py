@@ -8,9 +8,9 @@ import numpy as np
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 
 COLS, ROWS, SQUARE, SIZE = 9, 6, 25.0, (1280, 960)
 ALPHA = 1000.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.simulation.rendering import Scene
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from support.picture_bound import noise_variance, shift_gradients

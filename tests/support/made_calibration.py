@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 from support.plain_projection import project
 
 CAMERA = Intrinsics(600.0, 610.0, 320.0, 240.0, 1.571)

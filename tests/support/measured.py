@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import EDGE_H, VERTEX, Grid, Measured
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene, render
 from support.picture_bound import scene_bound
 from support.rendered import condition

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli import Correspondences
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 from support.scenes import Scene
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import half_plane
 from neurocal_cli.simulation.rendering.scene import Cover
 

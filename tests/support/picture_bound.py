@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.render import enough_parts, image_light, response, signal
 from neurocal_cli.simulation.rendering.scene import Scene, Sensor

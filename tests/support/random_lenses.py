@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 _CENTRE = np.array([505.0, 392.0])
 _FARTHEST = 1.4  # rad

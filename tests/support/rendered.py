@@ -15,11 +15,11 @@ from typing import Literal
 
 import numpy as np
 
-from neurocal_cli.board import Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Plane
 from neurocal_cli.simulation.rendering import (
     Illumination,
     Rendered,

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose
-from neurocal_cli.bundle_adjustment.reprojection import residuals
+from neurocal_cli.adjustment.reprojection import residuals
+from neurocal_cli.calibration.rig.adjust import RigProblem, RigState
 from neurocal_cli.camera.distortion import Distortion, distort
-from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.adjust import RigProblem, RigState
+from neurocal_cli.camera.geometry import Array
 
 KINDS = ("parallel", "verging", "wide", "narrow", "unequal")
 

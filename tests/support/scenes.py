@@ -8,15 +8,15 @@ from functools import partial
 import numpy as np
 
 from neurocal_cli import calibrate
-from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
-from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.covariance import covariance
+from neurocal_cli.adjustment.problem import Problem, problem_for
+from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
+from neurocal_cli.observations.points import Correspondences
 from support.plain_projection import project
 
 # Every point, a pinhole: what a reference optimiser does.

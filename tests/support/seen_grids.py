@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.identity.identify import Identified
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene
 
 

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.camera.distortion import coefficient_names, distort
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.points import Correspondences
+from neurocal_cli.camera.geometry import Array, rotation_step
+from neurocal_cli.observations.points import Correspondences
 from support.targets import SHAPES, Lens, Truth, offsets, photographed, views_of
 
 KINDS = SHAPES

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli import Correspondences
+from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.geometry import Array, rotation_step
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1010.0, 480.0], [0.0, 0.0, 1.0]])
 _SIZE = np.array([300.0, 250.0, 200.0])

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.camera.distortion import distort
-from neurocal_cli.geometry import Array, nearest_similarity, rotation_step
-from neurocal_cli.points import Correspondences
+from neurocal_cli.camera.geometry import Array, nearest_similarity, rotation_step
+from neurocal_cli.observations.points import Correspondences
 
 SHAPES = ("flat", "parabola", "twist", "waves", "stretch", "in_plane", "out_of_plane", "both", "flexing")
 COLS, ROWS, SQUARE = 9, 7, 25.0  # 200 mm long

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import Scene, Sensor, ground_truth
 from neurocal_cli.simulation.rendering.render import Image, digitised, image_light
 from support.clutter import Clutter

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.board import Plane
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Plane
 from neurocal_cli.simulation.rendering import (
     Illumination,
     Rendered,

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
 
 Law = Literal["equidistant", "equisolid", "stereographic"]
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import GRID, NODES, RADII
-from neurocal_cli.geometry import Array
 
 SIZE = (1000, 800)
 # Of a rich lens, without a field: its axis is seen at the principal point.

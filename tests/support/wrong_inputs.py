@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.verdict.assessment import assess
 from support.plain_projection import project
 from support.scenes import board_midpoints
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate, fit_rig
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.geometry import Array, rotation_step, rotation_vector
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.geometry import Array, rotation_step, rotation_vector
-from neurocal_cli.stereo.rig import Rig
 from support.rigs import RigScene, corner, random_rig
 
 SIGMA = 0.15

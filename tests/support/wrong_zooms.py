@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.settings import LensPoints
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.fit_points import fit_lens
-from neurocal_cli.zoom_lens.judgement import judge_lens
-from neurocal_cli.zoom_lens.settings import LensPoints
+from neurocal_cli.observations.points import Correspondences
 from support.zoom_laws import grid, seen
 
 TOPOLOGIES = ((0, 1), (0, 2))

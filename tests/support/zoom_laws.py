@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from simulated_zoom import see
 
+from neurocal_cli.calibration.zoom.settings import LensPoints
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.settings import LensPoints
-from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 LOW, HIGH = np.array([100.0, 0.0]), np.array([2100.0, 900.0])  # of the encoders
 POSE = Pose.from_euler(0.15, -0.22, 0.05, np.array([12.0, -8.0, 0.0]))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.lattice import Lattice, signs
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.predict import PredictedVertices
 from neurocal_cli.detection.medians import median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Insensitive, except _INTO and _ALONG: doubled, samples reach the next squares, and 66 of 279 points of three
 # photographs are lost.

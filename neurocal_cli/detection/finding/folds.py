@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.medians import median, quantile
-from neurocal_cli.geometry import Array
 
 # Pairs of the least second difference of a fold [squares] and its least ratio to those of distant rows,
 # because paper is not flat either. Insensitive, like all constants here; FOLDED and WHOLE in

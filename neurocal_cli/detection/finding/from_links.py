@@ -11,6 +11,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.folds import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.grow import check_lattice
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square
@@ -18,7 +19,6 @@ from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.links import STEPS, Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.subpixel import refine_saddles
-from neurocal_cli.geometry import Array
 
 # Insensitive: a lattice rejected here is grown instead, which only costs time
 # (tests/benchmarks/test_detection_speed.py).

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.checks import edges_visible, has_block, is_smooth
 from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
@@ -29,7 +30,6 @@ from neurocal_cli.detection.finding.overlaps import (
 )
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.geometry import Array
 
 # Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless nothing
 # has been found yet. Chosen for speed: tests/benchmarks/test_detection_speed.py.

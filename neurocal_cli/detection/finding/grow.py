@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.checks import VertexCheck, check_vertices
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square, signs
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
 from neurocal_cli.detection.finding.subpixel import refine_saddles
-from neurocal_cli.geometry import Array
 
 # Insensitive, with exceptions: half of _STEPS loses 3 of 1204 vertices, half of _MOST_SPREAD loses 47, and
 # twice _WEAKEST, which exceeds the contrast of the neighbours, stops growth. tests/test_finding.py repeats

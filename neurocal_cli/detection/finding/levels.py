@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 
 Image = NDArray[np.float32]
 

@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.lattice import Index
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))

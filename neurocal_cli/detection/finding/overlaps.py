@@ -10,11 +10,11 @@ from itertools import combinations
 
 import numpy as np
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grow import frontier
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.detection.grid import TURNS
-from neurocal_cli.geometry import Array
 
 # Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
 _SAME = 0.25  # squares; greatest distance between vertices that are the same

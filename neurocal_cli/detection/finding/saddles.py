@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.subpixel import refine_saddles
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Insensitive, except _RADII: doubled, the rings reach beyond squares of 6 px, and such a board is not found.
 _THRESHOLD = 5.0  # least steepness of a saddle, in standard deviations of the noise

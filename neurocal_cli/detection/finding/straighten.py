@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.from_links import linked_group
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.levels import Level, interpolate
@@ -23,8 +25,6 @@ from neurocal_cli.detection.finding.overlaps import distance
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Saddles at a distance between these [squares] from a lattice may be its next line: nearer ones are its own.
 _OWN, _BESIDE = 0.4, 2.0

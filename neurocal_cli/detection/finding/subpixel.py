@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.levels import Image
-from neurocal_cli.geometry import Array
 
 _LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     CONTRAST,
@@ -30,8 +32,6 @@ from neurocal_cli.detection.fitting.shading import Shading, excess_variance, pol
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.strips import Lines, Single
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Insensitive, except _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
 _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level

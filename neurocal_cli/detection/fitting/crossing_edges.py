@@ -22,12 +22,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.edge_fit import OFFSET
 from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridFit, GridImage, fit_rim
 from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import grid_lines
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
 # 0.7 to 1.6 in rendered images (tests/test_rendered_sets.py), and 9 to 300 in photographs of paper boards.

@@ -17,6 +17,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     FitPixels,
@@ -28,8 +30,6 @@ from neurocal_cli.detection.fitting.edge_profile import erf_and_density, respons
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines, Single, Strips, strip_pixels
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Half of REACH raises errors by 16 %; doubled, it lowers them by 2 %, with twice the pixels. Half of SHARP
 # raises the errors of edges sharper than a pixel up to 9 times. The others are insensitive.

@@ -29,7 +29,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.geometry import Array
 
 Real = NDArray[np.floating]
 

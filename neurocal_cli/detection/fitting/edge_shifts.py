@@ -18,13 +18,13 @@ from itertools import chain
 
 import numpy as np
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur, FieldBlur
 from neurocal_cli.detection.fitting.map_fit import MapFit
 from neurocal_cli.detection.fitting.shading import Shading, polynomial_terms
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 _KINDS = (range(1, 2), range(2, 4), range(4, 9))  # columns of the terms of blur, levels and place
 # Insensitive. Excess variance of a map above which terms are tried; chi2 that each must gain, in variances of

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, MEAN, BatchFit
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
-from neurocal_cli.geometry import Array
 
 # Insensitive as long as they admit a ratio of 1 to the prior, and fits of 8 pixels for the smallest squares.
 # tests/test_measuring.py counts the fits of hidden edges that are accepted.

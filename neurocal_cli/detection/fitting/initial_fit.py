@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
 from neurocal_cli.detection.fitting.edge_fit import REACH, SHARP, edge_model, edge_pixels, usual_stride
@@ -13,7 +14,6 @@ from neurocal_cli.detection.fitting.fit_quality import is_typical
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.geometry import Array
 
 # Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
 # of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them 8 times

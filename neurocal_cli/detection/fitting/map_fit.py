@@ -15,10 +15,10 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Insensitive.
 _STEPS = 25  # greatest number

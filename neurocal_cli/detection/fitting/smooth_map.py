@@ -20,8 +20,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 
 _HOMOGRAPHY, _REST = 8, 17  # number of its parameters, and position of the first one after the lens
 _TAU, _K3 = slice(14, 16), 16

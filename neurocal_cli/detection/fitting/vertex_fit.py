@@ -18,6 +18,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     MEAN,
@@ -33,8 +35,6 @@ from neurocal_cli.detection.fitting.shading import Shading, excess_variance
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single, grid_lines, packed, strip_pixels
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 # Positions of the values of a fit: offset [px] and tilt [px over the half length] of the line along c, then
 # of that along r, then the values of `BatchFit`.

@@ -20,10 +20,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.smooth_map import Frame, Places, SmoothMap
 from neurocal_cli.detection.wide_lens import fit_wide_lens
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 
 _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0

@@ -12,8 +12,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.geometry import Array
 
 # Sides of a grid, named by their outward directions (c, r).
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))

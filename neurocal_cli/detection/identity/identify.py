@@ -20,14 +20,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.board import Board, Plane
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.linear_camera import fit_camera, is_flat, rigid_motion
 from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError, ambiguous, wrong_size
 from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Board, Plane
 
 # tests/test_identity.py accepts and refuses rendered boards with these limits.
 _CLEARLY = 3.0  # ratio to the best rms error above which an arrangement is excluded

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 
 _FLAT = 1e-6  # greatest ratio of thickness to extent of points in one plane, for rounding errors
 _WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by this factor

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from neurocal_cli.board import Board
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.observations.board import Board
 
 # Least share of a grid's vertices that are found if it is a whole board. On photographs it is 0.89 and more
 # for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.

@@ -12,11 +12,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from neurocal_cli.board import Plane
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import TURNS, Grid
 from neurocal_cli.detection.identity.ends import End
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Plane
 
 Side = tuple[slice | int, ...]
 

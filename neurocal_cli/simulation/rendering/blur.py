@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 
 _TAIL = 5.7  # standard deviations at which the Gaussian is cut off; 1e-8 of the light is beyond
 _STRIP = 16  # rows processed at a time

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.simulation.rendering.blur import Blur
 from neurocal_cli.simulation.rendering.layers import Composition
 from neurocal_cli.simulation.rendering.scene import Illumination, Scene, Sensor

@@ -13,13 +13,13 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
+from neurocal_cli.observations.board import Board, Plane
 
 
 @frozen_dataclass

@@ -1,0 +1,184 @@
+"""Covariance of a calibrated camera and its poses, for all code that reports or uses it.
+
+It combines the normal matrices with the uncertainty of an estimated target (`uncertainty`), the jackknife
+over views (`view_covariance`), and the model uncertainty of the selected distortion model and target
+(`open_coefficients`, `open_stretch`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, covariance
+from neurocal_cli.adjustment.cross_validation import reduced
+from neurocal_cli.adjustment.normal_equations import solve_scaled
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.solution import TargetPosterior
+from neurocal_cli.adjustment.view_covariance import counting_views
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import Target
+
+if TYPE_CHECKING:
+    from neurocal_cli.adjustment.open_coefficients import OpenCoefficients
+
+
+@frozen_dataclass(eq=False)
+class CameraSeen:
+    """A camera at its minimum, with its observations; the first six fields are as for `counting_views`."""
+
+    views: Views
+    state: CameraState
+    normal: Array  # from `reprojection.normal_blocks`
+    free: NDArray[np.bool_]
+    free_poses: bool
+    repeated: RepeatedPoses
+    points: Correspondences  # with the world coordinates of the estimated target, if any
+    target: Target | None = None  # the estimated target
+    # Function that returns the posterior of the target for a variance of the noise, if there is one already.
+    posterior: Callable[[float], TargetPosterior] | None = None
+    # Candidate models of the distortion selection; empty if the user named the model.
+    choice: Collection[str] = ()
+    shared: Array | None = None  # (f, f) covariance of the free parameters, if it comes from elsewhere
+    by_prior: float = 0.0  # effective number of coefficients that a prior determines instead of the points
+    target_kept: bool = False  # whether the given target was kept although it could have been estimated
+    # From the normal matrices alone, if it is known already and the target is as given.
+    plain: Covariance | None = None
+
+
+@frozen_dataclass(eq=False)
+class WideCovariance:
+    """Covariance of a camera extended by the coefficients that its selected distortion model leaves out.
+
+    The projection is less uncertain than the covariance of the estimated parameters alone suggests, because
+    the open coefficients and the parameters correlated with them compensate.
+
+    `normal` (V, 12 + K, 12 + K) are the normal matrices of the extended camera, and `entries` (f, f) is the
+    covariance of all free parameters, including the open ones.
+    """
+
+    open: OpenCoefficients
+    normal: Array
+    entries: Array
+
+
+@frozen_dataclass(eq=False)
+class CameraCovariance:
+    """Covariance of a camera that was calibrated from points."""
+
+    basis: CovarianceBasis
+    plain: Covariance  # from the normal matrices alone
+    found: Covariance  # with the jackknife over views and the model uncertainty
+    wide: WideCovariance | None = None  # None if the model selection leaves no coefficient open
+    # Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
+    stretched: float = 0.0
+
+
+def camera_covariance(seen: CameraSeen) -> CameraCovariance:
+    """Covariance of a camera at its minimum.
+
+    Raises `numpy.linalg.LinAlgError` if the points do not determine a camera whose target was estimated.
+    """
+    asked = seen.free, seen.free_poses
+    basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared, seen.posterior)
+    plain = seen.plain or covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
+    if basis.poses is not None:
+        plain = replace(plain, poses=basis.poses)
+    if seen.shared is not None:
+        return CameraCovariance(basis, plain, plain)
+    bends = seen.target is not None and seen.target.bends is not None
+    found = counting_views(
+        plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without, bends
+    )
+    known = CameraCovariance(basis, plain, found)
+    kept = seen.target_kept and seen.free_poses and bool(seen.free.any())
+    if not np.isfinite(found.entries).all() or not (seen.choice or kept):
+        return known
+    variance = _variance(seen, basis)
+    if not variance > 0:
+        return known
+    known = _chosen(seen, known, variance) if seen.choice else known
+    return _stretched(seen, known, variance) if kept else known
+
+
+def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
+    """Add the uncertainty from the selection of the distortion model."""
+    from neurocal_cli.adjustment import open_coefficients as coefficients
+
+    views, state = seen.views, seen.state
+    reach = coefficients.radius(views, state)
+    corner = coefficients.corner_radius(
+        state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
+    )
+    richer = coefficients.open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
+    if richer is None:
+        return known
+    state = richer.state(state)
+    normal, _ = normal_blocks(seen.views.batches, state)
+    normal = _basis(seen, state, richer.free, normal).normal
+    q = reduced(normal, richer.free, seen.free_poses)
+    left_out = richer.prior.left_out
+    spread = coefficients.spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    E, follow = spread.E, spread.follow
+    entries = coefficients.wide_covariance(known.found.entries, E, follow, left_out)
+    if not np.isfinite(entries).all():
+        return known
+    poses = known.found.poses
+    if seen.free_poses:
+        columns = camera_columns(len(richer.free) - 5)[np.flatnonzero(richer.free)]
+        gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ follow
+        poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
+    found = replace(known.found, entries=entries[np.ix_(~left_out, ~left_out)], poses=poses)
+    return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
+
+
+def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
+    """Add the uncertainty from keeping the given target."""
+    from neurocal_cli.adjustment.board.open_stretch import open_stretch
+
+    added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
+    if added is None:
+        return known
+    entries, poses = known.found.entries + added.entries, known.found.poses + added.poses
+    found, wide = replace(known.found, entries=entries, poses=poses), known.wide
+    if wide is not None:
+        everything = wide.entries.copy()
+        estimated = ~wide.open.prior.left_out
+        everything[np.ix_(estimated, estimated)] += added.entries
+        wide = replace(wide, entries=everything)
+    return replace(known, found=found, wide=wide, stretched=added.probability)
+
+
+def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
+    """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
+    views = seen.views
+    unknowns = int(seen.free.sum()) + (6 * views.n_views if seen.free_poses else 0)
+    alike = correlation(views, point_residuals(views, seen.state))
+    worth = effective_number(views.n_equations, alike) / views.n_equations * seen.repeated.worth
+    return float(basis.normal[:, -1, -1].sum()) / max(basis.n_equations - unknowns, 1) / worth
+
+
+def _basis(
+    seen: CameraSeen,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    normal: Array,
+    shared: Array | None = None,
+    posterior: Callable[[float], TargetPosterior] | None = None,
+) -> CovarianceBasis:
+    if seen.target is None:
+        return CovarianceBasis(normal, shared, seen.views.n_equations)
+    from neurocal_cli.adjustment.board.uncertainty import covariance_basis
+
+    return covariance_basis(
+        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, posterior
+    )

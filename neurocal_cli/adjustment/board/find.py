@@ -1,0 +1,439 @@
+"""Estimate the target together with the cameras: linearise, solve for the offsets, move, repeat.
+
+Each step solves for cameras, poses and offsets together (`posterior`). At the end, bundle adjustment brings
+cameras and poses to their minimum for the found target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.board.bend_evidence import bends_are_valid, most_probable_precision
+from neurocal_cli.adjustment.board.gauge import nearest_to_given
+from neurocal_cli.adjustment.board.information import (
+    Information,
+    Sight,
+    folded_information,
+    information_of,
+    of_views,
+    steps_of_poses,
+)
+from neurocal_cli.adjustment.board.posterior import (
+    OUT_OF_PLANE,
+    Posterior,
+    evidence_of_given,
+    given_posterior,
+    posterior,
+    posterior_of,
+)
+from neurocal_cli.adjustment.board.prior import SINGLE, prior_of
+from neurocal_cli.adjustment.board.system import WithoutPoses
+from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
+from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.reprojection import CameraState
+from neurocal_cli.adjustment.units import in_pixels, normalised
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.median import median
+from neurocal_cli.observations.bends import N_SHAPES, Bends, surface_of
+from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.target import Target, distinct_points, scale_of_points
+
+_STEPS = 10
+# Unknowns of the dense system: with more than the first, only some views are used; with more than the second,
+# no target is estimated.
+_DENSE, _MOST_DENSE = 600, 3000
+_FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
+_EXACT = 1e-6  # px: smaller residuals are rounding
+_EARLY = 0.5  # share of the required gain that the first step must predict
+_NOT_YET = 5.0  # log evidence that another step may add; without it, 56 sets of all shapes end the same
+_SETTLED = 0.02  # of the cameras' standard deviations
+# Largest offset over the target's size, of one plane and of planes that are set up by hand; more is another
+# target.
+_LARGEST, _LARGEST_OF_FOLDED = 0.02, 0.05
+# Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
+# estimated target below the first limit may move slightly beyond it when the lens is selected again.
+_STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
+_LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0.02 on one in photographs
+_FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
+LEAST_GAIN = 6.0
+"""Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
+most; tests/test_simulated_targets.py (slow) checks that clean sets keep the given target."""
+
+
+@frozen_dataclass(eq=False)
+class Found:
+    """An estimated target, with the problems and their minima for it.
+
+    The points of each problem have the target's coordinates. The log evidence is comparable between
+    distortion models. For a variance of the noise [px^2], `posterior` returns the posterior at this minimum;
+    it is None if not all views were used.
+    """
+
+    target: Target
+    fits: tuple[tuple[Problem, Adjusted], ...]
+    evidence: float
+    posterior: Callable[[float], Posterior] | None = None
+
+
+def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
+    """Whether enough different views show most points to estimate the target.
+
+    One view determines how three planes of a folded target stand; the bend of one plane needs three.
+    """
+    least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
+    return n_different >= least and _median_views(label) >= least
+
+
+def _median_views(label: NDArray[np.intp]) -> float:
+    """Number of views of most points."""
+    return float(median(np.bincount(label[label >= 0]).astype(float)))
+
+
+def find_target(
+    fits: Sequence[tuple[Problem, Adjusted]],
+    flat: bool = False,
+    known: Target | None = None,
+    least_gain: float = -np.inf,
+    least: float = -np.inf,
+) -> Found | None:
+    """Estimate the true positions of a target's points, from cameras at their minimum.
+
+    Points with equal coordinates are the same. Flat means that they stay in their planes. `known` is an
+    estimated target whose coordinates the points have already; the search starts from it. It ends early if
+    the gain in log evidence will be smaller than `least_gain`, or the log evidence than `least`. None if the
+    points do not determine a target, or if the result is too different from the given one.
+    """
+    some = _few_enough(fits, known)
+    if some is None:
+        return None
+    found = Search(some, flat, known).result(least_gain, least)
+    return found if found is None or some is fits else _of_all_views(found, fits, known)
+
+
+def _few_enough(
+    fits: Sequence[tuple[Problem, Adjusted]], known: Target | None
+) -> Sequence[tuple[Problem, Adjusted]] | None:
+    """The fits, with some of their views if a dense system has no room for all; None if for none."""
+    of_poses = 6 * sum(problem.views.n_views for problem, _ in fits)
+    if of_poses <= _DENSE:
+        return fits
+    points = [problem.points if known is None else known.straightened(problem.points) for problem, _ in fits]
+    unknowns = min(3 * len(distinct_points(points)[0]), of_poses)
+    if unknowns > _MOST_DENSE:
+        return None
+    return fits if unknowns <= _DENSE else [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits]
+
+
+def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Logarithm of the evidence of the given target, of the views from which a target would be estimated.
+
+    It is -inf if the points do not determine the cameras.
+    """
+    return evidence_of_views(views_for_target(fits))
+
+
+def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple[Problem, Adjusted]]:
+    """The fits, with the views from which a target would be estimated."""
+    return _few_enough(fits, None) or fits
+
+
+def evidence_of_views(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Log evidence of the given target, of all views; -inf if the points do not determine the cameras."""
+
+    def of_camera(problem: Problem, adjusted: Adjusted) -> Information:
+        """The quadratic of one camera, with fixed target points."""
+        views, no_label = problem.views, np.zeros(0, dtype=np.intp)
+        normal = views.pixel_scale**2 * adjusted.normal
+        return of_views(sight_of(problem, adjusted, no_label), normal, np.ones(views.n_views, dtype=bool))
+
+    try:
+        return evidence_of_given(*(of_camera(*fit) for fit in fits))
+    except np.linalg.LinAlgError:
+        return -np.inf
+
+
+def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
+    """At most `most` views, evenly spaced among all: so many determine the target well enough."""
+    points = problem.points.of_few_views(most)
+    if points is problem.points:
+        return problem, adjusted
+    known = in_pixels(problem, adjusted.state)
+    place = [problem.views.names.index(name) for name in points.view_names]
+    state = replace(known, R=known.R[place], t=known.t[place])
+    return at_world(replace(problem, points=points), adjusted, state, points.world)
+
+
+def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
+    """Apply a target estimated from some views to all views."""
+    moved = []
+    for problem, adjusted in fits:
+        points = problem.points if known is None else known.as_given(problem.points)
+        world = found.target.applied(points).world
+        moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
+    return replace(found, fits=tuple(moved), posterior=None)
+
+
+class Search:
+    """State of the search for a target, with arguments as for `find_target`.
+
+    If it is bending (always if the known target has bends), each view of the only camera has a bend of its
+    own. If it is still, the common points stay as given, so that only the bends are estimated.
+    """
+
+    def __init__(
+        self,
+        fits: Sequence[tuple[Problem, Adjusted]],
+        flat: bool,
+        known: Target | None,
+        bending: bool = False,
+        still: bool = False,
+    ) -> None:
+        self.fits, self.flat = list(fits), flat
+        self.still = still or (known is not None and known.only_bends)
+        worlds = [problem.points.world for problem, _ in fits]
+        self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
+        if known is None:
+            self.given, label, self.ids = distinct_points([problem.points for problem, _ in fits])
+            self.plane = planes_of(self.given, self.ids)
+            self.sizes = None
+        else:
+            self.given, self.ids, self.plane = known.given, known.point, known.plane
+            worlds = [known.straightened(problem.points).world for problem, _ in fits]
+            label = known.rows_of(np.concatenate(worlds))
+            self.sizes = dict(known.sizes)
+        self.label = np.split(label, np.cumsum([len(world) for world in worlds])[:-1])
+        self.prior = prior_of(self.given, self.plane)
+        self.largest = (_LARGEST_OF_FOLDED if self.plane.any() else _LARGEST) * self.prior.size
+        # Errors of points that are seen once look like noise.
+        self.absent = (OUT_OF_PLANE if flat else ()) + (SINGLE if _median_views(label) < 2 else ())
+        found = np.zeros_like(self.given) if known is None else known.offsets
+        self.offsets = self.prior.along_axes(found)
+        bends = None if known is None else known.bends
+        names = self.fits[0][0].views.names
+        self.surface = surface_of(self.given) if bending or bends is not None else None
+        self.bends = np.zeros((len(names), N_SHAPES)) if bends is None else bends.of_views(names)
+        self.precision = 1.0
+
+    def result(self, least_gain: float, least: float = -np.inf) -> Found | None:
+        """As for `find_target`."""
+        try:
+            with np.errstate(all="ignore"):
+                return self._run(least_gain, least)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _run(self, least_gain: float, least: float) -> Found | None:
+        """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
+        noise: float | None = None
+        last = 0.0
+        one_fold = [np.zeros(problem.views.n_views, dtype=np.intp) for problem, _ in self.fits]
+        n_folds = folds_of([problem.views.n_views for problem, _ in self.fits])
+        for step in range(_STEPS):
+            # Without initial sizes, those of the first step are rough.
+            known = self.still or self.sizes is not None
+            folded = folded_information(
+                self.sights(), len(self.given), n_folds if known and not self.still else one_fold
+            )
+            here = folded.whole.turned(self.prior.axes)
+            noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
+            info = self._around_given(here)
+            if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
+                return None
+            parts: list[WithoutPoses] = []
+            if self.still:
+                found = given_posterior(info, self.prior)
+            else:
+                if known:
+                    parts = [
+                        WithoutPoses(part, np.flatnonzero(folded.fold == k))
+                        for k, part in enumerate(folded.parts(info, self._in_offsets))
+                    ]
+                found = posterior(info, self.prior, self.sizes, self.absent, noise, step == 0, parts)
+            if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
+                return None
+            if known and found.evidence < least - _NOT_YET:
+                return None
+            noise = found.variance
+            std = np.sqrt(noise * np.diagonal(found.camera))
+            length = float((np.abs(found.camera_step) / std).max(initial=0.0))
+            # The next step would be shorter than this one by the same factor as this one than the last.
+            settled = known and (length < _SETTLED or length**2 < _SETTLED * last)
+            last = length
+            states = self._moved(found, info)
+            if states is None:
+                return None
+            if settled or step == _STEPS - 1:
+                break
+            self._place(states)
+        assert states is not None
+        without = self._without(info)
+        if found.evidence < max(least, without + least_gain) or not self._adjust(self._aligned(states)):
+            return None
+        if not self._passes_cross_validation(found, parts):
+            return None
+        given = without if self.surface is None else evidence_of_given(info.straight())
+        target = self._target(found, found.evidence - given)
+        stretch, lean = target.sides()
+        if not (max(stretch, target.unequal()) < self.most_stretched and lean < _LEANING):
+            return None
+        return Found(target, tuple(self.fits), found.evidence, self._posterior_of(target, found))
+
+    def _without(self, info: Information) -> float:
+        """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
+        return evidence_of_given(info.straight() if self.still else info)
+
+    def _passes_cross_validation(self, found: Posterior, parts: list[WithoutPoses]) -> bool:
+        if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
+            return False
+        return self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)
+
+    def _around_given(self, info: Information) -> Information:
+        """The quadratic in the whole offsets; with bends, also with their prior of the most probable size."""
+        if self.surface is not None:
+            self.precision = most_probable_precision(info, self.prior.size)
+        return self._held(info.around_given(self.offsets))
+
+    def _held(self, info: Information) -> Information:
+        """With bends, add their prior."""
+        return info if self.surface is None else info.held(self.precision)
+
+    def _posterior_of(self, target: Target, found: Posterior) -> Callable[[float], Posterior]:
+        """The posterior of the estimated target for a variance of the noise [px^2].
+
+        Without bends, that of the last step is taken, which has nearly this variance and alignment.
+        """
+        if self.surface is None:
+            opened = cache(found.opened)
+            return lambda variance: opened()
+        info = self._in_offsets(information_of(self.sights(), len(self.given)))
+        return partial(posterior_of, target, info, self.prior)
+
+    def _in_offsets(self, info: Information) -> Information:
+        """The quadratic around the current target, in the whole offsets along each point's axes."""
+        return info.turned(self.prior.axes).around_given(self.offsets)
+
+    def sights(self) -> list[Sight]:
+        """Observations of each camera for the current target."""
+        sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
+        if self.surface is None:
+            return sights
+        shapes = self.surface.offsets(self._common())
+        return [replace(sight, shapes=shapes, bends=self.bends) for sight in sights]
+
+    def _common(self) -> Array:
+        """(n, 3) current common points of all views."""
+        return self.given + self.prior.in_world(self.offsets)
+
+    def _world(self, k: int) -> Array:
+        """(N, 3) current world coordinates of the points of one fit, with the bend of their view."""
+        common, points = self._common(), self.fits[k][0].points
+        if self.surface is None:
+            return common[self.label[k]]
+        shapes = self.surface.offsets(common)[self.label[k]]
+        return common[self.label[k]] + (shapes @ self.bends[points.view_index][..., None])[..., 0]
+
+    def _moved(self, found: Posterior, info: Information) -> list[CameraState] | None:
+        """Move the target, and return the cameras' predicted states in pixels; None if it moves too far."""
+        if not np.abs(found.offsets).max() < self.largest:
+            return None
+        own = steps_of_poses(info, found.camera_step, found.offsets)
+        if self.surface is not None:
+            self.bends = own[:, 6:]
+            bent = self.surface.offsets(self._common()) @ self.bends.T
+            if not np.abs(bent).max() < self.largest:
+                return None
+        self.offsets, self.sizes = found.offsets, found.sizes
+        return self._predicted(found.camera_step, own[:, :6])
+
+    def _place(self, states: list[CameraState]) -> None:
+        """Take the cameras to states in pixels, and their points to the current target."""
+        self.fits = [
+            placed(*fit, state, self._world(k))
+            for k, (fit, state) in enumerate(zip(self.fits, states, strict=True))
+        ]
+
+    def _adjust(self, states: list[CameraState]) -> bool:
+        """Adjust the cameras to the current target, from states in pixels; whether that succeeded."""
+        self._place(states)
+        self.fits = [(problem, problem.adjust(start)) for problem, start in self.fits]
+        return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
+
+    def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
+        """The state of each camera in pixels after these steps, (f,) and (P, 6), of all."""
+        states, first, view = [], 0, 0
+        for problem, adjusted in self.fits:
+            free, V = np.flatnonzero(problem.free_camera), problem.views.n_views
+            by_camera, by_pose = np.zeros((1, len(problem.free_camera))), np.zeros((V, 6))
+            by_camera[0, free] = camera_step[first : first + len(free)]
+            if problem.free_poses:
+                by_pose[:] = pose_steps[view : view + V]
+                view += V
+            first += len(free)
+            states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
+        return states
+
+    def _nearest(self, world: Array) -> tuple[float, Array, Array]:
+        """Scale, rotation and shift that hold the gauge of the common points (n, 3).
+
+        Measured distances determine the scale, if there are any.
+        """
+        if self.still or not all(problem.free_poses for problem, _ in self.fits):
+            return 1.0, np.eye(3), np.zeros(3)
+        s, R, t = nearest_to_given(world, self.given, self.plane)
+        held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
+        return held * s, R, held * t
+
+    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
+        """Scale, rotate and shift the target, and the cameras with it."""
+        world = self._common()
+        s, R, t = self._nearest(world)
+        self.offsets = self.prior.along_axes(s * world @ R.T + t - self.given)
+        turned = [state.R @ R.T for state in states]
+        return [
+            replace(state, R=own, t=s * state.t - own @ t) for state, own in zip(states, turned, strict=True)
+        ]
+
+    def _target(self, found: Posterior, gain: float) -> Target:
+        axes = self.prior.axes
+        variance = np.einsum("nij,nj->ni", axes**2, found.std**2)
+        bends = None
+        if self.surface is not None:
+            size = float(np.sqrt(found.variance / self.precision))
+            bends = Bends(size, self.fits[0][0].views.names, self.bends)
+        std = np.sqrt(variance)
+        return Target(
+            self.given, self._common(), std, self.plane, found.sizes, self.flat, gain, self.ids, bends=bends
+        )
+
+
+def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:
+    """Observations of a fit's camera; label (N,) in the order of its points."""
+    views = problem.views
+    ordered = label if views.order is None or not len(label) else label[views.order]
+    return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
+
+
+def at_world(
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+) -> tuple[Problem, Adjusted]:
+    """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
+    new, start = placed(problem, adjusted, state, world)
+    return new, new.adjust(start)
+
+
+def placed(
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+) -> tuple[Problem, Adjusted]:
+    """A camera with other world coordinates of its points, at a state in pixels and not adjusted yet."""
+    new = replace(problem.with_points(replace(problem.points, world=world)), penalty=problem.penalty)
+    if not problem.free_distortion and state.model != "none":
+        # The state contains the given distortion, but `with_points` has removed it from the pixels.
+        new = new.with_seen_pixels()
+    return new, replace(adjusted, state=normalised(state, new.views))

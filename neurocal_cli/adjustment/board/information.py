@@ -1,0 +1,463 @@
+"""Normal equations of cameras, poses and target points together.
+
+Each target point has an offset d from its given position, the same in all views. Around a state, the squared
+error is a quadratic in the cameras' free parameters c, the poses q and the offsets d. Different poses are
+coupled only through c and d, and different points only through c and q, so both parts are block diagonal.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.point_batches import PointBatches, batches_of, products
+from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.observations.bends import N_SHAPES
+
+
+@frozen_dataclass(eq=False)
+class Sight:
+    """Observations of the target, at its current world coordinates, by one camera.
+
+    `label` (N,) is the index of the target point of each row, in the order of `views`. With a bend in each
+    view, `shapes` (n, 3, 3) has the offsets of each point for unit coefficients, and `bends` (V, 3) the
+    current coefficients [world unit].
+    """
+
+    views: Views
+    state: CameraState
+    free: NDArray[np.bool_]
+    free_poses: bool
+    label: NDArray[np.intp]
+    shapes: Array | None = None
+    bends: Array | None = None
+
+    def of_views(self, which: NDArray[np.intp]) -> Sight:
+        """The observations of some views."""
+        return self._of(which, self.views.subset(which), np.isin(self.views.index, which))
+
+    def of_points(self, kept: NDArray[np.bool_]) -> Sight:
+        """The observations of some points (N,), in the order of `views`."""
+        return self._of(np.unique(self.views.index[kept]), self.views.of_points(kept), kept)
+
+    def _of(self, which: NDArray[np.intp], views: Views, kept: NDArray[np.bool_]) -> Sight:
+        state = self.state.of_views(which)
+        bends = None if self.bends is None else self.bends[which]
+        return replace(self, views=views, state=state, label=self.label[kept], bends=bends)
+
+
+@frozen_dataclass(eq=False)
+class Information:
+    """Blocks of the normal matrix and the right side: sums of products of derivatives and residuals [px].
+
+    The camera blocks are those of the free parameters of all cameras in sequence, each in its normalised
+    units. With a bend in each view, a pose has p = 9 unknowns: its six, and the three coefficients of the
+    view's whole bend. Otherwise p = 6. The points' unknowns are offsets in the world's axes and unit.
+    """
+
+    camera: Array  # (f, f)
+    camera_right: Array  # (f,)
+    pose: Array  # (P, p, p)
+    pose_camera: Array  # (P, p, f)
+    pose_right: Array  # (P, p)
+    point: Array  # (n, 3, 3)
+    point_camera: Array  # (n, 3, f)
+    point_right: Array  # (n, 3)
+    pose_point: Array  # (P, p, n, 3)
+    cost: float  # sum of squares
+    equations: float
+    log_precision: float = 0.0  # sum of the logarithms of the prior precisions of the bends; see `held`
+
+    @property
+    def spare(self) -> float:
+        """Degrees of freedom: equations minus the unknowns of cameras and poses."""
+        return self.equations - len(self.camera) - 6 * len(self.pose)
+
+    def held(self, precision: float) -> Information:
+        """Add a Gaussian prior of this precision, in units of the noise precision, on the bends."""
+        pose, bends = self.pose.copy(), np.arange(6, self.pose.shape[1])
+        pose[:, bends, bends] += precision
+        return replace(self, pose=pose, log_precision=len(pose) * len(bends) * np.log(precision))
+
+    def around_straight(self, bends: Array) -> Information:
+        """The same quadratic in the whole bends (P, 3) instead of their changes."""
+        by_pose = (self.pose[:, :, 6:] @ bends[..., None])[..., 0]
+        cost = 2 * self.pose_right[:, 6:] + by_pose[:, 6:]
+        return replace(
+            self,
+            camera_right=self.camera_right + np.einsum("pkf,pk->f", self.pose_camera[:, 6:], bends),
+            pose_right=self.pose_right + by_pose,
+            point_right=self.point_right + np.einsum("pkni,pk->ni", self.pose_point[:, 6:], bends),
+            cost=self.cost + float((bends * cost).sum()),
+        )
+
+    def with_poses_of(self, other: Information, which: NDArray[np.bool_] | slice) -> Information:
+        """The same sums, with the blocks of some poses (P,) of another."""
+        return replace(
+            self,
+            pose=other.pose[which],
+            pose_camera=other.pose_camera[which],
+            pose_right=other.pose_right[which],
+            pose_point=other.pose_point[which],
+        )
+
+    def of_cameras(self, kept: NDArray[np.bool_]) -> Information:
+        """The quadratic in some parameters (f,) of the cameras, where the others are held."""
+        return replace(
+            self,
+            camera=self.camera[np.ix_(kept, kept)],
+            camera_right=self.camera_right[kept],
+            pose_camera=self.pose_camera[:, :, kept],
+            point_camera=self.point_camera[:, :, kept],
+        )
+
+    def pose_by(self, offsets: Array) -> Array:
+        """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
+        P, p = self.pose.shape[:2]
+        return (self.pose_point.reshape(P * p, offsets.size) @ offsets.ravel()).reshape(P, p)
+
+    def straight(self) -> Information:
+        """The quadratic without bends."""
+        return replace(
+            self,
+            pose=self.pose[:, :6, :6],
+            pose_camera=self.pose_camera[:, :6],
+            pose_right=self.pose_right[:, :6],
+            pose_point=self.pose_point[:, :6],
+            log_precision=0.0,
+        )
+
+    def turned(self, axes: Array) -> Information:
+        """Express each point's offset in its own axes, the columns of (n, 3, 3)."""
+        transposed = np.swapaxes(axes, 1, 2)
+        if (axes == axes[:1]).all():  # with a single plane one product suffices
+            pose_point = (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
+        else:
+            pose_point = np.einsum("pqni,nij->pqnj", self.pose_point, axes)
+        return replace(
+            self,
+            point=transposed @ self.point @ axes,
+            point_camera=transposed @ self.point_camera,
+            point_right=(transposed @ self.point_right[..., None])[..., 0],
+            pose_point=pose_point,
+        )
+
+    def around_given(self, offsets: Array) -> Information:
+        """The same quadratic in the whole offsets (n, 3) instead of their changes."""
+        by_point = (self.point @ offsets[..., None])[..., 0]
+        return replace(
+            self,
+            camera_right=self.camera_right + np.einsum("nif,ni->f", self.point_camera, offsets),
+            pose_right=self.pose_right + self.pose_by(offsets),
+            point_right=self.point_right + by_point,
+            cost=self.cost + float((offsets * (2 * self.point_right + by_point)).sum()),
+        )
+
+
+@frozen_dataclass(eq=False)
+class FoldedInformation:
+    """Information of all views, and of each fold of the views."""
+
+    whole: Information
+    sums: list[Information]  # of each fold, without the blocks of its poses
+    fold: NDArray[np.intp]  # (P,) of each pose
+
+    def parts(self, whole: Information, change: Callable[[Information], Information]) -> list[Information]:
+        """Information of each fold after a change; that of all views has been changed already."""
+        return [change(some).with_poses_of(whole, self.fold == k) for k, some in enumerate(self.sums)]
+
+
+def information_of(sights: Sequence[Sight], n_points: int) -> Information:
+    """Sum over the observations of all cameras; each camera has its own free parameters and poses."""
+    one_fold = [np.zeros(sight.views.n_views, dtype=np.intp) for sight in sights]
+    return folded_information(sights, n_points, one_fold).whole
+
+
+def folded_information(
+    sights: Sequence[Sight], n_points: int, folds: Sequence[NDArray[np.intp]]
+) -> FoldedInformation:
+    """The same, and the sums over each fold; `folds` (V,) are the folds of each camera's views, from 0."""
+    n_folds = 1 + max(int(fold.max()) for fold in folds)
+    widths = [int(sight.free.sum()) for sight in sights]
+    poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
+    f, P = sum(widths), sum(poses)
+    p = 6 if sights[0].shapes is None else 6 + N_SHAPES
+    found = Information(  # the sums have one more axis, for the folds
+        np.zeros((n_folds, f, f)), np.zeros((n_folds, f)), np.zeros((P, p, p)), np.zeros((P, p, f)),
+        np.zeros((P, p)), np.zeros((n_folds, n_points, 3, 3)), np.zeros((n_folds, n_points, 3, f)),
+        np.zeros((n_folds, n_points, 3)), np.zeros((P, p, n_points, 3)), 0.0, 0.0,
+    )  # fmt: skip
+    cost, equations, of_poses = np.zeros(n_folds), np.zeros(n_folds), []
+    ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
+    for sight, of_views, width, count, (end, last) in zip(sights, folds, widths, poses, ends, strict=True):
+        cost += _add(found, sight, slice(end - width, end), slice(last - count, last), of_views)
+        equations += np.bincount(of_views, sight.views.equations, n_folds)
+        of_poses.append(of_views[:count])
+    fold = np.concatenate(of_poses)
+    bends = [sight.bends for sight in sights if sight.bends is not None]
+
+    def sums(taken: Callable[[Array], Any], of: NDArray[np.bool_] | slice) -> Information:
+        info = replace(
+            found.with_poses_of(found, of),
+            camera=taken(found.camera),
+            camera_right=taken(found.camera_right),
+            point=taken(found.point),
+            point_camera=taken(found.point_camera),
+            point_right=taken(found.point_right),
+            cost=float(taken(cost)),
+            equations=float(taken(equations)),
+        )
+        return info.around_straight(np.concatenate(bends)[of]) if bends else info
+
+    whole = sums(lambda values: values.sum(axis=0), slice(None))
+    of_folds = []
+    for k in range(n_folds):
+        own = fold == k if bends else slice(0)  # bends add products with the blocks of poses to the sums
+        of_folds.append(sums(operator.itemgetter(k), own).with_poses_of(found, slice(0)))
+    return FoldedInformation(whole, of_folds, fold)
+
+
+def steps_of_poses(info: Information, camera_step: Array, offsets: Array) -> Array:
+    """(P, p) steps of the poses, and whole bends, given steps of the cameras (f,) and offsets (n, 3)."""
+    right = info.pose_right - info.pose_camera @ camera_step - info.pose_by(offsets)
+    return np.asarray(np.linalg.solve(info.pose, right[..., None])[..., 0])
+
+
+def joined(parts: Sequence[Information]) -> Information:
+    """Sum over parts of the views of the same cameras."""
+    blocks: dict[str, Any] = {}
+    for field in fields(Information):
+        own = [getattr(part, field.name) for part in parts]
+        blocks[field.name] = np.concatenate(own) if field.name.startswith("pose") else sum(own)
+    return Information(**blocks)
+
+
+def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> Array:
+    """Add the observations of one camera to the sums of the folds (V,) of its views; return their costs."""
+    views = sight.views
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    label, (n_folds, n_points) = labelled(views, sight.label), found.point.shape[:2]
+    # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
+    cross = found.pose_point[poses] if sight.free_poses else None
+    terms = folded_terms(
+        views.batches, sight.state, views.scale, label, columns, n_points, fold, n_folds, sight.shapes, cross
+    )
+    normal, px2 = terms.normal, views.pixel_scale**2
+    by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
+    found.camera[:, own, own] += by_fold[:, columns[:, None], columns]
+    found.camera_right[:, own] += by_fold[:, columns, -1]
+    found.point[...] += px2 * terms.point
+    found.point_camera[..., own] += px2 * terms.point_camera
+    found.point_right[...] += px2 * terms.point_right
+    if sight.free_poses:
+        of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
+        found.pose[poses] = px2 * normal[:, of_pose[:, None], of_pose]
+        found.pose_camera[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
+        found.pose_right[poses] = px2 * normal[:, of_pose, -1]
+        found.pose_point[poses] *= px2
+    return np.asarray(by_fold[:, -1, -1])
+
+
+@frozen_dataclass(eq=False)
+class PointTerms:
+    """Sums of products with the derivatives by the target points, for one camera, normalised.
+
+    `normal` (V, 12 + K, 12 + K) is as from `normal_blocks`; with bends, it has three columns for them before
+    the residual. The rest is as in `Information`; from `folded_terms`, sums over views have one more axis.
+    """
+
+    normal: Array
+    point: Array
+    point_camera: Array
+    point_right: Array
+    pose_point: Array
+
+
+def point_terms(
+    batches: PointBatches,
+    state: CameraState,
+    scale: Array,
+    label: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    n_points: int,
+    shapes: Array | None = None,
+) -> PointTerms:
+    """Sums of one camera over its observations of `n_points` target points.
+
+    `scale` (V,) is S2 of each view, `label` (T, n) from `labelled`, `columns` (f,) those of the camera's free
+    parameters, and `shapes` as in `Sight`.
+    """
+    fold = np.zeros(batches.n_views, dtype=np.intp)
+    terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1, shapes)
+    return replace(
+        terms, point=terms.point[0], point_camera=terms.point_camera[0], point_right=terms.point_right[0]
+    )
+
+
+def folded_terms(
+    batches: PointBatches,
+    state: CameraState,
+    scale: Array,
+    label: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    n_points: int,
+    fold: NDArray[np.intp],
+    n_folds: int,
+    shapes: Array | None = None,
+    out: Array | None = None,
+) -> PointTerms:
+    """The same sums over each of `n_folds` folds (V,) of the views.
+
+    `out` (V, p, n, 3) are zeros that become those of poses and points.
+    """
+    f, V, by_batch = len(columns), batches.n_views, blocks_by_batch(batches, state, shapes)
+    whole = by_batch.shape[1]
+    of_pose = pose_columns(whole, shapes is not None)
+    p, kept = len(of_pose), np.append(columns, whole - 1)
+    once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
+    alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
+    summed = np.zeros((n_folds, n_points, 3, f + 4))
+    cross = np.zeros((V, p, n_points, 3)) if out is None else out
+    for chunk, part, by_point in linearised(batches, state, scale, label[:1] if alike else label, shapes):
+        view, seen = batches.view[chunk], label[chunk]
+        products(part, by_batch[chunk])
+        rows = np.concatenate([by_point, part[:, kept]], axis=1)
+        crossed = np.swapaxes(_of_each(part[:, of_pose], by_point), 2, 3)  # (T, p, n, 3)
+        if alike:
+            own, rows = by_point.transpose(3, 1, 0, 2), rows.transpose(3, 0, 2, 1)
+            n = len(own)
+            for k in range(n_folds):
+                of = fold[view] == k if n_folds > 1 else slice(None)
+                summed[k, seen[0]] += own[:, :, of].reshape(n, 3, -1) @ rows[:, of].reshape(n, -1, f + 4)
+            cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
+            continue
+        real = seen >= 0
+        every, flat = np.moveaxis(_of_each(by_point, rows), 3, 1)[real], seen[real]
+        place = (fold[view][:, None] * n_points + seen)[real]
+        summed += _summed_by(place, every.reshape(len(flat), -1), n_folds * n_points).reshape(summed.shape)
+        places = np.broadcast_to(view[:, None], real.shape)[real], flat
+        each = np.swapaxes(crossed, 1, 2)[real]
+        if once:
+            np.swapaxes(cross, 1, 2)[places] = each
+        else:
+            np.add.at(np.swapaxes(cross, 1, 2), places, each)
+    return PointTerms(
+        batches.sum_by_view(by_batch), summed[..., :3], summed[..., 3:-1], summed[..., -1], cross
+    )
+
+
+def _is_once(label: NDArray[np.intp]) -> bool:
+    """Whether no batch contains a point twice."""
+    ordered = np.sort(label, axis=1)
+    return not ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any()
+
+
+def _of_each(a: Array, b: Array) -> Array:
+    """(T, i, j, n) products of rows (T, i, 2, n) and (T, j, 2, n) of each point, summed over u and v."""
+    product = a[:, :, None, 0] * b[:, None, :, 0]
+    product += a[:, :, None, 1] * b[:, None, :, 1]
+    return np.asarray(product)
+
+
+def without_points(sight: Sight) -> Array:
+    """(V, w, w) normal matrices of one camera's views [px], with the columns of `PointTerms.normal`."""
+    views, state = sight.views, sight.state
+    label, by_batch = labelled(views, sight.label), blocks_by_batch(views.batches, state, sight.shapes)
+    for chunk, part, _ in linearised(views.batches, state, views.scale, label, sight.shapes):
+        products(part, by_batch[chunk])
+    return views.pixel_scale**2 * views.batches.sum_by_view(by_batch)
+
+
+def linearised(
+    batches: PointBatches, state: CameraState, scale: Array, label: NDArray[np.intp], shapes: Array | None
+) -> Iterator[tuple[slice, Array, Array]]:
+    """Chunks of batches, their rows of derivatives and residuals, and the derivatives by the points.
+
+    With bends (`shapes`), the rows have those by each view's bend. A single row of labels holds for all
+    batches. The rows are overwritten in the next chunk.
+    """
+    buffer = batches.memory(12 + len(state.k))
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part[:, :-1])
+        by_point = _by_world(part, state, scale, view)
+        if shapes is not None:
+            part = _with_bends(part, by_point, shapes[label if len(label) == 1 else label[chunk]])
+        yield chunk, part, by_point
+
+
+def blocks_by_batch(batches: PointBatches, state: CameraState, shapes: Array | None) -> Array:
+    """Memory for the normal matrices of all batches; with bends, with three more columns."""
+    whole = 12 + len(state.k) + (0 if shapes is None else N_SHAPES)
+    return np.empty((len(batches.view), whole, whole))
+
+
+def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
+    """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
+    N = normal[which]
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N) if sight.free_poses else 0
+    p, f = len(of_pose), len(columns)
+    camera, own = N.sum(axis=0), N[:P]
+    found = Information(
+        camera[columns[:, None], columns], camera[columns, -1],
+        own[:, of_pose[:, None], of_pose], own[:, of_pose[:, None], columns], own[:, of_pose, -1],
+        np.zeros((0, 3, 3)), np.zeros((0, 3, f)), np.zeros((0, 3)), np.zeros((P, p, 0, 3)),
+        float(camera[-1, -1]), float(sight.views.equations[which].sum()),
+    )  # fmt: skip
+    return found if sight.bends is None else found.around_straight(sight.bends[which])
+
+
+def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
+    """Columns of a view's own unknowns in normal matrices of this width: omega, tau, and bends if any."""
+    last = np.arange(width - 1 - N_SHAPES, width - 1) if bends else np.arange(0)
+    return np.concatenate([np.arange(POSE.start, POSE.stop), last])
+
+
+def _with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
+    """(T, width + 4, 2, n) derivatives with those by the view's bend before the residual.
+
+    `shapes` (T, n, 3, 3) or (1, n, 3, 3) are the offsets of the points for unit coefficients.
+    """
+    along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
+    by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
+    return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
+
+
+def _by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
+    """(T, 3, 2, n) derivatives by the world's coordinates, from those of `derivatives`.
+
+    d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
+    """
+    turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
+    by_tau = part[:, POSE.start + 3 : POSE.stop]
+    return np.asarray((turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape))
+
+
+def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
+    numbers = np.column_stack([label, label]).astype(float)
+    laid = batches_of(views.local, numbers, None, views.index, views.n_views)
+    found = np.rint(laid.pixels[:, 0]).astype(np.intp)
+    if laid.whitening is not None:
+        found[laid.whitening[:, 0] == 0] = -1
+    return found
+
+
+def _summed_by(label: NDArray[np.intp], rows: Array, n: int) -> Array:
+    """(n, m) sums of the rows (N, m) with the same label."""
+    order = np.argsort(label, kind="stable")
+    ordered = label[order]
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    out = np.zeros((n, rows.shape[1]))
+    out[ordered[first]] = np.add.reduceat(rows[order], first, axis=0)
+    return out

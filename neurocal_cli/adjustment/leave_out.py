@@ -1,0 +1,101 @@
+"""Leave groups of data out of a least-squares fit without fitting again.
+
+At the minimum the error of each group g is nearly a quadratic in the unknowns p that the groups share,
+
+    E_g(p + d) = c_g - 2 g_g . d + d^T S_g d,
+
+with the group's own unknowns eliminated (Schur complement). With S and g summed over all groups, the minimum
+without a set F of groups is d = (S - S_F)^-1 (g - g_F). It and its error on the groups left out follow from
+these few small matrices: exactly if the problem is linear, otherwise to second order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.normal_equations import unit_diagonal
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+
+_REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal that is not mere rounding
+# Undetermined unknowns become inf or nan; the results are tested for that.
+_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+@frozen_dataclass(eq=False)
+class Quadratics:
+    """Squared errors of G groups as quadratic functions of the f unknowns that they share."""
+
+    S: Array  # (G, f, f)
+    g: Array  # (G, f)
+    cost: Array  # (G,)
+
+    @_quietly
+    def at(self, step: Array) -> Array:
+        """(G,) error of each group after a step (f,), or a step of its own (G, f)."""
+        step = np.broadcast_to(step, self.g.shape)
+        square = (step * (self.S @ step[..., None])[..., 0]).sum(axis=-1)
+        return np.asarray(self.cost - 2 * (self.g * step).sum(axis=-1) + square)
+
+    def summed(self, member: Array) -> tuple[Array, Array]:
+        """S (F, f, f) and g (F, f) of sets of groups; member (F, G) is 1 where a group belongs to a set."""
+        return np.einsum("fg,gij->fij", member, self.S), member @ self.g
+
+    @_quietly
+    def steps(self, member: Array, penalty: tuple[Array, Array] | None = None) -> Array:
+        """Steps (F, f) to the minimum over F sets of groups; nan where a set does not determine the unknowns.
+
+        `member` (F, G) is 1 where a group belongs to a set, 0 elsewhere. `penalty` is a prior, (f, f) and
+        (f,), added to the matrix and to the right side.
+        """
+        S, g = self.summed(member)
+        return solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])
+
+    @_quietly
+    def held_out(self, fold: NDArray[np.intp], penalty: tuple[Array, Array] | None = None) -> Array:
+        """(G,) error of each group with the unknowns estimated from all groups outside its fold (G,)."""
+        member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
+        return self.at(self.steps(1.0 - member, penalty)[fold])
+
+    @_quietly
+    def moves_without_each(self) -> Array:
+        """(G, f) how far the unknowns move when one group is left out."""
+        return solve_or_nan(self.S.sum(axis=0) - self.S, self.g.sum(axis=0) - self.g)
+
+    @_quietly
+    def cost_without_each(self) -> Array:
+        """(G,) error of all other groups, fitted again without the group."""
+        gained = ((self.g.sum(axis=0) - self.g) * self.moves_without_each()).sum(axis=-1)
+        return np.asarray(self.cost.sum() - self.cost - gained)
+
+
+def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
+    """(G,) fold of each group, assigned in turn; with at most `n_folds` groups each is a fold of its own."""
+    return np.arange(n_groups) % n_folds if n_groups > n_folds else np.arange(n_groups)
+
+
+def solve_or_nan(S: Array, g: Array) -> Array:
+    """S^-1 g of a stack (..., f, f), (..., f); nan where S is singular to rounding."""
+    return _solved(S, g[..., None])[..., 0]
+
+
+def inverse_or_nan(S: Array) -> Array:
+    """S^-1 of symmetric matrices (..., n, n); nan where they are singular to rounding."""
+    return _solved(S, np.broadcast_to(np.eye(S.shape[-1]), S.shape))
+
+
+@_quietly
+def _solved(S: Array, right: Array) -> Array:
+    """S^-1 times right sides (..., f, m)."""
+    if right.size == 0:
+        return np.zeros(right.shape)
+    scaled, scale = unit_diagonal(S)
+    usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    if usable.any():
+        usable[usable] = np.linalg.eigvalsh(scaled[usable])[..., 0] > _REGULAR
+    solved = np.full(right.shape, np.nan)
+    if usable.any():
+        scale = scale[..., None]
+        solved[usable] = scale[usable] * np.linalg.solve(scaled[usable], (scale * right)[usable])
+    return solved

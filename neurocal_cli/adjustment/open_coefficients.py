@@ -1,0 +1,251 @@
+"""Uncertainty of the camera that comes from the selection of its distortion model.
+
+A selected model may lack coefficients that the real lens has: p1 and p2 are correlated with the image centre,
+k3 with k1 and k2. Or it has them only because noise made them large. All these coefficients are called open
+here. Each group of them is either absent or has a Gaussian prior, whose width is three times or a third of
+the typical size in real lenses, the same factor for all groups (spike and slab, George and McCulloch 1993).
+To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
+probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
+reported values (0 if they were left out), and T = dc/do the response of the camera parameters c. Then
+
+    E = sum_m w_m (P_m + (o_m - o_r) (o_m - o_r)^T),    added(c, o) = [T; 1] E [T; 1]^T
+
+is the term that Bayesian model averaging (Hoeting et al. 1999) adds to the covariance for known o, around the
+reported parameters of the selected model. The covariance of the selected model already contains the noise of
+the open coefficients that it estimates, so only the part of E beyond it is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.reprojection import CameraState
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import in_cameras
+
+# For each group of coefficients that are present or absent together: the power of the radius, and the prior
+# std of their term as a share of the radius in the farthest corner of the image. At the farthest points of
+# four real cameras the shares are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007, and in the corners
+# up to three times as large. Repeated by tests/test_choice_uncertainty.py (slow: 200 draws).
+_POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
+_FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
+_STEEPEST = 1.55  # rad
+_NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
+_ODDS = {1.0: 3.0}  # prior odds that a group of the typical size is present
+_SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
+
+
+@frozen_dataclass(eq=False)
+class OpenPrior:
+    """Prior of the open unknowns."""
+
+    is_open: NDArray[np.bool_]  # (f,) which of the free unknowns are open
+    left_out: NDArray[np.bool_]  # (f,) which of these were not estimated
+    value: Array  # (o,) reported values of the open unknowns; 0 if they were left out
+    size: Array  # (o,) prior std of the open unknowns around 0, if they are present
+    groups: tuple[NDArray[np.intp], ...]  # indices of open unknowns that are present or absent together
+    # For each group, the factors of its size that it may have, and the prior odds of each over its absence.
+    odds: tuple[Mapping[float, float], ...]
+    scales: tuple[float, ...] = _SCALES  # common factors of all sizes, equally probable
+
+
+@frozen_dataclass(eq=False)
+class SpreadOfOpen:
+    """Posterior of the open unknowns o."""
+
+    # (o, o) term to add to the estimated covariance of the open unknowns, which is 0 for those left out; nan
+    # if the points do not determine those that were estimated.
+    E: Array
+    follow: Array  # (f, o) [T; 1], the response of all free unknowns to the open ones
+    probability: float  # posterior probability that any group is present
+
+
+@frozen_dataclass(eq=False)
+class OpenCoefficients:
+    """A camera extended by the coefficients that its selected model leaves out."""
+
+    model: str  # the richer model
+    k: Array  # (K,) its coefficients; those left out are 0
+    free: NDArray[np.bool_]  # (5 + K,) free entries of A and coefficients, including those left out
+    prior: OpenPrior
+
+    def state(self, state: CameraState) -> CameraState:
+        """The same camera, expressed in the richer model."""
+        return replace(state, model=self.model, k=self.k)
+
+
+def radius(views: Views, state: CameraState) -> float:
+    """Undistorted normalised radius of the point farthest from the axis; at most that of 89 degrees."""
+    return _farthest((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index])
+
+
+def _farthest(seen: Array) -> float:
+    return float(np.tan(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).clip(max=_STEEPEST).max()))
+
+
+def corner_radius(
+    entries: Array, pixel_centre: Array, pixel_scale: float, size: tuple[int, int] | None
+) -> float:
+    """Distorted radius of the farthest corner in normalised image coordinates; 0 without an image size.
+
+    `entries` (5,) are those of A, normalised by `pixel_centre` and `pixel_scale`; `size` is width and height.
+    """
+    if size is None:
+        return 0.0
+    a11, a12, a22, a13, a23 = entries
+    u, v = np.meshgrid([0.0, size[0] - 1.0], [0.0, size[1] - 1.0])
+    y = ((v - pixel_centre[1]) / pixel_scale - a23) / a22
+    x = ((u - pixel_centre[0]) / pixel_scale - a13 - a12 * y) / a11
+    return float(np.hypot(x, y).max())
+
+
+def fisheye_sizes(far: float) -> Array:
+    """(4,) prior standard deviations of k1 to k4 for lenses that reach the angle `far` [rad]."""
+    return np.array([share / far**power for _, power, share in _FISHEYE])
+
+
+def log_prior(state: CameraState, first: int, reach: float) -> float:
+    """Logarithm of the prior density of the coefficients of a polynomial model, from the `first` on.
+
+    A uniform density of 1, which the evidence of a target has for all cameras, is far too wide for them.
+    `first` is the number of coefficients that are not counted. `state` is normalised, and `reach` is the
+    `radius` of the farthest point.
+    """
+    names = coefficient_names(state.model)
+    size = {name: share / reach**power for members, power, share in _POLYNOMIAL for name in members}
+    width = _SCALES[0] * np.array([size[name] for name in names[first:]])
+    return float(-(0.5 * (state.k[first:] / width) ** 2 + np.log(np.sqrt(2 * np.pi) * width)).sum())
+
+
+def open_coefficients(
+    model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
+) -> OpenCoefficients | None:
+    """Open coefficients of a selected distortion model with coefficients k (K,); None if there are none.
+
+    `free` (5 + K,) tells which of A's entries and the coefficients were estimated. `choice` contains the
+    candidate models of the selection; it is empty if the user named the model. `reach` is the `radius` of the
+    farthest point, and `corner` the `corner_radius`.
+    """
+    own = coefficient_names(model)
+    richer = (
+        model if model == "fisheye" else next((m for m in POLYNOMIAL_MODELS[::-1] if m in choice), "none")
+    )
+    names = coefficient_names(richer)
+    if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
+        return None
+    value = dict(zip(own, k.tolist(), strict=True))
+    estimated = {name for name, is_free in zip(own, free[5:].tolist(), strict=True) if is_free}
+    wide = richer == "fisheye"
+    may_be_noise = () if wide else _NOISE_MAY_MAKE
+    open_names = [name for name in names if name not in estimated or name in may_be_noise]
+    if not open_names:
+        return None
+    far = max(float(np.arctan(reach)) if wide else reach, corner)
+    size, groups = np.zeros(len(open_names)), []
+    for members, power, share in _FISHEYE if wide else _POLYNOMIAL:
+        places = [open_names.index(name) for name in members if name in open_names]
+        size[places] = share / far**power
+        if places:
+            groups.append(np.array(places))
+    everything = np.append(free[:5], np.ones(len(names), dtype=bool))
+    is_open, left_out = (
+        np.array([False] * 5 + [name in some for name in names])[everything]
+        for some in (open_names, set(names) - estimated)
+    )
+    reported = np.array([value.get(name, 0.0) for name in names])
+    prior = OpenPrior(
+        is_open,
+        left_out,
+        np.where(left_out, 0.0, np.append(np.zeros(int(free[:5].sum())), reported))[is_open],
+        size,
+        tuple(groups),
+        (_ODDS,) * len(groups),
+    )
+    return OpenCoefficients(richer, reported, everything, prior)
+
+
+def open_of_calibration(
+    calibration: Calibration, free: NDArray[np.bool_], k: Array | None = None
+) -> OpenCoefficients | None:
+    """Open coefficients of a calibrated camera's distortion model; None if there are none.
+
+    The calibration must have its points and poses. `free` (5 + K,) tells which of A's entries and the
+    coefficients were estimated. `k` (K,) are coefficients of the same model, if they differ from those of the
+    calibration.
+    """
+    points, camera = calibration.points, calibration.camera
+    poses = [calibration.views[name].pose for name in points.view_names]
+    reach = _farthest(in_cameras(poses, points.world, points.view_index))
+    corner = corner_radius(np.array(camera.entries), np.zeros(2), 1.0, points.image_size)
+    k = camera.distortion.coefficients if k is None else k
+    return open_coefficients(camera.distortion.model, k, free, tuple(calibration.lens_choice), reach, corner)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
+    """Posterior of the open unknowns by model averaging.
+
+    S (f, f) is the normal matrix of the free unknowns with the poses eliminated, and g (f,) its right side,
+    J^T r, at the reported values. `variance` is that of the residuals, enlarged if they are correlated.
+    """
+    c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
+    T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
+    # Schur complement: J^T J and J^T r of the open unknowns at 0, with all others eliminated.
+    left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) / variance
+    right = (g[o] + T.T @ g[c]) / variance + left @ prior.value
+    size, logarithm, is_none = _models(prior)
+    # In units of the prior; nan if rounding dominates.
+    P = inverse_or_nan(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])
+    mean = (P @ (size * right)[..., None])[..., 0]
+    logarithm = logarithm + 0.5 * (size * right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
+    weight = np.exp(logarithm - logarithm.max())
+    weight /= weight.sum()
+    away = size * mean - prior.value
+    second = size[:, :, None] * P * size[:, None, :] + away[:, :, None] * away[:, None, :]
+    E = _beyond(np.einsum("m,mij->ij", weight, second), left, prior.left_out[prior.is_open])
+    follow = np.zeros((len(prior.is_open), len(o)))
+    follow[c], follow[o] = T, np.eye(len(o))
+    return SpreadOfOpen(E, follow, float(1.0 - weight[is_none].sum()))
+
+
+def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Prior std (m, o) of the open unknowns in each model, 0 if absent; log prior; whether all are absent."""
+    states = [({0.0: 1.0} | dict(own)).items() for own in prior.odds]
+    factors, odds = np.moveaxis(np.array(list(product(*states))), 2, 0)  # (m, number of groups)
+    size = np.zeros((len(prior.scales), len(factors), len(prior.size)))
+    for group, own in zip(prior.groups, factors.T, strict=True):
+        size[..., group] = np.multiply.outer(prior.scales, np.outer(own, prior.size[group]))
+    n = len(prior.scales)
+    logarithm, is_none = np.log(odds).sum(axis=1), ~factors.any(axis=1)
+    return size.reshape(n * len(factors), -1), np.tile(logarithm, n), np.tile(is_none, n)
+
+
+def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
+    """(o, o) part of the second moment beyond the covariance of the estimated unknowns; never negative."""
+    if left_out.all():
+        return second
+    more, own = second.copy(), np.ix_(~left_out, ~left_out)
+    more[own] -= inverse_or_nan(left[own])
+    if not np.isfinite(more).all():
+        return np.full_like(second, np.nan)
+    scale = unit_diagonal(second)[1]
+    values, vectors = np.linalg.eigh(more * scale[:, None] * scale)
+    return np.asarray((vectors * values.clip(min=0.0)) @ vectors.T / scale[:, None] / scale)
+
+
+def wide_covariance(entries: Array, E: Array, follow: Array, left_out: NDArray[np.bool_]) -> Array:
+    """(f, f) covariance of all free unknowns: that of the estimated ones plus the spread of the open ones."""
+    wide = follow @ E @ follow.T
+    wide[np.ix_(~left_out, ~left_out)] += entries
+    return np.asarray(wide)

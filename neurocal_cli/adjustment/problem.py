@@ -1,0 +1,329 @@
+"""A calibration problem: the points, and the given parameters of the camera (the paper's section 4.1).
+
+Given are: type 1: nothing. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
+Type 4: the extrinsics, V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted, Penalty, adjust
+from neurocal_cli.adjustment.reprojection import CameraState
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, rotation_to_axis
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRIES, image_points, undistorted_pixels
+from neurocal_cli.camera.rich_lens import FIRST_NODE
+from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.observations.points import Correspondences
+
+_LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's mean direction
+_LARGEST = 1e9  # px; no image is larger
+# Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
+_RIM, _HALVINGS = 0.02, 30
+
+
+@frozen_dataclass(eq=False)
+class Problem:
+    """Which parameters are estimated from which points."""
+
+    points: Correspondences
+    # The same points, normalised. A given distortion is removed from their pixels, because the networks model
+    # a pinhole; `with_seen_pixels` restores it.
+    views: Views
+    type: int
+    entries: Array  # (5,) A11, A12, A22, A13, A23 [px]; only the given ones are meaningful
+    free: NDArray[np.bool_]  # (5,) entries to estimate
+    poses: Mapping[str, Pose] | None  # the given poses by view
+    # Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
+    fixed: frozenset[str]
+    intrinsics: Intrinsics | None  # the given intrinsics of type 3, returned unchanged
+    distortion: Distortion  # the final distortion model, with its coefficients if they are given
+    free_distortion: bool  # whether the coefficients that are not fixed are estimated
+    # Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's prior,
+    # which holds for any points.
+    penalty: Penalty | None = None
+    # If a given wide lens is removed, each view has a pinhole that looks at its target: rotations (V, 3, 3)
+    # from the camera's frame to that pinhole's. None after `with_seen_pixels`.
+    turned: Array | None = None
+
+    @property
+    def free_camera(self) -> NDArray[np.bool_]:
+        """(5 + K,) which of A's entries and of the distortion coefficients are estimated."""
+        coefficients = [
+            self.free_distortion and name not in self.fixed
+            for name in coefficient_names(self.distortion.model)
+        ]
+        return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
+
+    @property
+    def free_of_prior(self) -> NDArray[np.bool_]:
+        """`free_camera` without the nodes of a rich lens, which its prior determines where points do not."""
+        free = self.free_camera
+        if self.distortion.model == "rich":
+            free[5 + FIRST_NODE :] = False
+        return free
+
+    @property
+    def free_poses(self) -> bool:
+        """Whether the poses are estimated."""
+        return self.poses is None
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of unknowns that the points must determine without a prior."""
+        return int(self.free_of_prior.sum()) + (6 * self.views.n_views if self.free_poses else 0)
+
+    @property
+    def given_centre(self) -> Array | None:
+        """(2,) the image centre [px] if it is given, else None."""
+        return None if self.free[3] else self.entries[3:]
+
+    @property
+    def normalised_entries(self) -> Array:
+        """The given entries in normalised pixels, ``S1^-1 A``; (5,). The free ones are meaningless."""
+        scaled = self.entries.copy()
+        scaled[3:] -= self.views.pixel_centre
+        return scaled / self.views.pixel_scale
+
+    def matrix(self, entries: Array) -> Array:
+        """A [px] from normalised entries; given entries come back exactly as given."""
+        pixels = entries * self.views.pixel_scale
+        pixels[3:] += self.views.pixel_centre
+        return intrinsic_matrix(np.where(self.free, pixels, self.entries))
+
+    def with_points(self, points: Correspondences) -> Problem:
+        """The same problem with other points.
+
+        Raises InputError if the given distortion maps no ray to one of the pixels, and
+        DegenerateGeometryError if all pixels coincide.
+        """
+        if self.free_distortion:
+            views, turned = arrange(points), None
+        else:
+            views, turned = _undistorted_views(points, self.distortion, self.entries)
+        penalty = self.penalty if self.distortion.model == "rich" else None
+        return replace(self, points=points, views=views, turned=turned, penalty=penalty)
+
+    def with_model(self, model: str) -> Problem:
+        """The same points with another distortion model to estimate."""
+        # Fixed coefficients belong to the previous model.
+        fixed = self.fixed & set(INTRINSIC_NAMES)
+        return replace(
+            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, penalty=None
+        )
+
+    def with_seen_pixels(self) -> Problem:
+        """The same problem with the observed (distorted) pixels, normalised as before."""
+        views = self.views
+        order = slice(None) if views.order is None else views.order
+        pixels = (self.points.pixels[order] - views.pixel_centre) / views.pixel_scale
+        return replace(self, views=replace(views, pixels=pixels), turned=None)
+
+    def as_seen(self, state: CameraState) -> tuple[Problem, CameraState]:
+        """Undo the removal of a given distortion: the problem with observed pixels, and its state."""
+        state = replace(state, model=self.distortion.model, k=self.distortion.coefficients)
+        if self.turned is not None:
+            back = np.swapaxes(self.turned, 1, 2)
+            state = replace(state, R=back @ state.R, t=(back @ state.t[..., None])[..., 0])
+        return self.with_seen_pixels(), state
+
+    def adjust(
+        self,
+        start: CameraState | Adjusted,
+        max_iterations: int = OPTIONS.max_iterations,
+        damping: float = OPTIONS.damping,
+    ) -> Adjusted:
+        """Minimise the reprojection error (3) from a state; see `adjust`.
+
+        If the distortion is estimated and the start is a pinhole, its coefficients start at those of a
+        pinhole. If the start is itself an adjustment, its iterations are added.
+        """
+        done = start.iterations if isinstance(start, Adjusted) else 0
+        state = start.state if isinstance(start, Adjusted) else start
+        if self.free_distortion and state.model == "none":
+            model = self.distortion.model
+            state = replace(state, model=model, k=pinhole_coefficients(model))
+        free = self.free if state.model == "none" else self.free_camera
+        adjusted = adjust(
+            self.views.batches, state, free, self.free_poses, max_iterations, self.penalty, damping
+        )
+        return replace(adjusted, iterations=done + adjusted.iterations)
+
+
+def intrinsic_matrix(entries: Array) -> Array:
+    """(3, 3) upper triangular A from its entries (5,), in any unit."""
+    A = np.eye(3)
+    A[ENTRIES] = entries
+    return A
+
+
+def problem_for(
+    points: Correspondences,
+    type: int,
+    image_center: tuple[float, float] | None = None,
+    intrinsics: Intrinsics | None = None,
+    extrinsics: Mapping[str, Pose] | None = None,
+    skew: bool = True,
+    distortion: Distortion | None = None,
+) -> Problem:
+    """State a problem; check that the given parameters are those of its type.
+
+    `image_center`, `intrinsics`, `extrinsics` and `skew` are as for `calibrate`. `distortion` is the given
+    one with type 3, else the model to be estimated.
+
+    Raises UsageError if the type does not exist, a parameter that it needs is missing, or one that it does
+    not use is given. Raises InputError if there are no points, a value is not finite, the extrinsics lack a
+    view, or the given distortion maps no ray to a pixel. Raises DegenerateGeometryError if all pixels
+    coincide.
+    """
+    if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
+        raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
+    if not len(points):
+        raise InputError(f"{points.source}: there are no points to calibrate from; give some")
+    for name, value, wanted in (
+        ("image_center", image_center, 2),
+        ("intrinsics", intrinsics, 3),
+        ("extrinsics", extrinsics, 4),
+    ):
+        if value is not None and type != wanted:
+            raise UsageError(f"{name} needs type {wanted}, but the type is {type}; give type={wanted}")
+    entries, free = np.zeros(5), np.ones(5, dtype=bool)
+    fixed: set[str] = set()
+    poses: dict[str, Pose] | None = None
+    if not skew:
+        free[1] = False
+        fixed.add("theta")
+    if type == 2:
+        entries[3:] = _centre(points, image_center)
+        free[3:] = False
+        fixed |= {"u0", "v0"}
+    elif type == 3:
+        if intrinsics is None:
+            raise UsageError("type 3 needs the intrinsics of the camera; give intrinsics=")
+        entries = intrinsics.A[ENTRIES]
+        if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
+            raise InputError(
+                "the given intrinsics are out of range: alpha and the centre must be of the size of an "
+                "image; correct them"
+            )
+        free[:] = False
+        fixed = set(INTRINSIC_NAMES)
+    elif type == 4:
+        poses = _poses(points, extrinsics)
+    distortion = distortion or Distortion()
+    free_distortion = type != 3 and distortion.model != "none"
+    if type == 3:
+        fixed |= set(coefficient_names(distortion.model))
+    views, turned = (
+        (arrange(points), None) if free_distortion else _undistorted_views(points, distortion, entries)
+    )
+    given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
+    return Problem(points, views, *given, turned=turned)
+
+
+def _undistorted_views(
+    points: Correspondences, distortion: Distortion, entries: Array
+) -> tuple[Views, Array | None]:
+    """Views with a given distortion removed from their pixels, and the rotations of their pinholes."""
+    if distortion.is_identity:
+        return arrange(points), None
+    camera = Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), distortion)
+    seen = _seen_nearby(camera, points.pixels)
+    rays = camera.unproject(seen)
+    lost = ~np.isfinite(rays[:, 0])
+    if lost.any():
+        row = int(np.argmax(lost))
+        u, v = points.pixels[row]
+        raise InputError(
+            f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
+            "check that the camera belongs to these images"
+        )
+    if not distortion.wide:
+        return arrange(replace(points, pixels=undistorted_pixels(distortion, camera.A, seen))), None
+    pixels, turned = _turned_pixels(points, rays, camera)
+    behind = ~np.isfinite(pixels[:, 0])
+    if behind.any():
+        row = int(np.argmax(behind))
+        raise InputError(
+            f"{points.place(row)}: this point is seen more than 84 degrees from the middle of the points in "
+            "its view; leave such points out"
+        )
+    return arrange(replace(points, pixels=pixels)), turned
+
+
+def _seen_nearby(camera: Camera, pixels: Array) -> Array:
+    """The pixels; those just outside the lens's domain (by noise) are moved to its rim, others are nan."""
+    outside = np.flatnonzero(~np.isfinite(camera.unproject(pixels)[:, 0]))
+    if not outside.size:
+        return pixels
+    centre = np.array([camera.intrinsics.u0, camera.intrinsics.v0])
+    low, high = np.full(outside.size, 1 - _RIM), np.ones(outside.size)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        at = centre + middle[:, None] * (pixels[outside] - centre)
+        sees = np.isfinite(camera.unproject(at)[:, 0])
+        low, high = np.where(sees, middle, low), np.where(sees, high, middle)
+    moved = pixels.copy()
+    moved[outside] = centre + low[:, None] * (pixels[outside] - centre)
+    moved[outside[low == 1 - _RIM]] = np.nan
+    return moved
+
+
+def _turned_pixels(points: Correspondences, rays: Array, camera: Camera) -> tuple[Array, Array]:
+    """Pixels (N, 2) of pinholes that look along the mean ray of each view, and their rotations (V, 3, 3).
+
+    A target may lie more than 90 degrees from the camera's axis, but it spans a cone of less than that.
+    """
+    index = points.view_index
+    sums = np.zeros((points.n_views, 3))
+    np.add.at(sums, index, np.nan_to_num(rays))
+    forward = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+    forward[~sums.any(axis=1)] = 0.0, 0.0, 1.0
+    turned = rotation_to_axis(forward)
+    X, Y, Z = (turned[index] @ rays[..., None])[..., 0].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(Z > _LEAST_DEPTH, Z, np.nan)
+        return np.column_stack(image_points(camera.entries, "none", (), X / depth, Y / depth)), turned
+
+
+def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
+    centre = image_center if image_center is not None else points.image_center
+    if centre is None and points.image_size is not None:
+        # Pixel centres run from 0 to the size less 1.
+        centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
+    if centre is None:
+        raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
+    try:
+        values = np.array(centre, dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
+        raise InputError("the image centre must be two finite numbers of the size of an image; correct it")
+    return values
+
+
+def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
+    if extrinsics is None:
+        raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
+    wrong = "the extrinsics must be a dict with a Pose for each view"
+    if not isinstance(extrinsics, Mapping):
+        raise UsageError(wrong)
+    missing = [name for name in points.view_names if name not in extrinsics]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"the extrinsics have no view named {missing[0]!r}{more}; they have "
+            f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
+        )
+    if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
+        raise UsageError(wrong)
+    return {name: extrinsics[name] for name in points.view_names}

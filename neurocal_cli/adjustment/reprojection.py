@@ -1,0 +1,218 @@
+"""The reprojection error (3) of a camera and its poses: residuals, derivatives, normal matrices.
+
+All quantities are normalised, unless said otherwise: pixels by S1, the world by each view's own S2. The
+columns of every matrix here are the five entries of A, the pose (omega, tau), the distortion coefficients
+and the residual, in this order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.point_batches import PointBatches, products
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.directions import WITH_XI
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, rotation_step
+from neurocal_cli.camera.projection import project_points, project_with_jacobian
+
+POSE = slice(5, 11)  # omega, tau
+_OMEGA, _TAU = slice(5, 8), slice(8, 11)
+_COEFFICIENTS = 11  # first column of the coefficients of the distortion
+
+
+def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
+    """Columns (5 + K,) of the parameters that all views share: the entries of A, then the coefficients."""
+    return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
+
+
+@frozen_dataclass(eq=False)
+class CameraState:
+    """Camera and poses, the unknowns of an adjustment, in normalised units or in pixels and world units."""
+
+    # A11, A12, A22, A13, A23: (1, 5) of the camera that all views share, or (V, 5) of each view's own camera.
+    entries: Array
+    R: Array  # (V, 3, 3)
+    t: Array  # (V, 3)
+    model: str = "none"  # distortion model, one of `distortion.MODELS`
+    # Coefficients of the model: (K,) the same for all views, or (V, K) each view's own.
+    k: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def distortion(self) -> Distortion:
+        """The distortion that all views share."""
+        return Distortion(self.model, self.k)
+
+    def with_model(self, model: str) -> CameraState:
+        """The same camera with a model that begins with the same coefficients; new ones are 0."""
+        k = np.zeros(len(coefficient_names(model)))
+        kept = min(len(k), len(self.k))
+        k[:kept] = self.k[:kept]
+        return replace(self, model=model, k=k)
+
+    def of_view(self, view: int) -> CameraState:
+        """The state of one view alone."""
+        own = slice(view, view + 1)
+        entries = self.entries if len(self.entries) == 1 else self.entries[own]
+        k = self.k if self.k.ndim == 1 else self.k[view]
+        return replace(self, entries=entries, R=self.R[own], t=self.t[own], k=k)
+
+    def of_views(self, which: NDArray[np.intp]) -> CameraState:
+        """The state of some views, which share one camera."""
+        return replace(self, R=self.R[which], t=self.t[which])
+
+    def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
+        """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
+        by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
+        if self.model in WITH_XI:
+            by_entries = by_entries + self._along_valley(by_entries, by_k)
+        return CameraState(
+            self.entries + by_entries,
+            rotation_step(by_pose[:, :3]) @ self.R,
+            self.t + by_pose[:, 3:],
+            self.model,
+            self.k + (by_k[0] if self.k.ndim == 1 else by_k),
+        )
+
+    def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
+        """Second-order correction of a step along the valley in which xi and alpha compensate.
+
+        The points determine the scale in the image centre, alpha / (1 + xi).
+        """
+        bend = np.zeros_like(by_entries)
+        xi, by_xi = self.k[..., :1], by_k[:, :1]
+        bend[:, :3] = by_xi / (1 + xi) * (by_entries[:, :3] - self.entries[:, :3] * by_xi / (1 + xi))
+        return bend
+
+    def camera_of(self, view: NDArray[np.intp]) -> tuple[Sequence[Any] | Array, Sequence[Any] | Array]:
+        """A's entries and the coefficients for the points of some batches, given each batch's view."""
+        # For one camera, Python numbers are faster than NumPy scalars or columns of one.
+        entries = self.entries[view].T[..., None] if len(self.entries) > 1 else self.entries[0].tolist()
+        return entries, self.k.tolist() if self.k.ndim == 1 else self.k[view].T[..., None]
+
+
+def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
+    """Normal matrices (V, 12 + K, 12 + K), and which views are sensible (V,).
+
+    The matrices are products of derivatives and residuals, summed over each view's points. Their columns are
+    the derivatives by A11, A12, A22, A13, A23, omega (3), tau (3) and K coefficients, and the residual. A
+    view is sensible if all its points have positive depth and lie where the distortion is monotonic.
+    """
+    n_batches = len(batches.view)
+    width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
+    by_batch = np.empty((n_batches, width, width))
+    sensible = np.empty(n_batches, dtype=bool)
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        part = buffer[: chunk.stop - chunk.start]
+        sensible[chunk] = derivatives(batches, chunk, state, part[:, :-1])
+        products(part, by_batch[chunk])
+    if n_batches == batches.n_views:
+        return by_batch, sensible
+    return batches.sum_by_view(by_batch), np.logical_and.reduceat(sensible, batches.first)
+
+
+def displaced_blocks(
+    batches: PointBatches, state: CameraState, m: int, displaced: Callable[[slice], Array]
+) -> Array:
+    """(V, 12 + K + m, 12 + K + m) normal matrices with m columns between coefficients and residual.
+
+    These columns are the derivatives by m ways in which the target may be displaced. `displaced` returns the
+    displacements (T, m, 3, n) of the points of a chunk of the batches, in local coordinates.
+    """
+    width, n = 12 + len(state.k), batches.local.shape[2]
+    by_batch = np.empty((len(batches.view), width + m, width + m))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view), :-1]
+        derivatives(batches, chunk, state, part)
+        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
+        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
+        more = np.einsum("tipn,tsin->tspn", by_local, displaced(chunk))
+        J = np.concatenate([part[:, :-1], more, part[:, -1:]], axis=1).reshape(len(view), width + m, -1)
+        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+    return batches.sum_by_view(by_batch)
+
+
+def residuals(batches: PointBatches, state: CameraState) -> Array:
+    """Observed minus projected pixels, not whitened; (T, 2, n), padding included."""
+    out = np.empty_like(batches.pixels)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        Xc = state.R[view] @ batches.local[chunk] + state.t[view][:, :, None]
+        entries, k = state.camera_of(view)
+        u, v, _ = project_points(entries, state.model, k, Xc[:, 0], Xc[:, 1], Xc[:, 2])
+        out[chunk, 0] = batches.pixels[chunk, 0] - u
+        out[chunk, 1] = batches.pixels[chunk, 1] - v
+    return out
+
+
+def squared_errors(batches: PointBatches, state: CameraState) -> Array:
+    """(V,) sum of squared (whitened) residuals of each view, without their derivatives."""
+    du, dv = residuals(batches, state).swapaxes(0, 1)
+    if batches.whitening is not None:
+        root = batches.whitening.swapaxes(0, 1)
+        du, dv = root[0] * du + root[1] * dv, root[2] * dv
+    return batches.sum_by_view((du * du + dv * dv).sum(axis=1))
+
+
+def predicted_pixels(
+    state: CameraState, world: Array, view: NDArray[np.intp]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Project world points (N, 3), each with the pose of its view (N,); `state` is in pixels and world units.
+
+    Returns the pixels (N, 2), and which points (N,) are in front of the camera; others have ``nan`` pixels.
+    """
+    X, Y, Z = ((state.R[view] @ world[..., None])[..., 0] + state.t[view]).T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u, v, seen = project_points(state.entries[0], state.model, state.k, X, Y, Z)
+        return np.where(seen[:, None], np.column_stack([u, v]), np.nan), seen
+
+
+def farthest_angle(views: Views, state: CameraState) -> float:
+    """Largest angle between a point's ray and the optical axis [rad]."""
+    X, Y, Z = ((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]).T
+    return float(np.arctan2(np.hypot(X, Y), Z).max())
+
+
+def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:
+    """Fill out (T, 12 + K, 2, n) with the derivatives of the pixels and the residuals.
+
+    Around the centroid, Xc = exp(omega) R M + t + tau, so d Xc = omega x Y + tau with Y = R M. The derivative
+    by tau is the derivative by the point, and the derivative by omega is the cross product of Y with it.
+    """
+    view, pixels = batches.view[chunk], batches.pixels[chunk]
+    entries, k = state.camera_of(view)
+    Y = state.R[view] @ batches.local[chunk]
+    Xc = Y + state.t[view][:, :, None]
+    by_omega, by_point = out[:, _OMEGA], out[:, _TAU]
+    u, v, valid = project_with_jacobian(
+        entries, state.model, k, (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
+        out[:, :5], by_point, out[:, _COEFFICIENTS:-1],
+    )  # fmt: skip
+    product = np.empty(by_omega[:, 0].shape)
+    for n, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(Y[:, i, None], by_point[:, j], out=by_omega[:, n])
+        np.multiply(Y[:, j, None], by_point[:, i], out=product)
+        by_omega[:, n] -= product
+    np.subtract(pixels[:, 0], u, out=out[:, -1, 0])
+    np.subtract(pixels[:, 1], v, out=out[:, -1, 1])
+    if batches.whitening is not None:
+        _whiten(out[:, :, 0], out[:, :, 1], batches.whitening[chunk])
+    return np.asarray(valid.all(axis=1))
+
+
+def _whiten(u: Array, v: Array, factors: Array) -> None:
+    """Multiply each point's two rows by its upper triangular factor, in place."""
+    # The buffer is reused: structural zeros must be set again before whitening mixes the rows.
+    u[:, 2] = u[:, 4] = v[:, 0] = v[:, 1] = v[:, 3] = 0.0
+    u *= factors[:, None, 0]
+    u += v * factors[:, None, 1]
+    v *= factors[:, None, 2]

@@ -1,0 +1,221 @@
+"""Jackknife covariance over views, for residuals that are correlated within a view.
+
+The inverse normal matrix treats all residuals as independent. But if the board is not quite flat, the focus
+moves or the distortion model is not quite right, the errors of a view are correlated, and the parameters
+scatter more from view to view than the residuals suggest. The jackknife measures that: each view is left out
+by one step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
+
+    covariance = (V - 1) / V  sum_v (d_v - mean) (d_v - mean)^T.
+
+With few views it is imprecise: used always, it would make the std of clean data a third too large with five
+views, and a quarter with ten. So it is used only if the views contradict each other more than chance allows,
+and it never goes below the covariance of the normal matrix. If each view has bends of its own, they hide such
+contradictions; then it is used if it is far larger than noise lets one expect. Views that repeat a pose
+(`repeated_poses`) count as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
+from neurocal_cli.adjustment.covariance import Covariance
+from neurocal_cli.adjustment.cross_validation import reduced
+from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+
+_CHANCE = 1.645  # sigmas: one clean set in twenty
+_TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
+# Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in
+# each view: above it in one (4.4) of the 143 such sets of tests/test_simulated_targets.py, and 4.7 to 32 in
+# photographs (figures, "The board estimated with the camera").
+_GROWN = 3.0
+_FEWEST = 3  # fewest poses: with one left out, two must still differ
+
+
+# Undetermined parameters become inf or nan; the results are tested for that.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def counting_views(
+    found: Covariance,
+    normal: Array,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    n_residuals: float,
+    repeated: RepeatedPoses,
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
+    bends: bool = False,
+) -> Covariance:
+    """Covariances for residuals that are independent between views only.
+
+    The result is `found`, the covariance from the normal matrix, if the views contradict each other no more
+    than the residuals explain. `normal`, `free`, `free_poses` and `n_residuals` are as for
+    `covariance.covariance`. `moves_without` takes the pose number of each view and returns the moves of the
+    free parameters when the views of each pose are left out; it is needed if they do not follow from the
+    normal matrices. `bends` tells whether each view has bends of its own: they absorb contradictions between
+    views that have other causes, and only the jackknife reveals those.
+    """
+    if not free.any() or not np.isfinite(found.entries).all():
+        return found
+    unknowns = int(free.sum()) + (6 * len(normal) if free_poses else 0)
+    variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
+    whole = reduced(normal, free, free_poses)
+    told = _determined(whole.S.sum(axis=0))
+    if told is not None:
+        whole = Quadratics(told.into.T @ whole.S @ told.into, whole.g @ told.into, whole.cost)
+    q = _by_pose(whole, repeated)
+    entries = before = found.entries if told is None else told.back @ found.entries @ told.back.T
+    if not repeated.none:
+        entries = _of_copies(q, repeated.variance, variance)
+    enough = len(q.cost) >= _FEWEST
+    contradict = enough and _contradict(q if repeated.none else _weighed(q, repeated.variance), variance)
+    if contradict or (bends and enough):
+        moves = None if moves_without is None else moves_without(repeated.group)
+        if moves is not None and told is not None:
+            moves = moves @ told.back.T
+        jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
+        noise = _expected(q, repeated.variance, variance)
+        if contradict or _size(jackknife, entries) > _GROWN * _size(noise, entries):
+            entries = _at_least(jackknife, entries)
+    if entries is before or not np.isfinite(entries).all():
+        return found
+    if told is not None:
+        entries = found.entries + told.into @ (entries - before) @ told.into.T
+    return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
+
+
+@frozen_dataclass(eq=False)
+class _Determined:
+    """Directions of the unknowns that the points determine: p = into z, z = back p."""
+
+    into: Array  # (f, r)
+    back: Array  # (r, f)
+
+
+def _determined(S: Array) -> _Determined | None:
+    """Directions not dominated by rounding; None if these are all or none.
+
+    Coefficients of a rational model are almost degenerate, although the projection is well determined.
+    """
+    scaled, scale = unit_diagonal(S)
+    try:
+        values, vectors = np.linalg.eigh(scaled)
+    except np.linalg.LinAlgError:
+        return None
+    kept = values > _TOLD
+    if kept.all() or not kept.any():
+        return None
+    vectors = vectors[:, kept]
+    return _Determined(scale[:, None] * vectors, vectors.T / scale)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def scores_of_poses(
+    normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
+) -> Quadratics:
+    """Quadratics of the different poses at their minimum, weighted so that cov(g) is variance times S.
+
+    The parameters are those of `reduced`.
+    """
+    return _weighed(_by_pose(reduced(normal, free, free_poses), repeated), repeated.variance)
+
+
+def _weighed(q: Quadratics, times: Array) -> Quadratics:
+    S, g = q.S / times[:, None, None], q.g / times[:, None]
+    return Quadratics(S, g - S @ solve_or_nan(S.sum(axis=0), g.sum(axis=0)), q.cost / times)
+
+
+def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
+    """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
+    if not repeated.none:
+        q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
+    return Quadratics(q.S, q.g - q.S @ solve_or_nan(q.S.sum(axis=0), q.g.sum(axis=0)), q.cost)
+
+
+def _of_copies(q: Quadratics, times: Array, variance: float) -> Array:
+    """S^-1 (sum of the variances of the poses' scores) S^-1."""
+    S_inverse = inverse_or_nan(q.S.sum(axis=0))
+    return np.asarray(variance * S_inverse @ np.tensordot(times, q.S, 1) @ S_inverse)
+
+
+def _contradict(q: Quadratics, variance: float) -> bool:
+    """Whether the scores g of the poses are larger than noise explains, where cov(g) = variance S.
+
+    The statistic is sum g^T S^-1 g. For noise it is a sum of squares with the covariance W_v - W_v W_w
+    between views v and w, where W_v = S^-1/2 S_v S^-1/2. Its mean and variance follow, and it is compared
+    with a chi-squared distribution of the same mean and variance (Satterthwaite 1946).
+    """
+    scaled, scale = unit_diagonal(q.S.sum(axis=0))
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(scaled)) * scale
+    except np.linalg.LinAlgError:
+        return False
+    W = root @ q.S @ root.T
+    W2 = W @ W
+    Q = W2.sum(axis=0)
+    mean = len(Q) - float(np.trace(Q))
+    spread = float(np.trace(Q) - 2 * (W * W2).sum() + (Q * Q).sum())
+    if not (mean > 0 and spread > 0 and variance > 0):
+        return False
+    statistic = float(((q.g @ root.T) ** 2).sum()) / variance / mean
+    return bool(statistic > exceeded_by_chance(mean**2 / spread, _CHANCE))
+
+
+def _jackknife(moves: Array) -> Array:
+    """(f, f) jackknife covariance from the moves (P, f) without each pose; nan if a pose is indispensable."""
+    moves = moves - moves.mean(axis=0)
+    return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
+
+
+def _expected(q: Quadratics, times: Array, variance: float) -> Array:
+    """(f, f) jackknife covariance that noise alone lets one expect, where cov(g) = times variance S.
+
+    It is larger than the covariance of the parameters: a view with a large share of the information moves
+    them far when it is left out.
+    """
+    S, own = q.S.sum(axis=0), times[:, None, None] * q.S
+    share = inverse_or_nan(S) @ q.S
+    by_share = own @ share
+    # At the minimum, g of each pose has lost its share of the sum.
+    scores = own - by_share - np.swapaxes(by_share, 1, 2)
+    scores += np.swapaxes(share, 1, 2) @ own.sum(axis=0) @ share
+    gain = inverse_or_nan(S - q.S)
+    return np.asarray((len(own) - 1) / len(own) * variance * (gain @ scores @ gain).sum(axis=0))
+
+
+def _size(jackknife: Array, entries: Array) -> float:
+    """Mean ratio of a jackknife's variances to the others over all directions; nan if unknown."""
+    return float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
+
+
+def _at_least(jackknife: Array, entries: Array) -> Array:
+    """The jackknife's covariance, raised to the other one in every direction in which it is smaller."""
+    scaled, scale = unit_diagonal(entries)
+    try:
+        root = np.linalg.cholesky(scaled) / scale[:, None]
+        inverse = np.linalg.inv(root)
+        values, vectors = np.linalg.eigh(inverse @ jackknife @ inverse.T)
+    except np.linalg.LinAlgError:  # nan among them too
+        return entries
+    if not np.isfinite(values).all():
+        return entries
+    axes = root @ vectors
+    return np.asarray(axes * np.maximum(values, 1.0) @ axes.T)
+
+
+def _followed(
+    found: Covariance, normal: Array, free: NDArray[np.bool_], free_poses: bool, entries: Array
+) -> Array:
+    """Covariances of the poses, propagated from those of the shared parameters."""
+    if not free_poses:
+        return found.poses
+    f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
+    gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, f, POSE], 1, 2))  # (V, 6, f)
+    return np.asarray(found.poses + gain @ (entries - found.entries) @ np.swapaxes(gain, 1, 2))

@@ -1,0 +1,244 @@
+"""Points sorted by view and normalised with the paper's S1 and S2: centred, with one S2 for each view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, similarity
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.network.network import Patterns
+from neurocal_cli.observations.measured_directions import LEAST, equations, loosened
+from neurocal_cli.observations.points import Correspondences
+
+# Repeated by tests/test_convergence.py, with targets of every thickness.
+# A target thinner than this share of its length is a plane up to rounding ...
+_EXACTLY_FLAT = 1e-6
+# ... and thinner than this it is treated as a plane until bundle adjustment, which uses all coordinates.
+_NEARLY_FLAT = 0.02
+
+
+@frozen_dataclass(eq=False)
+class Views:
+    """All points, sorted by view, in normalised coordinates."""
+
+    names: tuple[str, ...]
+    # (N,) row of the original data for each point; None if the data were sorted already.
+    order: NDArray[np.intp] | None
+    index: NDArray[np.intp]  # (N,) view of each point
+    counts: NDArray[np.intp]  # (V,) number of points of each view
+    first: NDArray[np.intp]  # (V,) index of each view's first point
+    distinct: NDArray[np.intp]  # (V,) number of different world points of each view
+    local: Array  # (N, 3) (M - centre) / scale, each view with its own
+    pixels: Array  # (N, 2) (m - pixel_centre) / pixel_scale
+    weights: Array  # (N,) scalar weights, mean 1
+    across: Array | None  # (N, 2) direction in which each point was measured; see `measured_directions`
+    # (N, 3) upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
+    whitening: Array | None
+    centre: Array  # (V, 3) mean of each view's points [world unit]
+    scale: Array  # (V,) S2 of each view [world unit]
+    basis: Array  # (V, 3, 3) columns: principal axes of each view's points, longest first; a rotation
+    extent: Array  # (V, 3) rms extents along them, normalised
+    pixel_centre: Array  # (2,) [px]
+    pixel_scale: float  # S1 [px]
+    along: float = LEAST  # weight that points measured across an edge have along it
+    # (N, 3) unit directions that the networks learn instead of (u, v, 1), from an assumed lens. Without them
+    # a network models a pinhole.
+    rays: Array | None = None
+
+    @property
+    def targets(self) -> Array:
+        """(N, 3) training targets of the networks: normalised pixels (u, v, 1), or rays."""
+        if self.rays is not None:
+            return self.rays
+        return np.column_stack([self.pixels, np.ones(len(self.pixels))])
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.names)
+
+    @cached_property
+    def equations(self) -> Array:
+        """(V,) number of equations that each view's points give."""
+        return np.asarray(np.add.reduceat(equations(self.across, len(self.index), self.along), self.first))
+
+    @property
+    def n_equations(self) -> float:
+        """Number of equations that all points give."""
+        return float(self.equations.sum())
+
+    @property
+    def n_distinct_equations(self) -> float:
+        """Number of equations that different points give; a repeated point counts once."""
+        return float(np.minimum(2 * self.distinct, self.equations).sum())
+
+    @property
+    def exactly_flat(self) -> NDArray[np.bool_]:
+        """(V,) whether the view's points lie in one plane."""
+        return np.asarray(self.extent[:, 2] <= _EXACTLY_FLAT * self.extent[:, 0])
+
+    @property
+    def nearly_flat(self) -> NDArray[np.bool_]:
+        """(V,) whether the view's points nearly lie in one plane."""
+        return np.asarray(self.extent[:, 2] <= _NEARLY_FLAT * self.extent[:, 0])
+
+    @property
+    def S1(self) -> Array:
+        """(3, 3) matrix from normalised to real pixels, eq. (12)."""
+        s, (u, v) = self.pixel_scale, self.pixel_centre
+        return np.array([[s, 0.0, u], [0.0, s, v], [0.0, 0.0, 1.0]])
+
+    @property
+    def S2(self) -> Array:
+        """(V, 4, 4) matrices from real to normalised world coordinates of each view, eq. (12)."""
+        S2 = np.eye(4) / self.scale[:, None, None]
+        S2[:, :3, 3] = -self.centre / self.scale[:, None]
+        S2[:, 3, 3] = 1.0
+        return S2
+
+    def subset(self, views: NDArray[np.intp]) -> Views:
+        """Only these views, normalised as before."""
+        rows = np.concatenate([np.arange(self.first[v], self.first[v] + self.counts[v]) for v in views])
+        counts = self.counts[views]
+        return self._only(views, rows, counts)
+
+    def of_points(self, kept: NDArray[np.bool_]) -> Views:
+        """Only these points, in the order of the views, normalised as before."""
+        counts = np.bincount(self.index[kept], minlength=self.n_views)
+        views = np.flatnonzero(counts)
+        return self._only(views, np.flatnonzero(kept), counts[views])
+
+    def _only(self, views: NDArray[np.intp], rows: NDArray[np.intp], counts: NDArray[np.intp]) -> Views:
+        return replace(
+            self,
+            names=tuple(self.names[v] for v in views),
+            order=None,
+            index=np.repeat(np.arange(len(views)), counts),
+            counts=counts,
+            first=np.cumsum(counts) - counts,
+            distinct=self.distinct[views],
+            local=self.local[rows],
+            pixels=self.pixels[rows],
+            weights=self.weights[rows],
+            across=None if self.across is None else self.across[rows],
+            whitening=None if self.whitening is None else self.whitening[rows],
+            rays=None if self.rays is None else self.rays[rows],
+            centre=self.centre[views],
+            scale=self.scale[views],
+            basis=self.basis[views],
+            extent=self.extent[views],
+        )
+
+    @cached_property
+    def batches(self) -> PointBatches:
+        """All points, in batches for bundle adjustment."""
+        return batches_of(self.local, self.pixels, self.whitening, self.index, self.n_views)
+
+    def patterns(
+        self, views: NDArray[np.intp], flat: bool, most: int, rng: np.random.Generator | None = None
+    ) -> Patterns:
+        """Training patterns of some views' networks, at most `most` of each view.
+
+        If a view has more points, one is drawn from each of `most` equal stretches of its rows, at random or,
+        without a generator, the middle one. Views with fewer points than the others are padded with weight 0.
+        """
+        n = self.counts[views]
+        width = min(int(n.max()), most)
+        slot = np.arange(width)
+        inside = 0.5 if rng is None else rng.random((len(views), width))
+        stretch = np.maximum(n / width, 1.0)[:, None]
+        rank = np.minimum((slot + inside * (stretch > 1)) * stretch, n[:, None] - 1).astype(np.intp)
+        rows = self.first[views][:, None] + rank
+        local = self.local[rows]
+        if flat:
+            local = (local @ self.basis[views])[:, :, :2]
+        ones = np.ones((*rows.shape, 1))
+        weights = np.where(slot < n[:, None], self.weights[rows], 0.0)
+        targets = np.concatenate([self.pixels[rows], ones], axis=2) if self.rays is None else self.rays[rows]
+        return Patterns(np.concatenate([local, ones], axis=2), targets, weights)
+
+
+def arrange(points: Correspondences) -> Views:
+    """Sort points by view and normalise them; raises DegenerateGeometryError if all pixels coincide."""
+    index, V = points.view_index, points.n_views
+    world, pixels, covariance, across = points.world, points.pixels, points.covariance, points.across
+    order = None
+    if np.any(index[1:] < index[:-1]):
+        order = np.argsort(index, kind="stable")
+        index, world, pixels = index[order], world[order], pixels[order]
+        covariance = None if covariance is None else covariance[order]
+        across = None if across is None else across[order]
+    counts = np.bincount(index, minlength=V)
+    first = np.cumsum(counts) - counts
+    centre = np.add.reduceat(world, first) / counts[:, None]
+    local = world - np.repeat(centre, counts, axis=0)
+    scale = np.maximum.reduceat(np.abs(local), first).max(axis=1)
+    scale = np.where(scale > 0, scale, 1.0)
+    local /= np.repeat(scale, counts)[:, None]
+    pixel_centre, pixel_scale = similarity(pixels)
+    if len(pixels) > 1 and (pixels == pixels[0]).all():
+        raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
+    basis, extent = _principal_axes(local, counts, first)
+    weights, whitening = noise_model(covariance, across)
+    if weights is None:
+        weights = np.ones(len(index))
+    return Views(
+        points.view_names, order, index, counts, first, _distinct(local, index, V), local,
+        (pixels - pixel_centre) / pixel_scale, weights, across, whitening, centre, scale, basis,
+        extent, pixel_centre, pixel_scale,
+    )  # fmt: skip
+
+
+def _principal_axes(local: Array, counts: NDArray[np.intp], first: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Principal axes (V, 3, 3) and rms extents (V, 3) of each view's centred points."""
+    scatter = np.empty((len(counts), 3, 3))
+    columns = np.ascontiguousarray(local.T)
+    for a in range(3):
+        for b in range(a, 3):
+            scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
+    values, basis = np.linalg.eigh(scatter / counts[:, None, None])
+    basis = basis[:, :, ::-1] * np.where(np.linalg.det(basis[:, :, ::-1]) < 0, -1.0, 1.0)[:, None, None]
+    # Rounding leaves 1e-16 in a zero eigenvalue, so 1e-8 in the extent, below `_EXACTLY_FLAT`.
+    return basis, np.sqrt(np.maximum(values[:, ::-1], 0.0))
+
+
+def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np.intp]:
+    """Number of different world points of each view.
+
+    Points are identified by a fixed irrational combination of their coordinates; one sort handles all views.
+    """
+    key = local @ np.array([0.4142135623730951, 0.2360679774997898, 0.1231056256176606])
+    key = np.sort(index + 0.5 * (np.round(key, 11) + 0.8) / 1.6)
+    view = np.floor(key).astype(np.intp)
+    fresh = np.concatenate([[True], np.diff(key) > 1e-13 * n_views])
+    return np.bincount(view[fresh], minlength=n_views)
+
+
+def noise_model(
+    covariance: Array | None, across: Array | None = None, along: float = LEAST
+) -> tuple[Array | None, Array | None]:
+    """Scalar weights (N,) of mean 1 and whitening factors (N, 3) of mean square 1 for each equation.
+
+    The columns of `covariance` (N, 3) are suu, suv, svv; it is None if they are equal for all points.
+    `across` (N, 2) is the direction in which each point was measured (see `measured_directions`), and `along`
+    is the weight of such points along their edge.
+    """
+    if covariance is None:
+        if across is None:
+            return None, None
+        covariance = np.tile([1.0, 0.0, 1.0], (len(across), 1))
+    suu, suv, svv = loosened(covariance, across, along).T
+    # Inverse covariance = U^T U with U upper triangular.
+    v11 = 1.0 / np.sqrt(svv)
+    u00 = 1.0 / np.sqrt(suu - suv**2 / svv)
+    u01 = -u00 * suv / svv
+    factors = np.column_stack([u00, u01, v11])
+    of_point, count = (factors**2).sum(axis=1), equations(across, len(factors), along)
+    information = of_point / count
+    return information / information.mean(), factors / np.sqrt(of_point.sum() / count.sum())

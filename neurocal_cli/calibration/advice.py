@@ -1,0 +1,258 @@
+"""Choose the views that reduce the uncertainty of a camera most, one after the other.
+
+Each view adds the normal matrix of the camera's parameters with the view's pose eliminated, ``A - C B^-1
+C^T``. It needs no observed pixels, so views that were not taken can be compared. All points have equal
+weight, with the noise of the calibration.
+
+Changes of the camera that a motion of its frame compensates do not count, as in
+`verdict.projection_uncertainty`. There the frame moves with the poses of the views. Here it moves so that
+the pixels of near and far points all over the image move least, which does not depend on the views. So no
+view can make the camera less certain, and the numbers of both modules are similar but not equal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.open_coefficients import open_of_calibration
+from neurocal_cli.calibration.calibration import Calibration, free_entries
+from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.rich_lens import NODES
+from neurocal_cli.errors import InputError
+
+_POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # shares of the image's width and height
+_WIDTHS = (0.3, 0.5, 0.75)  # width of the target as a share of the image's width
+_TILTS = ((0.0, 0.0), *((tilt, way) for tilt in (25.0, 45.0) for way in range(0, 360, 45)))  # degrees
+_ROLLS = (0.0, 90.0)  # degrees
+_FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # distances of judged points, relative to that of the views
+_FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
+_LEAST_SIGMA = 1e-4  # px; least noise, for perfect fits
+_SINGULAR = 1e-13  # eigenvalue of a matrix with unit diagonal, below which it is rounding
+
+
+@frozen_dataclass(eq=False)
+class Candidate:
+    """A possible view."""
+
+    pose: Pose
+    position: Array  # (2,) of the target's middle, as shares of the image's width and height
+    width: float  # of the target in a frontal view, as a share of the image's width
+    tilt: float  # [degrees]
+    way: float  # direction of the side that comes nearer [degrees]: 0 is right, 90 is down
+    roll: float  # clockwise rotation of the target in its plane [degrees]
+    outline: Array  # (n, 2) corners of the target in the image [px]
+
+
+@frozen_dataclass(eq=False)
+class Advice:
+    """Views to take next, in this order."""
+
+    views: tuple[Candidate, ...]
+    before: float  # largest standard deviation of a projected pixel without the views [px]
+    after: tuple[float, ...]  # the same after adding each of the views [px]
+    image_size: tuple[int, int]
+
+
+def advise(calibration: Calibration, count: int = 3) -> Advice:
+    """Choose views greedily: each reduces the largest uncertainty most, given the previous ones.
+
+    Raises
+    ------
+    InputError
+        The calibration has no points, no image size or no free parameter, or no view shows the whole target.
+    """
+    known, world = _Known.of(calibration), _target(calibration)
+    options = candidates(calibration)
+    if not options:
+        raise InputError("no view shows the whole target; check the image size and the target")
+    told = [view_information(known.camera, known.free, option.pose, world) for option in options]
+    before, more = known.worst(), np.zeros_like(known.information)
+    chosen, after = [], []
+    for _ in range(count):
+        values = [known.worst(more + view) for view in told]
+        best = int(np.argmin(values))
+        more = more + told[best]
+        chosen.append(options[best])
+        after.append(values[best])
+    assert known.camera.image_size is not None
+    return Advice(tuple(chosen), before, tuple(after), known.camera.image_size)
+
+
+@frozen_dataclass(eq=False)
+class _Known:
+    """Information on a camera from the views taken so far."""
+
+    camera: Camera  # with open coefficients that its model lacks (`open_coefficients`), as 0
+    free: NDArray[np.bool_]  # (5 + K,)
+    information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
+    places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`
+    sigma: float  # noise of the points [px]
+
+    def worst(self, more: Array | float = 0.0) -> float:
+        """Largest standard deviation of a projected pixel [px], with the information of further views."""
+        return worst_std(self.information + more, self.places, self.sigma)
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> _Known:
+        points, camera = calibration.points, calibration.camera
+        size = camera.image_size
+        if not len(points) or not calibration.views:
+            raise InputError("the calibration holds no points; give a file that was not written with --lean")
+        if size is None:
+            raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+        free = _free(calibration)
+        rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
+        sigma = max(rms / np.sqrt(2.0), _LEAST_SIGMA)
+        beforehand = np.zeros(int(free.sum()))
+        if (opened := open_of_calibration(calibration, free)) is not None:
+            camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
+            beforehand = np.zeros(int(free.sum()))
+            prior = opened.prior
+            beforehand[prior.left_out] = (sigma / prior.size[prior.left_out[prior.is_open]]) ** 2
+        information, depths = np.diag(beforehand), []
+        for k, name in enumerate(points.view_names):
+            pose, own = calibration.views[name].pose, points.world[points.view_index == k]
+            information += view_information(camera, free, pose, own)
+            seen = pose.to_camera(own)
+            depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
+            depths.append(float(np.median(depth)))
+        places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths))
+        return cls(camera, free, information, places, sigma)
+
+
+def _free(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) mask of the entries of A and the coefficients that were estimated."""
+    free = free_entries(calibration, NODES)
+    if not calibration.camera.intrinsics.skewed:
+        free[1] = False
+    if not free.any():
+        raise InputError("all parameters of the camera are given; more views cannot improve it")
+    return free
+
+
+def _target(calibration: Calibration) -> Array:
+    """(n, 3) distinct points of the target."""
+    points = calibration.points
+    if calibration.target is not None:
+        points = calibration.target.straightened(points)
+    return np.asarray(np.unique(points.world, axis=0))
+
+
+def candidates(calibration: Calibration) -> list[Candidate]:
+    """Views with the whole target in the image, for all positions, widths, tilts and rolls."""
+    camera, world = calibration.camera, _target(calibration)
+    assert camera.image_size is not None
+    size = np.array(camera.image_size, dtype=float)
+    middle = 0.5 * (world.min(axis=0) + world.max(axis=0))
+    frontal = _frontal(calibration, world - middle)
+    corners = _outline(world - middle, frontal)
+    extent = np.ptp((world - middle) @ frontal.T, axis=0)[:2]
+    turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
+    rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
+    R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
+    # A flat target is in the image if its corners are.
+    flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
+    checked = corners if flat else world - middle
+    found = []
+    for share in [(a, b) for b in _POSITIONS for a in _POSITIONS]:
+        ray = camera.unproject((np.array(share) * (size - 1))[None])[0]
+        if not (np.isfinite(ray).all() and ray[2] > 0):
+            continue
+        for width in _WIDTHS:
+            depth = camera.A[0, 0] * float(extent.max()) / (width * size[0])
+            centre = depth * ray / ray[2]
+            points = checked @ np.swapaxes(R, 1, 2) + centre  # (turns, n, 3)
+            pixels = camera.project(points)[0]
+            with np.errstate(invalid="ignore"):
+                inside = ((pixels >= 0) & (pixels <= size - 1)).all(axis=(1, 2))
+                whole = inside & camera.sees(points).all(axis=1)
+            for k in np.flatnonzero(whole).tolist():
+                pose = Pose(R[k], centre - R[k] @ middle)
+                outline = camera.project(corners @ R[k].T + centre)[0]
+                found.append(Candidate(pose, np.array(share), width, *turns[k], outline))
+    return found
+
+
+def _frontal(calibration: Calibration, centred: Array) -> Array:
+    """Rotation of the frontal view, upright like the mean of the views."""
+    mean = nearest_rotation(np.mean([view.pose.R for view in calibration.views.values()], axis=0))
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    if spread[2] > _FLAT * spread[0]:
+        return np.asarray(mean)
+    normal = axes[2] if mean[2] @ axes[2] > 0 else -axes[2]  # away from the camera
+    right = mean[0] - (mean[0] @ normal) * normal
+    if np.linalg.norm(right) < 1e-6:
+        right = axes[0]
+    right = right / np.linalg.norm(right)
+    return np.array([right, np.cross(normal, right), normal])
+
+
+def _outline(centred: Array, frontal: Array) -> Array:
+    """(n, 3) points of the target on its convex outline in the frontal view, in order."""
+    from scipy.spatial import ConvexHull
+
+    flat = (centred @ frontal.T)[:, :2]
+    return np.asarray(centred[ConvexHull(flat, qhull_options="QJ").vertices])
+
+
+def _tilted(tilt: float, way: float) -> Array:
+    """Rotation that brings the side in a direction of the image nearer; angles in degrees."""
+    a, b = np.radians(tilt), np.radians(way)
+    K = cross_matrix(np.array([-np.sin(b), np.cos(b), 0.0]))
+    return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
+
+
+def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array) -> Array:
+    """Information (f, f) of a view of points (N, 3) on the camera.
+
+    It is the normal matrix of the free ones of A11, A12, A22, A13, A23 and the coefficients with the pose
+    eliminated, for residuals of unit variance.
+    """
+    points = pose.to_camera(world)
+    J, P = _derivatives(camera, free, points)
+    J, P = J.reshape(-1, J.shape[2]), P.reshape(-1, 6)
+    C = J.T @ P
+    return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T)
+
+
+def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array) -> Array:
+    """Derivatives (g, 2, f) of pixels by the free parameters, without what a motion of the frame compensates.
+
+    The pixels (G, 2) are all over the image; those without a ray are left out. Each has a point at each of
+    the depths (D,).
+    """
+    rays = camera.seen_points(pixels)
+    rays = rays[np.isfinite(rays[:, 0])]
+    J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]))
+    motion = np.linalg.lstsq(P.reshape(-1, 6), J.reshape(-1, J.shape[2]), rcond=None)[0]
+    return np.asarray(J - P @ motion)
+
+
+def worst_std(normal: Array, changes: Array, sigma: float) -> float:
+    """Largest standard deviation of a projected pixel [px]; infinite if the views determine no camera.
+
+    `normal` (f, f) is the sum of the views' information, `changes` (g, 2, f) are from `pixel_changes`, and
+    `sigma` [px] is the noise of the points, in u and in v.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    S = normal / np.outer(scale, scale)
+    if np.linalg.eigvalsh(S)[0] < _SINGULAR:
+        return float("inf")
+    scaled = changes / scale
+    variance = np.sum((scaled @ np.linalg.inv(S)) * scaled, axis=(1, 2))
+    return sigma * float(np.sqrt(variance.max()))
+
+
+def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array) -> tuple[Array, Array]:
+    """Derivatives of pixels by the free parameters (N, 2, f) and a motion of the points' frame (N, 2, 6)."""
+    by_camera, by_point = camera.project_jacobian(points)
+    moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
+    return by_camera[:, :, free], by_point @ moved

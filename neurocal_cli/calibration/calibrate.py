@@ -1,0 +1,290 @@
+"""`calibrate`: from points to a calibrated camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neurocal_cli.adjustment.problem import Problem, problem_for
+from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.calibration.calibration import Calibration, Rejected, camera_of, undistorted_before
+from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.result import calibration_of, with_given_covariance
+from neurocal_cli.calibration.verdict.assessment import assess
+from neurocal_cli.calibration.verdict.odd_points import repeated_views
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WITH_XI
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_seed
+from neurocal_cli.network.options import Options, Progress, options_for
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import TARGETS, Target
+
+if TYPE_CHECKING:
+    from neurocal_cli.network.backprop import BackpropOptions
+
+METHODS = ("neuro", "linear", "nonlinear", "tsai")
+TRAINERS = ("lm", "backprop")
+DISTORTIONS = ("auto", *MODELS, "plumb-line")
+OUTLIERS = ("reject", "keep")
+
+_STARTS = 20
+_FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
+_NOT_FOUND = (
+    "the target stays as given: either another shape does not predict the points of other views better, or "
+    "these points do not determine it, which needs three different views of most points and offsets below "
+    "2 % of the target's size"
+)
+_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
+
+
+def calibrate(
+    points: Correspondences,
+    type: int = 1,
+    image_center: tuple[float, float] | None = None,
+    intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
+    extrinsics: Mapping[str, Pose] | Calibration | None = None,
+    method: str = "neuro",
+    trainer: str = "lm",
+    distortion: str = "auto",
+    skew: bool = True,
+    outliers: str = "reject",
+    seed: int = 0,
+    *,
+    target: str | Target = "auto",
+    preferred: str = "",
+    starts: int = _STARTS,
+    backprop: BackpropOptions | None = None,
+    camera_name: str = "camera",
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate a camera from known points, from random weights.
+
+    Parameters
+    ----------
+    points : Correspondences
+        One view of a target that is not flat, or several views of any target.
+    type : {1, 2, 3, 4}
+        What is given (paper, section 4.1): 1 nothing, 2 the image centre, 3 the intrinsics,
+        4 the extrinsics.
+    image_center : (u0, v0), optional [px]
+        For type 2. Default: that of the points, else the middle of their image size.
+    intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
+        For type 3. A Camera or Calibration includes its distortion. The standard deviations of the poses
+        include the covariance of a Calibration; any other camera is taken as exact.
+    extrinsics : dict of Pose by view name or Calibration, optional
+        For type 4. Of a Calibration, the poses of its views.
+    method : {"neuro", "linear", "nonlinear", "tsai"}
+        The network, or one of the methods that the paper compares it with (`baselines`). These use all
+        points, including outliers, and have no random starts.
+    trainer : {"lm", "backprop"}
+    distortion : {"auto", "plumb-line"} or one of `camera.distortion.MODELS`
+        The distortion model whose coefficients are estimated with all other parameters. "auto" selects the
+        simplest model that the points support (`lens_choice`); with the methods linear and nonlinear it is
+        none, with tsai k1. "plumb-line", the paper's way, estimates k1, k2, p1 and p2 from the images of
+        straight lines alone, then the pinhole camera. Type 3 uses the distortion of the given camera.
+    skew : bool
+        False fixes theta at pi/2.
+    outliers : {"reject", "keep"}
+        Whether points and whole views that contradict the others are left out (`outlier_rejection`).
+    seed : int
+        Of the random weights; the same seed gives the same result.
+    target : {"auto", "given", "flat", "free"} or Target
+        How the target's points are treated: "given" uses them as given; "free" estimates them with the
+        camera; "flat" does so within their plane; "auto" does so if the data support it (`target_shape`). A
+        Target that is known already is used as it is. Points with stated standard deviations (`world_std`)
+        are adjusted within these, unless "given".
+    preferred : str
+        With ``distortion="auto"``, a model to select unless another predicts decidedly better, such as that
+        of the other camera of a rig.
+    starts : int
+        Most random starts for each network, at least 2.
+    backprop : BackpropOptions, optional
+        Rates and epochs of the backprop trainer.
+    camera_name : str
+    progress : callable, optional
+        Called with the name of a stage and the completed share of it.
+
+    Returns
+    -------
+    Calibration
+        `converged` is False if training ended before it converged; the result is complete all the same.
+
+    Raises
+    ------
+    UsageError
+        A parameter that the type needs is missing, or an option does not exist.
+    InputError, DegenerateGeometryError
+        The points do not determine the camera; the message says why.
+    """
+    known_target = replace(target, bends=None) if isinstance(target, Target) else None
+    choice = "given" if isinstance(target, Target) else target
+    _check_options(method, trainer, distortion, outliers, choice, starts, seed)
+    if preferred:
+        check_choice("preferred", preferred, tuple(MODELS))
+    if skew not in (True, False):
+        raise UsageError(f"skew must be True or False, not {skew!r}")
+    if backprop is not None and trainer != "backprop":
+        raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
+    if known_target is not None:
+        points = known_target.applied(points)
+    given = None if intrinsics is None else camera_of(intrinsics)
+    known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
+    if isinstance(extrinsics, Calibration):
+        extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
+    type_3 = isinstance(type, (int, np.integer)) and type == 3
+    if method != "neuro" and not type_3:
+        distortion = _distortion_of(method, distortion)
+    if not type_3:
+        model = Distortion() if distortion in _FOUND else Distortion(distortion)
+    elif distortion not in ("auto", "none", model.model):
+        raise UsageError(
+            f"type 3 uses the distortion of the given camera ({model.model}), not {distortion}; leave it out"
+        )
+    way = distortion if distortion in _FOUND and not type_3 else ""
+    options = options_for(
+        trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
+    )
+    try:
+        problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
+        if method != "neuro":
+            from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
+
+            found = calibrate_by(method, problem, camera_name)
+            _refuse_misfit(found)
+            warnings = _unused(points, f"the method is {method}")
+        else:
+            solution, rejected = _solved(problem, options, outliers, choice)
+            if known_target is not None:
+                solution = replace(solution, target=known_target)
+            if solution.refusal:
+                raise DegenerateGeometryError(solution.refusal)
+            found = calibration_of(
+                solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
+            )
+            _refuse_misfit(found)
+            warnings = _about_target(found, solution, choice)
+        if isinstance(intrinsics, Calibration):
+            found = with_given_covariance(found, intrinsics)
+        if isinstance(intrinsics, (Camera, Calibration)) and (why := undistorted_before(points, intrinsics)):
+            warnings = (*warnings, why)
+        return replace(found, warnings=(*found.warnings, *warnings), judgement=assess)
+    except DegenerateGeometryError as error:
+        text, copies = _true_cause(points, type) or str(error), repeated_views(points)
+        if copies:
+            text += (
+                f"; the rows of {len(copies)} of {points.n_views} views are given twice, in the view itself "
+                "or in another one"
+            )
+        # The code that raised this does not know the points' file, so its name is added here.
+        if points.lines is not None and not text.startswith(points.source):
+            text = f"{points.source}: {text}"
+        if text == str(error):
+            raise
+        raise DegenerateGeometryError(text) from error
+
+
+def _true_cause(points: Correspondences, type: int) -> str:
+    """Why points are refused, if it is another cause than what the refusal says; else ""."""
+    from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, proportions, unlike_axes
+
+    found = proportions(points) if type in (1, 2) else None
+    return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
+
+
+def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
+    """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
+    if outliers == "reject":
+        from neurocal_cli.calibration.outlier_rejection import fit_robustly
+
+        solution, rejected = fit_robustly(problem, options)
+    else:
+        solution, rejected = fit(problem, options), Rejected()
+    if choice != "given":
+        from neurocal_cli.calibration.rich_choice import with_rich_lens
+        from neurocal_cli.calibration.target_choice import with_target
+
+        solution, rejected = with_target(problem, solution, rejected, options, choice)
+        solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
+    if solution.state.model in WITH_XI:
+        from neurocal_cli.calibration.lens_choice.xi_profile import with_all_minima
+
+        solution = with_all_minima(solution)
+    return solution, rejected
+
+
+def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
+    """Estimate the poses of a given camera's views (type 3) from all points, without outlier rejection.
+
+    Raises InputError or DegenerateGeometryError if the points do not determine the poses.
+    """
+    given = camera_of(camera)
+    problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)
+    solution = fit(problem, options_for("lm", _STARTS, seed))
+    found = calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+    return with_given_covariance(found, camera) if isinstance(camera, Calibration) else found
+
+
+def _distortion_of(method: str, distortion: str) -> str:
+    """The distortion model for a method other than neuro."""
+    if distortion in ("plumb-line", "rich"):
+        raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
+    if distortion == "auto":
+        return "k1" if method == "tsai" else "none"
+    return distortion
+
+
+def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
+    """Warnings about a target that stays as given."""
+    if choice != "given" and solution.straight_lines is not None:
+        from neurocal_cli.calibration.target_choice import lines_that_are_bent
+
+        bent = lines_that_are_bent(solution, found.unit)
+        if bent:
+            return (bent,)
+    if found.target is not None:
+        return ()
+    if choice in ("flat", "free"):
+        return (_NOT_FOUND,)
+    given = choice == "given"
+    why = "the target is given" if given else "the points and views are too many, or too few"
+    return _unused(found.points, why)
+
+
+def _unused(points: Correspondences, why: str) -> tuple[str, ...]:
+    """Warn that the points' standard deviations are not used."""
+    if points.world_std is None:
+        return ()
+    return (f"the points' standard deviations sX,sY,sZ are not used, because {why}",)
+
+
+def _refuse_misfit(calibration: Calibration) -> None:
+    """Refuse a camera that does not fit its points at all."""
+    spread = np.sqrt(calibration.points.pixels.var(axis=0).sum())
+    if calibration.rmse_px < _MISFIT * spread:
+        return
+    given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
+    raise DegenerateGeometryError(
+        f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
+        f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
+    )
+
+
+def _check_options(
+    method: str, trainer: str, distortion: str, outliers: str, target: str, starts: int, seed: int
+) -> None:
+    check_choice("method", method, METHODS)
+    check_choice("trainer", trainer, TRAINERS)
+    check_choice("distortion", distortion, DISTORTIONS)
+    check_choice("outliers", outliers, OUTLIERS)
+    check_choice("target", target, TARGETS)
+    if method != "neuro" and target in ("flat", "free"):
+        raise UsageError(f"target {target} needs the method neuro, but the method is {method}; leave it out")
+    if not isinstance(starts, (int, np.integer)) or starts < 2:
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
+    check_seed(seed)

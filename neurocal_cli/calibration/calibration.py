@@ -1,0 +1,291 @@
+"""`Calibration`, the result: the camera, the poses, their standard deviations and how they were estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import field
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WITH_XI
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.rich_lens import NODES
+from neurocal_cli.errors import UsageError
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import Target
+
+_ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # what A11, A12, A22, A13, A23 determine
+
+
+class StopReason(str, Enum):
+    """Why the estimation stopped; the value is the text shown to the user."""
+
+    CONVERGED = "converged: the reprojection error is at a minimum"
+    MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
+    NO_AGREEMENT = "no two of the random starts agreed"
+    NOT_MINIMISED = "solved; the method does not minimise the reprojection error"
+
+
+@frozen_dataclass(eq=False)
+class NetworkRecord:
+    """Record of the training, kept with the result; errors and losses are in pixels."""
+
+    W: Array  # (3, 3) output weights, ``A = S1 W``, ``W[2, 2] = 1``
+    # By view, (3, 4) hidden weights; ``[R | t] = s2 V S2`` up to the scale that gamma leaves free.
+    V: Mapping[str, Array]
+    S1: Array  # (3, 3) from normalised to real pixels
+    S2: Mapping[str, Array]  # by view, (4, 4) from real to normalised world; ``P = S1 W V S2`` up to scale
+    starts: int  # number of random starts over all views
+    agreed: int  # least number of starts in any view that ended at its best result
+    iterations: int  # of training the network (epochs for backprop), summed over the starts
+    refine_iterations: int  # of bundle adjustment on the reprojection error (3)
+    loss: float  # rms of the network's error (5) after training
+    rmse_before: float  # reprojection error (3) before bundle adjustment
+    rmse_after: float
+    curve: tuple[float, ...] = ()  # learning curve: loss along the training of the best start
+
+
+@frozen_dataclass
+class StraightLines:
+    """Record of a distortion that was estimated from straight lines alone."""
+
+    n_lines: int  # counted in each view that shows them
+    n_points: int  # on these lines
+    centre: tuple[float, float]  # (u, v) [px] of the distortion
+    rms_before: float  # px; distance of the points from straight lines before undistortion
+    rms_after: float  # px; the same after it
+
+
+@frozen_dataclass(eq=False)
+class ViewResult:
+    """One view's pose."""
+
+    pose: Pose
+    std: Mapping[str, float]  # of R_x, R_y, R_z [rad], t_x, t_y, t_z [world unit]; 0 for a given pose
+    n_points: int
+    rmse_px: float
+    fixed: bool = False  # whether the pose was given
+
+
+@frozen_dataclass(eq=False)
+class Rejected:
+    """Outliers: points and views that were left out because they contradict the others."""
+
+    points: Correspondences | None = None  # with their lines in the file; None if there are none
+    # (M,) reprojection error of each point; nan where it has none, and in views left out as a whole.
+    error_px: Array = field(default_factory=lambda: np.zeros(0))
+    # Those that were left out as a whole, each with the reason.
+    views: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.error_px)
+
+
+@frozen_dataclass
+class Verdict:
+    """Verdict on a calibration: one word, with reasons and advice."""
+
+    word: str  # "good", "usable" or "poor"
+    reasons: tuple[str, ...]  # what is wrong, the worst first; empty for a good calibration
+    advice: tuple[str, ...]  # what to do about it
+    # The measures behind it (`calibration.verdict.evidence.Evidence`); nan if not determined.
+    measures: Mapping[str, float]
+
+
+@frozen_dataclass(eq=False)
+class Calibration:
+    """A calibrated camera.
+
+    Attributes
+    ----------
+    intrinsics : Intrinsics
+    std : dict
+        Standard deviation of alpha_u, alpha_v, u0, v0 [px] and theta [rad]; 0 for given ones.
+    fixed : frozenset of str
+        Names of the intrinsic parameters that were given.
+    views : dict of ViewResult by view name
+    points : Correspondences
+        The points it was calibrated from, without outliers. If the target was estimated with the camera,
+        their world coordinates are the estimated ones.
+    rejected : Rejected
+    target : Target or None
+        The estimated target; None if it was used as given.
+    target_stretched : float
+        If the given target was selected: the probability that its print is nevertheless stretched or leans by
+        a few thousandths, which the standard deviations include. 0 if it is below 0.001.
+    judgement : Verdict or callable, optional
+        The verdict read from a file, or the function that computes it from this calibration; see `verdict`.
+    lens_choice : dict of float by distortion model [px]
+        The candidate models of ``distortion="auto"`` and their cross-validation errors.
+    would_take : frozenset of str
+        Distortion models that would have been selected if they were `preferred`; any other preference has no
+        effect. Not in files.
+    covariance : (n, n) array
+        Of the free intrinsic parameters, in the order of `covariance_names`; `views` holds the standard
+        deviations of the poses.
+    given_covariance : (n, n) array
+        Of a given camera's parameters (type 3), in the order of `given_names`, as far as it is known. The
+        standard deviations of the poses include it, and those of the given parameters themselves are 0.
+    warnings : tuple of str
+        Warnings, which the command prints.
+    """
+
+    intrinsics: Intrinsics
+    std: Mapping[str, float]
+    fixed: frozenset[str]
+    views: Mapping[str, ViewResult]
+    points: Correspondences
+    type: int
+    method: str
+    trainer: str
+    seed: int
+    converged: bool
+    stop_reason: str
+    rmse_px: float
+    max_px: float
+    distortion_model: str = "none"
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    covariance_names: tuple[str, ...] = ()
+    given_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    given_names: tuple[str, ...] = ()
+    network: NetworkRecord | None = None
+    straight_lines: StraightLines | None = None
+    camera_name: str = "camera"
+    warnings: tuple[str, ...] = ()
+    rejected: Rejected = field(default_factory=Rejected)
+    target: Target | None = None
+    lens_choice: Mapping[str, float] = field(default_factory=dict)
+    target_stretched: float = 0.0
+    would_take: frozenset[str] = frozenset()
+    judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Verdict on this calibration, computed when it is first read; None without points of its own."""
+        return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    @property
+    def n_rejected(self) -> int:
+        """Number of points that were left out."""
+        return len(self.rejected)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera without poses and statistics."""
+        distortion = Distortion(self.distortion_model, self.distortion)
+        return Camera(self.intrinsics, distortion, self.image_size, self.camera_name)
+
+    @property
+    def known_covariance(self) -> tuple[tuple[str, ...], Array]:
+        """Names and covariance of the parameters whose uncertainty is known, whether estimated or given."""
+        if self.covariance_names:
+            return self.covariance_names, self.covariance
+        return self.given_names, self.given_covariance
+
+    @property
+    def std_of_given(self) -> dict[str, float]:
+        """Standard deviations that given parameters have in their own calibration, as far as it is known."""
+        std = np.sqrt(np.maximum(np.diagonal(self.given_covariance), 0.0)).tolist()
+        return dict(zip(self.given_names, std, strict=True))
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) camera matrix A, skew included."""
+        return self.intrinsics.A
+
+    @property
+    def relative_std_of_scale(self) -> float:
+        """Relative standard deviation of the scale in the image centre, the larger of u and v.
+
+        The scale is alpha, or alpha / (1 + xi) in models with xi.
+        """
+        shares = [self.std[name] / getattr(self.intrinsics, name) for name in ("alpha_u", "alpha_v")]
+        if self.distortion_model in WITH_XI and {"alpha_u", "xi"} <= set(self.covariance_names):
+            xi = self.covariance_names.index("xi")
+            for n, name in enumerate(("alpha_u", "alpha_v")):
+                gradient = np.zeros(len(self.covariance_names))
+                gradient[self.covariance_names.index(name)] = 1 / getattr(self.intrinsics, name)
+                gradient[xi] = -1 / (1 + self.distortion[0])
+                shares[n] = float(np.sqrt(gradient @ self.covariance @ gradient))
+        return max(shares)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) [px], if known."""
+        return self.points.image_size
+
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.points.unit
+
+    @property
+    def rotations(self) -> dict[str, Array]:
+        """(3, 3) rotation of each view."""
+        return {name: view.pose.R for name, view in self.views.items()}
+
+    @property
+    def translations(self) -> dict[str, Array]:
+        """(3,) translation of each view [world unit]."""
+        return {name: view.pose.t for name, view in self.views.items()}
+
+    @property
+    def projections(self) -> dict[str, Array]:
+        """(3, 4) matrix P = A [R | t] of each view, paper eq. (1)."""
+        return {name: self.K @ view.pose.D for name, view in self.views.items()}
+
+
+def free_entries(calibration: Calibration, held: Collection[str] = ()) -> NDArray[np.bool_]:
+    """(5 + K,) which of A11, A12, A22, A13, A23 and the coefficients are neither given nor held."""
+    names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
+    return np.array([name not in calibration.fixed and name not in held for name in names])
+
+
+def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and the distortion coefficients the views' points alone determined.
+
+    Coefficients from straight lines are not among them, nor a rich lens's nodes, which need their prior.
+    """
+    from_lines = calibration.straight_lines is not None
+    names = coefficient_names(calibration.distortion_model) if from_lines else NODES
+    return free_entries(calibration, names)
+
+
+def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
+    """Convert any of the accepted types to a `Camera`; a matrix has no distortion.
+
+    Raises UsageError for another type, and InputError for a matrix that is no camera matrix.
+    """
+    if isinstance(given, Camera):
+        return given
+    if isinstance(given, Calibration):
+        return given.camera
+    if isinstance(given, Intrinsics):
+        return Camera(given)
+    if isinstance(given, (np.ndarray, list, tuple)):
+        return Camera(Intrinsics.from_matrix(np.asarray(given)))
+    raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")
+
+
+def undistorted_before(points: Correspondences, given: Camera | Calibration) -> str:
+    """Why a camera with distortion does not belong to points that are undistorted already; "" if it may.
+
+    A camera that was calibrated from undistorted points has the distortion that these have left.
+    """
+    if not points.undistorted or camera_of(given).distortion.is_identity:
+        return ""
+    if isinstance(given, Calibration) and given.points.undistorted:
+        return ""
+    return (
+        f"{points.source}: the points are undistorted already, so the camera's distortion "
+        f"({camera_of(given).distortion.model}) is not theirs, unless the camera was calibrated from "
+        "undistorted points; give the points as they were measured, or a camera without distortion"
+    )

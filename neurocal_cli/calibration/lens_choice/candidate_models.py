@@ -1,0 +1,383 @@
+"""Fit all candidate distortion models to the same points, each starting from a simpler one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.covariance import Covariance, covariance
+from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_views, reduced
+from neurocal_cli.adjustment.normal_equations import unit_diagonal
+from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
+from neurocal_cli.adjustment.open_coefficients import radius
+from neurocal_cli.adjustment.outlier_views import free_networks, least_of_free_networks
+from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle, normal_blocks
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.view_covariance import counting_views
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back, normal_part
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import (
+    NOT_RADIAL,
+    POLYNOMIAL_MODELS,
+    coefficient_names,
+    distort,
+    pinhole_coefficients,
+    radial_part,
+)
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.errors import DegenerateGeometryError
+
+# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
+# tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
+# the tightest that give these results; penalties and significance tests are chi-squared levels, as noted.
+#
+# Numbers of free fisheye coefficients with the fixed ones: higher ones need points far from the axis.
+_FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
+# Number of coefficients that each model adds to the next simpler one.
+_NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
+# Nested models, from simple to rich.
+_CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
+_SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
+# The same for the quadratic models of the free networks. Where these give less, full descents of the networks
+# never gave more than 1.2; tests/test_free_networks.py repeats it.
+_FAR_FROM_SHORT = 1.15
+_MOST_VIEWS = 60  # views that are compared with free networks, to limit the time
+_BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
+_LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in one case of 200
+# Share of the gain required by the criterion that the rational model must predict; with less, it was never
+# selected (tests/test_model_selection.py, slow: 100 scenes).
+_PROMISING = 0.5
+# The selection admits a model with this number of coefficients more than another one only if it lowers the
+# rms error of held-out data by this factor.
+MORE, FAR_BETTER = 2, 1.25
+_ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
+_STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
+_SPARE = 1.3  # fewest equations per unknown
+_WIDE = 0.7  # least radius of the points for a fisheye model: 35 degrees from the axis
+_TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
+_LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; all terms together are about 1
+
+
+@frozen_dataclass(eq=False)
+class Candidate:
+    """A distortion model fitted to the points."""
+
+    problem: Problem  # with this model, and a penalty that keeps it monotonic if needed
+    adjusted: Adjusted
+    lost: Array  # cross-validation: squared error of each part of the data when it is held out
+    noise: bool  # whether its coefficients are only noise
+    not_monotonic: str | None  # where it is not monotonic: within the "points" or within the "image"
+    determined: bool  # whether the points determine all parameters
+    weak: bool  # whether a focal length is so poorly determined that other local minima may be lower
+
+    @property
+    def sound(self) -> bool:
+        """Whether it may be selected."""
+        return not self.noise and self.not_monotonic is None and self.determined
+
+    @property
+    def coefficients(self) -> int:
+        """Number of estimated distortion coefficients."""
+        return int(self.problem.free_camera[5:].sum())
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.adjusted.cost.sum())
+
+    @property
+    def held_out(self) -> float:
+        """Sum of squared errors of data that are held out."""
+        return float(self.lost.sum())
+
+    def criterion(self, n: float) -> float:
+        """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
+        penalty = max(np.log(n), _LEAST_PENALTY) * self.coefficients
+        return float(n * np.log(max(self.cost, 1e-300)) + penalty)
+
+
+def supported(problem: Problem, model: str) -> Problem | None:
+    """The problem with this model; None if there are too few points for it."""
+    with_model = problem.with_model(model)
+    equations = problem.views.n_distinct_equations
+    if model != "none" and equations < _SPARE * with_model.n_parameters + 4:
+        return None
+    return with_model
+
+
+def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]:
+    """Fit a fisheye with all its coefficients, starting from a state of any model."""
+    fisheye = problem.with_model("fisheye")
+    k = _coefficients(state, "fisheye", radius(problem.views, state))
+    return fisheye, fisheye.adjust(replace(state, model="fisheye", k=k), _STEPS)
+
+
+def fit_candidates(
+    problem: Problem, state: CameraState, by_views: bool, wanted: str | None = None
+) -> dict[str, Candidate]:
+    """Fit every model, starting from a state of any of them.
+
+    Cross-validation holds out views or points. If only one model is wanted, the others serve as starts and
+    need not be monotonic.
+    """
+    return _Chain(problem, by_views, radius(problem.views, state), wanted).all_from(state)
+
+
+def judged_again(
+    fitted: dict[str, Candidate], by_views: bool, repeated: RepeatedPoses
+) -> dict[str, Candidate]:
+    """Assess the same fits again, counting views that repeat a pose as one."""
+    again = {}
+    for model, candidate in fitted.items():
+        reach = radius(candidate.problem.views, candidate.adjusted.state)
+        found = _assessed(candidate.problem, candidate.adjusted, by_views, reach, repeated)
+        if found is not None:
+            again[model] = found
+    return again
+
+
+@frozen_dataclass(eq=False)
+class _Chain:
+    """Fits a chain of models to one problem."""
+
+    problem: Problem
+    by_views: bool
+    reach: float  # normalised radius of the farthest point
+    wanted: str | None
+
+    def all_from(self, state: CameraState) -> dict[str, Candidate]:
+        """Fit all models that the points support, each from the best of the simpler ones."""
+        fitted: dict[str, Candidate] = {}
+        least = np.inf  # any fit replaces a pinhole
+        if state.model != "none":
+            least = float((point_residuals(self.problem.views, state) ** 2).sum())
+        for model in ("none", *_CHAIN):
+            problem = supported(self.problem, model)
+            if problem is None or (model == "rational" and self._promises_little(problem, fitted)):
+                continue
+            candidate = self._fit(problem, state)
+            if candidate is None:
+                continue
+            fitted[model] = candidate
+            if model != "none" and candidate.not_monotonic is None and candidate.cost <= least:
+                state, least = candidate.adjusted.state, candidate.cost
+        for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
+            self._fit_again(simple, more, fitted)
+        fisheyes = self._fisheyes(state)
+        found = self._monotonic([*fitted.values(), *fisheyes])
+        fitted = dict(zip(fitted, found, strict=False))
+        best = _fewest_coefficients(found[len(fitted) :], self.problem.views)
+        return fitted if best is None else fitted | {"fisheye": best}
+
+    def _promises_little(self, rational: Problem, fitted: dict[str, Candidate]) -> bool:
+        """Whether the rational model can be skipped, because the criterion will not select it.
+
+        Its descent is long, so its gain is predicted from the quadratic model at the minimum of `plumb_bob`.
+        """
+        simpler = fitted.get("plumb_bob")
+        if simpler is None or self.wanted == "rational" or rational.penalty is not None:
+            return False
+        free, state = rational.free_camera, simpler.adjusted.state
+        start = replace(state, model="rational", k=_coefficients(state, "rational", self.reach))
+        normal, _ = normal_blocks(rational.views.batches, start)
+        q = reduced(normal, free, rational.free_poses)
+        S, scale = unit_diagonal(q.S.sum(axis=0))
+        g = scale * q.g.sum(axis=0)
+        if not np.isfinite(S).all():
+            return False
+        gain = float(g @ np.linalg.lstsq(S, g, rcond=_ROUNDING)[0])
+        return (
+            gain < _PROMISING * _LEAST_PENALTY * _NEW["rational"] * simpler.cost / rational.views.n_equations
+        )
+
+    def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
+        """Fit a model again from the next richer one if it is missing or far worse than that."""
+        problem = supported(self.problem, simple)
+        if problem is None or more not in fitted:
+            return
+        cost = fitted[simple].cost if simple in fitted else np.inf
+        if cost < _BEHIND * fitted[more].cost:
+            return
+        candidate = self._fit(problem, fitted[more].adjusted.state)
+        if candidate is not None and candidate.cost < cost:
+            fitted[simple] = candidate
+
+    def _fisheyes(self, state: CameraState) -> list[Candidate]:
+        """Fit fisheyes with one, two and four coefficients, each from the previous one."""
+        problem = supported(self.problem, "fisheye")
+        # The initial pinhole may underestimate the angles of a fisheye's points.
+        if problem is None or max(self.reach, radius(problem.views, state)) < _WIDE:
+            return []
+        found = []
+        for count, tail in _FISHEYES:
+            candidate = self._fit(replace(problem, fixed=problem.fixed | tail), state, count)
+            if candidate is not None:
+                found.append(candidate)
+                state = candidate.adjusted.state
+        return found
+
+    def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
+        """Fit promising models again that are not monotonic in image corners without points."""
+        lowest = min((c.cost for c in fitted), default=0.0)
+        near = [
+            c.not_monotonic == "image"
+            and not c.noise
+            and c.cost <= _BEHIND * lowest
+            and (self.wanted == c.problem.distortion.model if self.wanted else not _too_rich(c, fitted))
+            for c in fitted
+        ]
+        if not any(near) or falls_short(self.problem.views, fitted):
+            return fitted
+        return [self._made_monotonic(c) if bad else c for c, bad in zip(fitted, near, strict=True)]
+
+    def _made_monotonic(self, candidate: Candidate) -> Candidate:
+        found = fit_monotonic(candidate.problem, candidate.adjusted)
+        if found is not None:
+            return _assessed(*found, self.by_views, self.reach) or candidate
+        # The image circle of a wide lens may end within the image.
+        return replace(candidate, not_monotonic=None) if candidate.problem.distortion.wide else candidate
+
+    def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
+        """Fit one model; None if it did not converge, or if a part of the data is indispensable."""
+        model = problem.distortion.model
+        if state.model in WIDE and state.model not in (model, "fisheye"):
+            similar = similar_states(state, "fisheye", farthest_angle(self.problem.views, state))
+            state = similar[0] if similar else replace(state, model="none", k=np.zeros(0))
+        start = replace(state, model=model, k=_coefficients(state, model, self.reach, most))
+        steps = _RATIONAL_STEPS if model == "rational" else _STEPS
+        adjusted = problem.adjust(start, steps)
+        if not adjusted.converged and model != "none":
+            return None
+        return _assessed(problem, adjusted, self.by_views, self.reach)
+
+
+def _assessed(
+    problem: Problem, adjusted: Adjusted, by_views: bool, reach: float, repeated: RepeatedPoses | None = None
+) -> Candidate | None:
+    """A fit with the measures for the selection; None if a part of the data is indispensable."""
+    views, state, free = problem.views, adjusted.state, problem.free_camera
+    held = None if problem.penalty is None else normal_part(problem.penalty, state, free)
+    if by_views:
+        lost = held_out_views(adjusted.normal, free, problem.free_poses, held, repeated)
+    else:
+        lost = held_out_points(views, state, free, problem.free_poses, held)
+    if not np.isfinite(lost).all():
+        if state.model != "none":
+            return None
+        lost = np.full_like(lost, np.inf)
+    given = adjusted.normal, free, problem.free_poses, views.n_equations
+    cov = covariance(*given)
+    if repeated is not None:
+        cov = counting_views(cov, *given, repeated)
+    noise = _noise(problem.distortion.model, state, reach, cov.entries)
+    bad = folds_back(problem, state)
+    determined = _determined(problem, state, cov)
+    return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
+
+
+def _too_rich(candidate: Candidate, fitted: Iterable[Candidate]) -> bool:
+    """Whether a sound model with far fewer coefficients predicts too well for this one to be selected."""
+    return any(
+        c.sound
+        and c.coefficients + MORE < candidate.coefficients
+        and c.held_out <= FAR_BETTER**2 * candidate.held_out
+        for c in fitted
+    )
+
+
+def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
+    """Whether separate free networks fit the views far better than the best common camera.
+
+    Of many views, an evenly spaced subset is used.
+    """
+    best = min(fitted, key=lambda c: c.cost)
+    n = views.n_views
+    some = np.linspace(0, n - 1, min(n, _MOST_VIEWS)).round().astype(np.intp)
+    state, normal = best.adjusted.state, best.adjusted.normal[some]
+    cost = float(normal[:, -1, -1].sum())
+    if cost <= _FAR_FROM_SHORT**2 * float(least_of_free_networks(normal).sum()):
+        return False
+    own = free_networks(views.subset(some), state.of_views(some), _STEPS)
+    return cost > _SHORT**2 * float(own.sum()) + 1e-20
+
+
+def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
+    """The fisheye with the best criterion."""
+    some = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
+    n = worth(views, some)
+    return min(some, key=lambda candidate: candidate.criterion(n), default=None)
+
+
+def worth(views: Views, fitted: Collection[Candidate]) -> float:
+    """Effective number of residuals, given the correlation of neighbours.
+
+    The correlation is that of the closest fit, because a model that is too simple adds correlation.
+    """
+    if not fitted:
+        return 1.0
+    closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
+    return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)))
+
+
+def _determined(problem: Problem, state: CameraState, cov: Covariance) -> bool:
+    try:
+        refuse_undetermined(problem, state, cov)
+    except DegenerateGeometryError:
+        return False
+    return True
+
+
+def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:
+    """Whether coefficients are noise: large ones that cancel, or insignificant new ones.
+
+    New ones are those that the next simpler model lacks; they are tested together. A fisheye has none.
+    """
+    k = state.k
+    if (np.abs(_terms(model, reach) * k) > _LARGEST_TERM).any():
+        return True
+    new = _NEW.get(model, 0)
+    if not new:
+        return False
+    if not np.isfinite(cov).all():
+        return True
+    inverse = np.linalg.pinv(cov[-new:, -new:], hermitian=True)
+    return bool(k[-new:] @ inverse @ k[-new:] < _TOLD_APART * new)
+
+
+def _terms(model: str, reach: float) -> Array:
+    """Derivative of the relative radius by each coefficient, at the farthest point."""
+    if model == "fisheye":
+        return np.asarray(np.arctan(reach) ** np.array([2.0, 4.0, 6.0, 8.0]))
+    powers = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
+    return np.asarray(reach ** powers[: len(coefficient_names(model))])
+
+
+def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
+    """Coefficients of another model with nearly the same distortion; for a fisheye the first `most`."""
+    names = coefficient_names(model)
+    old = dict(zip(coefficient_names(state.model), state.k.tolist(), strict=True))
+    fisheye = model == "fisheye"
+    estimated = set(names[:most] if fisheye else names)
+    if fisheye == (state.model == "fisheye") and {name for name, k in old.items() if k} <= estimated:
+        return np.array([old.get(name, 0.0) for name in names])
+    # Least squares up to the farthest point: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted radius of the
+    # undistorted radius r, where q is r or a fisheye's angle.
+    r = np.linspace(0.05, 1, 60) * reach
+    distorted = distort(state.model, radial_part(state.model, state.k), r, np.zeros_like(r))[0]
+    q = np.arctan(r) if fisheye else r
+    of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
+    powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
+    if not np.isfinite(distorted).all():  # there is a pole
+        return pinhole_coefficients(model)
+    found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
+    new = {name: k for name, k in old.items() if name in NOT_RADIAL}
+    new.update(zip(of_radius, found, strict=True))
+    return np.array([new.get(name, 0.0) for name in names])

@@ -1,0 +1,149 @@
+"""The fit of one distortion model: other starts, the denominator of a thin prism, monotonicity.
+
+Other starts. The minimum of a strong distortion is found only from a start near it. If the residuals of
+neighbours are correlated (as a wrong distortion or a board that is not flat leaves them), or if a focal
+length is poorly determined, all models are fitted from this start and from others, each model from a simpler
+one. The best fit of the wanted model is the result. Wide lenses are reached from the fisheye, thin-prism and
+tilted models from the rational model. With many views, a few of them are used to test whether another start
+leads to a lower minimum.
+
+Denominator. k4, k5 and k6 of a thin-prism or tilted lens are optional in OpenCV (CALIB_RATIONAL_MODEL). In an
+ordinary lens they are nearly degenerate with k1, k2 and k3. So they stay 0 unless the Bayesian information
+criterion decidedly favours them.
+
+Given distortion. The networks model a pinhole. A given distortion is removed from the pixels before training
+(`Problem`), and the final bundle adjustment uses the observed pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.observability import is_weak
+from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.restart import is_elsewhere, of_few_views
+from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, folds_back
+from neurocal_cli.calibration.lens_choice.simpler_model import undetermined_coefficients
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WITH_PRISM
+from neurocal_cli.errors import DegenerateGeometryError
+
+# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
+# had a larger correlation.
+_CORRELATED = 0.15  # correlation of neighbouring residuals
+FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
+_LOWER = 0.999  # ratio of squared errors below which a minimum is lower
+DENOMINATOR = frozenset({"k4", "k5", "k6"})
+_STEPS = 150  # many, because the coefficients are nearly degenerate
+# Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
+DECISIVE = 10.0  # difference of the criterion: odds of 150
+
+Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem
+
+
+def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
+    """The better of a solution and the results of other starts, if it may be a local minimum.
+
+    A solution without an estimated distortion is returned unchanged.
+    """
+    problem = solution.problem
+    # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
+    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
+        return solution
+    few = of_few_views(solution, FEW_VIEWS)
+    certain = few is solution or is_elsewhere(few, solution)
+    if certain or total_cost(_lowest(few, more_starts)) < _LOWER * total_cost(few.adjusted):
+        return replace(solution, adjusted=_lowest(solution, more_starts))
+    return solution
+
+
+def _may_be_local(solution: Solution) -> bool:
+    if not solution.adjusted.converged or is_weak(solution.problem, solution.state, solution.covariance):
+        return True
+    return not correlation(solution.problem.views, solution.residuals) < _CORRELATED
+
+
+def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
+    """The lowest minimum of the wanted model from all starts."""
+    # Imported here, because most calibrations need no other starts.
+    from neurocal_cli.calibration.lens_choice.candidate_models import fit_candidates
+    from neurocal_cli.camera.similar_lens import similar_states
+
+    problem, best = solution.problem, solution.adjusted
+    wanted = problem.distortion.model
+    fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
+    for start in (best.state, *more_starts(problem)):
+        found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
+        if found is None or (fitted == wanted and not found.cost < total_cost(best)):
+            continue
+        near, state = [found.adjusted], found.adjusted.state
+        if fitted != wanted:
+            similar = similar_states(state, wanted, farthest_angle(problem.views, state))
+            near = [replace(found.adjusted, state=one) for one in similar]
+        best = min([best, *map(problem.adjust, near)], key=total_cost)
+    return best
+
+
+def total_cost(adjusted: Adjusted) -> float:
+    """Squared error of all views."""
+    return float(adjusted.cost.sum())
+
+
+def with_denominator_if_supported(solution: Solution) -> Solution:
+    """Add k4, k5 and k6 if that explains decidedly more, or if the model is not monotonic without them."""
+    problem, views = solution.problem, solution.problem.views
+    if views.n_equations - problem.n_parameters < 2 * len(DENOMINATOR):
+        return solution
+    richer = replace(problem, fixed=problem.fixed - DENOMINATOR)
+    found = richer.adjust(solution.adjusted, _STEPS)
+    alike = correlation(views, point_residuals(views, found.state))
+    n = effective_number(views.n_equations, alike)
+    before, after = (max(total_cost(a), 1e-300) for a in (solution.adjusted, found))
+    told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + DECISIVE
+    better = told and folds_back(problem, found.state) is None
+    if not better and folds_back(problem, solution.state) is None:
+        return solution
+    return replace(solution, problem=richer, adjusted=found)
+
+
+def check_distortion(solution: Solution) -> Solution:
+    """Restore a given distortion, and check that an estimated one is monotonic.
+
+    An estimated distortion that is not monotonic in parts of the image without points is fitted again so that
+    it is, unless the points contradict that.
+
+    Raises DegenerateGeometryError if the estimated distortion is not monotonic among the points, or cannot be
+    made so within the image.
+    """
+    problem = solution.problem
+    distortion = problem.distortion
+    if distortion.model == "none":
+        return solution
+    if not problem.free_distortion:
+        # A given distortion may fold the image's corners, but `problem_for` has checked these points.
+        problem, start = problem.as_seen(solution.state)
+        adjusted = problem.adjust(replace(solution.adjusted, state=start))
+        return replace(solution, problem=problem, adjusted=adjusted)
+    where = folds_back(problem, solution.state)
+    if where is None:
+        return solution
+    if where == "image" and solution.shared is None:
+        # The slopes are those of polynomials; other wide models end with their image circle.
+        polynomial = not distortion.wide or distortion.model == "fisheye"
+        found = fit_monotonic(problem, solution.adjusted) if polynomial else None
+        if found is not None:
+            return replace(solution, problem=found[0], adjusted=found[1])
+        if distortion.wide:  # its image circle may end within the image
+            return solution
+    folded = (
+        f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "
+        f"the {where}; choose another --distortion, or give points nearer to the image's corners"
+    )
+    raise DegenerateGeometryError(undetermined_coefficients(problem, solution.adjusted) or folded)

@@ -1,0 +1,271 @@
+"""``--distortion auto``: select the simplest distortion model that the data support.
+
+The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one. They are
+compared by their cross-validation error in five folds of the views (or of the points of a single view). The
+model with the lowest error is tied with all models whose error is within 0.9 % of it, and with simpler
+models whose error exceeds it by at most the standard error of the five folds. Among the tied models the
+Bayesian information criterion (Schwarz 1978) decides, n log E + p log n, where n is the effective number of
+residuals: it accounts for the correlation of neighbours and for views that repeat a pose (`repeated_poses`),
+which also share a fold.
+
+Models with over two coefficients more than the criterion alone would select are excluded, unless they predict
+far better than all others. Also excluded are models that did not converge, have too few points, or are not
+monotonic (`monotonic_fit`). Models whose coefficients are strongly correlated must lower the cross-validation
+error over several views by 5 %. Models of wide lenses (`WIDE`) are candidates only if points lie far from the
+axis and the criterion decidedly favours them over all ordinary models, because near the axis all lenses are
+alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
+from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
+from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.adjustment.restart import is_elsewhere, of_few_views
+from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.lens_choice.candidate_models import (
+    FAR_BETTER,
+    MORE,
+    Candidate,
+    falls_short,
+    fit_candidates,
+    judged_again,
+    worth,
+)
+from neurocal_cli.calibration.lens_choice.given_model import DECISIVE, FEW_VIEWS, Starts
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.geometry import Array
+
+# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
+# 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
+# tests/test_rendered_sets.py.
+_TIE = 0.009  # relative difference of rms errors that counts as equal
+# "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
+_CERTAIN = 2.0
+_DECIDEDLY = 1.03
+_FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
+_WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
+_MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
+_CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
+_BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
+
+
+def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
+    """Fit all models, starting from a solution with any of them, and select one.
+
+    `more_starts` are tried in case the first one leads to a local minimum. The `preferred` model is selected
+    unless another predicts decidedly better. The result has the cross-validation errors of all fitted models.
+    It is a refusal if the distortion is strong and the model that fits is not monotonic inside the image.
+    """
+    problem, views = solution.problem, solution.problem.views
+    by_views = _views_can_spare_any(solution)
+    fitted = fit_candidates(problem, solution.state, by_views)
+    if more_starts is not None:
+        _look_elsewhere(fitted, solution, more_starts, by_views)
+    if not fitted:  # not even the pinhole converged
+        return replace(solution, model_errors={})
+    fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
+    if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
+        fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
+    closest = min(fitted.values(), key=lambda c: c.cost).adjusted.state
+    repeated = repeated_poses(views, closest, point_residuals(views, closest))
+    if not repeated.none:
+        by_views = _views_can_spare_any(solution, repeated)
+        fitted = judged_again(fitted, by_views, repeated) or fitted
+    name, good = _best(fitted, views, repeated)
+    chosen = fitted[preferred if preferred in good else name]
+    n, px = len(views.index), views.pixel_scale
+    iterations = solution.adjusted.iterations + chosen.adjusted.iterations
+    return replace(
+        solution,
+        problem=chosen.problem,
+        adjusted=replace(chosen.adjusted, iterations=iterations),
+        would_take=solution.would_take | (good - {name}),
+        model_errors={name: float(np.sqrt(c.held_out / n)) * px for name, c in fitted.items()},
+        refusal=_refusal(fitted, chosen),
+    )
+
+
+def _look_elsewhere(
+    fitted: dict[str, Candidate], solution: Solution, more_starts: Starts, by_views: bool
+) -> None:
+    """Fit from other starts if the present fits may be local minima, and merge the results."""
+    problem, views = solution.problem, solution.problem.views
+    if (limit := _limit(views, fitted)) == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
+        return
+    for start in more_starts(problem):
+        _join(fitted, fit_candidates(problem, start, by_views), limit)
+        if (limit := _limit(views, fitted)) == 0:
+            return
+
+
+def _may_lead_lower(
+    fitted: dict[str, Candidate], limit: float, solution: Solution, more_starts: Starts
+) -> bool:
+    """Whether another start leads below the limit; with many views, tested on a few of them."""
+    if not np.isfinite(limit) or solution.problem.points.n_views <= FEW_VIEWS:
+        return True
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
+    few = of_few_views(whole, FEW_VIEWS)
+    if is_elsewhere(few, whole):
+        return True
+    limit *= float(few.adjusted.cost.sum()) / closest.cost
+    return any(
+        candidate.cost < limit
+        for start in more_starts(few.problem)
+        for candidate in fit_candidates(few.problem, start, by_views=False).values()
+    )
+
+
+def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
+    """Squared error below which the result of another start is accepted; 0: no other start is needed.
+
+    It is infinite if free networks fit far better or no model is sound. If a focal length is poorly
+    determined, another start must be better; if neighbouring residuals are correlated (as also on a board
+    that is not flat), much better.
+    """
+    if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
+        return np.inf
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    if closest.weak:
+        return _BETTER * closest.cost
+    alike = correlation(views, point_residuals(views, closest.adjusted.state)) > _CORRELATED
+    return _MUCH_BETTER * closest.cost if alike else 0.0
+
+
+def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: float) -> None:
+    """Merge other fits that are better, if any of them is below the limit."""
+    if min((c.cost for c in others.values()), default=np.inf) >= limit:
+        return
+    for model, candidate in others.items():
+        if model not in fitted or candidate.cost < fitted[model].cost:
+            fitted[model] = candidate
+
+
+def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
+    problem, adjusted = solution.problem, solution.adjusted
+    if problem.views.n_views == 1 or not problem.free_camera.any():
+        return False
+    free = problem.free_camera if adjusted.state.model == problem.distortion.model else problem.free
+    lost = held_out_views(adjusted.normal, free, problem.free_poses, repeated=repeated)
+    return bool(np.isfinite(lost).all())
+
+
+def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
+    """Whether neither a sound distortion model nor a camera for each view explains decidedly more."""
+    n, pinhole = worth(views, fitted.values()), fitted["none"]
+    lowest = min((c.criterion(n) for c in fitted.values() if c.sound), default=np.inf)
+    return pinhole.criterion(n) < lowest + DECISIVE and not falls_short(views, [pinhole])
+
+
+def _best(
+    fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses
+) -> tuple[str, AbstractSet[str]]:
+    """The model with the lowest criterion among those tied for the lowest cross-validation error.
+
+    The second result are all models that no other predicts decidedly better than.
+
+    Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
+    models, but among many models one is the best by chance.
+    """
+    eligible = _eligible(fitted, views.n_views > 1)
+    n = worth(views, eligible.values()) * repeated.worth
+    sound = _eligible(_without_wide(fitted, n), views.n_views > 1)
+    criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
+    most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + MORE
+    finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
+    few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
+    if not few:
+        return next(iter(sound)), set()  # cross-validation is impossible, so the simplest
+    pool = {
+        name: candidate
+        for name, candidate in finite.items()
+        if name in few
+        or all(predicts_decidedly_better(candidate.lost, c.lost, repeated, FAR_BETTER) for c in few.values())
+    }
+    best = min(pool, key=lambda name: pool[name].held_out)
+    good = {
+        name
+        for name, candidate in eligible.items()
+        if np.isfinite(candidate.lost).all()
+        and not predicts_decidedly_better(pool[best].lost, candidate.lost, repeated, _DECIDEDLY)
+    }
+    tied = []
+    for name, candidate in pool.items():
+        excess = _by_fold(candidate.lost - pool[best].lost, repeated)
+        chance = np.sqrt(len(excess)) * excess.std()
+        simpler = candidate.coefficients < pool[best].coefficients
+        if excess.sum() <= max(2 * _TIE * pool[best].held_out, chance if simpler else 0.0):
+            tied.append(name)
+    return min(tied, key=lambda name: criterion[name]), good
+
+
+def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:
+    """Exclude models of wide lenses if ordinary ones are nearly as good, even ones that are not sound."""
+    ordinary = [c for name, c in fitted.items() if name not in WIDE and c.coefficients <= _MOST_ORDINARY]
+    ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
+    if not ordinary:
+        return fitted
+    lowest, least = min(c.criterion(n) for c in ordinary), min(c.held_out for c in ordinary)
+    return {
+        name: c
+        for name, c in fitted.items()
+        if name not in WIDE or (c.criterion(n) < lowest - DECISIVE and c.held_out <= (1 + 2 * _TIE) * least)
+    }
+
+
+def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
+    """Whether a fit predicts held-out data better than another by a given factor, and significantly.
+
+    `lost` and `others` are the squared errors of each part of the data when it is held out, `enough` the
+    least ratio of the other's rms error to this one's. The significance is that of the mean log ratio over
+    the folds, so that no single fold dominates.
+    """
+    by_fold = [np.maximum(_by_fold(array, repeated), 1e-300) for array in (lost, others)]
+    if not by_fold[1].sum() > enough**2 * by_fold[0].sum():
+        return False
+    ratio = np.log(by_fold[1] / by_fold[0])
+    return bool(ratio.sum() > _CERTAIN * np.sqrt(len(ratio)) * ratio.std())
+
+
+def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
+    """Sum the held-out errors of views or parts of points by fold."""
+    if len(lost) == len(repeated.group):
+        return np.asarray(np.bincount(repeated.folds(FOLDS), lost))
+    if len(lost) <= FOLDS:
+        return lost
+    return np.array([lost[fold::FOLDS].sum() for fold in range(FOLDS)])
+
+
+def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
+    """Sound models; the other monotonic ones as well if they predict much better.
+
+    A single view cannot tell that, because errors of the target are common to all of its folds.
+    """
+    monotonic = {name: c for name, c in fitted.items() if c.not_monotonic is None} or fitted
+    sound = {name: c for name, c in monotonic.items() if c.sound}
+    if not sound or not several:
+        return sound or monotonic
+    lowest = [min(c.held_out for c in some.values()) for some in (sound, monotonic)]
+    return sound if lowest[0] < _WORTH**2 * lowest[1] else monotonic
+
+
+def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
+    """Why the result must be refused: the model that fits is not monotonic, the selected one far worse."""
+    for model, candidate in fitted.items():
+        bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
+        if bad and chosen.held_out > _FAR_WORSE**2 * candidate.held_out:
+            return (
+                f"the distortion is strong, and the model {model} that fits the points is not monotonic "
+                f"(maps two directions to one pixel) inside the {candidate.not_monotonic}; give points "
+                "nearer to the image's corners, or choose a --distortion"
+            )
+    return ""

@@ -1,0 +1,253 @@
+"""From a normalised solution to a calibration in pixels and world units, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.board.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
+from neurocal_cli.adjustment.covariance import Covariance
+from neurocal_cli.adjustment.given_camera import covariance_by_camera, entry_covariance
+from neurocal_cli.adjustment.observability import refuse_undetermined
+from neurocal_cli.adjustment.outlier_views import seen_from_behind
+from neurocal_cli.adjustment.parameter_uncertainty import (
+    parameter_covariance,
+    parameter_warnings,
+    pose_std,
+    with_scale,
+)
+from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.adjustment.solution import Solution, TargetPosterior
+from neurocal_cli.adjustment.stored_state import stored_state
+from neurocal_cli.adjustment.units import normalised, translations
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
+from neurocal_cli.calibration.lens_choice.simpler_model import undetermined_coefficients
+from neurocal_cli.calibration.verdict.odd_points import are_normalised
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.observations.target import scale_of
+
+_XI = 5  # index of xi, after A's five entries
+_TOLD = 0.1  # width of the range of xi from which on a warning is given
+_NAMED = 5  # number of outliers that the warning names
+
+
+def calibration_of(
+    solution: Solution, rejected: Rejected, *, method: str, trainer: str, seed: int, name: str
+) -> Calibration:
+    """Convert a solution to pixels and world units, with standard deviations and warnings.
+
+    Raises `DegenerateGeometryError` if the points do not determine the camera.
+    """
+    problem, adjusted, record = solution.problem, solution.adjusted, solution.record
+    views, state = problem.views, adjusted.state
+    known = camera_covariance(
+        CameraSeen(
+            views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
+            problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
+            solution.shared, solution.by_prior, solution.target_kept,
+            solution.covariance if solution.target is None else None,
+        )
+    )  # fmt: skip
+    refuse_undetermined(problem, state, known.plain)
+    cov = known.found
+    A = problem.matrix(state.entries[0])
+    if problem.type != 3 and not problem.free[1]:
+        intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+    else:
+        intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
+    entries = _entries(solution, known)
+    fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
+    block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
+    squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
+    rmse = float(np.sqrt(squared.mean()))
+    free = [n for n, parameter in enumerate(std) if parameter not in fixed]
+    reason = StopReason.CONVERGED
+    if not adjusted.converged:
+        reason = StopReason.MAX_ITERATIONS
+    elif not record.certain:
+        reason = StopReason.NO_AGREEMENT
+    chosen = solution.model_errors is not None
+    return Calibration(
+        intrinsics=intrinsics,
+        std=std,
+        fixed=fixed,
+        views=_view_results(solution, cov, squared),
+        points=problem.points,
+        type=problem.type,
+        method=method,
+        trainer=trainer,
+        seed=seed,
+        converged=reason is StopReason.CONVERGED,
+        stop_reason=reason.value,
+        rmse_px=rmse,
+        max_px=float(np.sqrt(squared.max())),
+        covariance=block[np.ix_(free, free)],
+        covariance_names=tuple(parameter for parameter in std if parameter not in fixed),
+        distortion_model=problem.distortion.model,
+        distortion=state.k,
+        network=_network_record(solution, rmse),
+        straight_lines=solution.straight_lines,
+        camera_name=name,
+        rejected=rejected,
+        target=solution.target,
+        target_stretched=known.stretched,
+        lens_choice=solution.model_errors or {},
+        would_take=solution.would_take,
+        warnings=(
+            *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
+            *_lens_warnings(solution),
+            *_view_warnings(solution),
+            *_rejection_warnings(rejected, len(problem.points)),
+        ),
+    )
+
+
+# Poses that the points do not determine have an infinite std already.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def with_given_covariance(found: Calibration, given: Calibration) -> Calibration:
+    """A calibration of type 3 whose poses have the uncertainty of the given camera, as far as it is known."""
+    names, covariance = given.known_covariance
+    if not names or not np.isfinite(covariance).all():
+        return found
+    views = arrange(found.points)
+    state = stored_state(found, views.names)
+    entries = entry_covariance(found.intrinsics, state.model, names, covariance, views.pixel_scale)
+    block = covariance_by_camera(views, normalised(state, views), entries)
+    added = pose_std(state.R, (state.R @ views.centre[..., None])[..., 0], views.scale, block)
+    results = dict(found.views)
+    for name, more in zip(views.names, added.tolist(), strict=True):
+        std = found.views[name].std
+        both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
+        results[name] = replace(found.views[name], std=both)
+    return replace(found, views=results, given_covariance=covariance, given_names=names)
+
+
+def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
+    """The posterior of the target for a variance, unless the camera has been adjusted again."""
+    adjusted, posterior = solution.target_posterior or (None, None)
+    return posterior if adjusted is solution.adjusted else None
+
+
+def _entries(solution: Solution, known: CameraCovariance) -> Array:
+    """(5 + K, 5 + K) covariance of A's entries and the distortion coefficients, normalised; 0 if given.
+
+    It includes the spread of other cameras that explain the points equally well (`ambiguity`).
+    """
+    free, ambiguity = solution.problem.free_camera, solution.ambiguity
+    entries = np.zeros((len(free), len(free)))
+    entries[np.ix_(free, free)] = known.found.entries
+    if ambiguity is None:
+        return entries
+    free[_XI] = True
+    inflation = known.found.entries[0, 0] / known.plain.entries[0, 0]  # for views that are not independent
+    entries[np.ix_(free, free)] = ambiguity.widened(entries[np.ix_(free, free)], free, max(inflation, 1.0))
+    return entries
+
+
+def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[str, ViewResult]:
+    """Poses in world units with their standard deviations, and each view's unweighted reprojection error."""
+    problem, state = solution.problem, solution.state
+    views, R = problem.views, state.R
+    centre = (R @ views.centre[..., None])[..., 0]
+    t = translations(views, state)
+    if problem.poses is not None:
+        R = np.stack([problem.poses[name].R for name in views.names])
+        t = np.stack([problem.poses[name].t for name in views.names])
+    std = pose_std(R, centre, views.scale, cov.poses)
+    if problem.free_poses:
+        std = with_scale(std, t, scale_of(problem.points).std)
+    rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
+    R.setflags(write=False)
+    t.setflags(write=False)
+    rows = zip(views.names, R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    given = not problem.free_poses
+    return {
+        name: ViewResult(Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, given)
+        for name, R_k, t_k, sigma, n, r in rows
+    }
+
+
+def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
+    views, record, state = solution.problem.views, solution.record, solution.state
+    px, n = views.pixel_scale, len(views.index)
+    return NetworkRecord(
+        W=intrinsic_matrix(state.entries[0]),
+        V=dict(zip(views.names, np.concatenate([state.R, state.t[..., None]], axis=2), strict=True)),
+        S1=views.S1,
+        S2=dict(zip(views.names, views.S2, strict=True)),
+        starts=record.starts,
+        agreed=int(record.agreed.min()),
+        iterations=record.iterations,
+        refine_iterations=solution.adjusted.iterations,
+        loss=float(np.sqrt(record.squares / n)) * px,
+        rmse_before=float(np.sqrt(record.before / n)) * px,
+        rmse_after=rmse,
+        curve=tuple((record.curve * px).tolist()),
+    )
+
+
+def _lens_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of a distortion that the points determine in part."""
+    problem, ambiguity = solution.problem, solution.ambiguity
+    model = problem.distortion.model
+    if ambiguity is not None and not np.diff(ambiguity.range)[0] < _TOLD:
+        first, last = ambiguity.range
+        with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
+        yield (
+            f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
+            f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, "
+            "and the verdict gives its std"
+        )
+    if model == "rich":
+        return
+    if problem.penalty is not None:
+        yield (
+            f"the distortion model {model} that fits the points best is not monotonic (maps two directions "
+            "to one pixel) in the image's corners, where there are no points; the best monotonic fit is "
+            "used, which is a guess in the corners; add views that show the board there"
+        )
+    # The standard deviations of eucm do not show it: without distortion alpha is 0, and beta has no effect.
+    doubtful = not solution.adjusted.converged or model == "eucm"
+    if doubtful and solution.model_errors is None and problem.free_distortion:
+        yield from filter(None, [undetermined_coefficients(problem, solution.adjusted)])
+
+
+def _view_warnings(solution: Solution) -> Iterator[str]:
+    """Warn of views that repeat a pose, of points with contradictory units, and of mirrored targets."""
+    points, views, repeated = solution.problem.points, solution.problem.views, solution.repeated
+    if not (repeated.none or are_normalised(points)):
+        yield (
+            f"{views.n_views} views show {repeated.n_poses} different pose{'s' * (repeated.n_poses != 1)}; "
+            "views that repeat a pose count as one"
+        )
+    yield from filter(None, [scale_of(points).contradiction])
+    # The camera is right nevertheless.
+    mirrored = seen_from_behind(views, solution.state)
+    if mirrored:
+        more = f" and {len(mirrored) - _NAMED} more" if len(mirrored) > _NAMED else ""
+        yield (
+            f"the target appears mirrored in {', '.join(map(repr, mirrored[:_NAMED]))}{more}, so the poses "
+            "of these views are wrong; check the order of their points"
+        )
+
+
+def _rejection_warnings(rejected: Rejected, kept: int) -> Iterator[str]:
+    """Name the views left out with their reasons, and the first outliers by line and id."""
+    for name, reason in rejected.views.items():
+        yield f"view {name!r} is left out: {reason}"
+    points = rejected.points
+    if points is None:
+        return
+    single = np.flatnonzero([points.view_names[v] not in rejected.views for v in points.view_index])
+    if single.size:
+        places = []
+        for row in single[:_NAMED]:
+            label = "" if points.point is None else f" ({points.point[row]})"
+            places.append(f"{points.place(int(row))}{label}")
+        more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
+        share = f"{single.size} of {kept + len(rejected)} points"
+        yield f"{share} are outliers and are left out: {', '.join(places)}{more}"

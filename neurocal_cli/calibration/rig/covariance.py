@@ -1,0 +1,223 @@
+"""What the covariance of a rig contains beyond the noise of independent points.
+
+* Pairs of views that contradict each other by more than noise (`rig_covariance`). The normal matrix treats
+  all points as independent. If the relative pose differs from pair to pair, only the pairs are independent.
+  The delete-one jackknife over the views then gives the covariance, without a model of the differences (Efron
+  and Stein 1981). A known change adds the square of the error that it causes.
+* A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
+* Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
+  single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
+  `adjustment.open_coefficients`), and two stretches of the print if the given target was kept
+  (`covariance_of_stretch`, see `adjustment.board.open_stretch`).
+
+All views share the unknowns of both cameras and of the rig; poses and target points are eliminated. The
+derivatives by the rig's unknowns follow from those of each camera by the chain rule.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.board.information import Information, point_terms
+from neurocal_cli.adjustment.board.open_stretch import spread_of_stretch, stretched_blocks, stretches
+from neurocal_cli.adjustment.board.posterior import known_sizes
+from neurocal_cli.adjustment.board.prior import prior_of_target
+from neurocal_cli.adjustment.board.surveyed import noise_variance
+from neurocal_cli.adjustment.leave_out import Quadratics
+from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.open_coefficients import OpenPrior, open_of_calibration, spread_of_open
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.adjustment.schur_complement import eliminate
+from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem
+from neurocal_cli.calibration.rig.contradiction import Contradiction
+from neurocal_cli.calibration.rig.relative_poses import RelativePoses
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.observations.target import Target
+
+_LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
+
+Mask = NDArray[np.bool_]
+
+
+def rig_covariance(poses: RelativePoses, used: Mask, found: Contradiction) -> Array:
+    """(F, F) covariance of the unknowns of the common fit of the used pairs, (P,) bool."""
+    S, _ = poses.normal(used)
+    model = solve_scaled(S, np.eye(len(S)))
+    model = 0.5 * (model + model.T)
+    if not found.is_significant:
+        return np.asarray(model)
+    if used.sum() < _LEAST_PAIRS:
+        return np.asarray(found.scatter**2 * model)
+    moves = _moves(poses, used)
+    spread = moves - moves.mean(axis=0)
+    by_pairs = (len(moves) - 1) / len(moves) * spread.T @ spread + 0.5 * found.shift.T @ found.shift
+    return not_smaller(model, by_pairs)
+
+
+def _moves(poses: RelativePoses, used: Mask) -> Array:
+    """Moves of the unknowns when each frame is left out."""
+    S, g = poses.cameras.S.copy(), poses.cameras.g.copy()
+    S[poses.frame[used]] += poses.pairs.S[used]
+    g[poses.frame[used]] += poses.pairs.g[used]
+    # Shifted to the minimum, where the formula for leaving out holds.
+    moves = Quadratics(S, g - S @ poses.solution(used), poses.cameras.cost).moves_without_each()
+    return np.asarray(moves[np.isfinite(moves).all(axis=1)])
+
+
+def not_smaller(least: Array, other: Array) -> Array:
+    """The smallest covariance that is, in the axes that both share, nowhere smaller than either.
+
+    Examples
+    --------
+    >>> not_smaller(np.diag([1.0, 4.0]), np.diag([3.0, 1.0])).round(9)
+    array([[3., 0.],
+           [0., 4.]])
+    """
+    scaled, scale = unit_diagonal(least)
+    values, axes = np.linalg.eigh(scaled)
+    root = axes * np.sqrt(np.maximum(values, 1e-15))
+    inverse = (axes / np.sqrt(np.maximum(values, 1e-15))).T
+    ratio, turn = np.linalg.eigh(inverse @ (other * scale[:, None] * scale) @ inverse.T)
+    joint = root @ turn
+    larger = (joint * np.maximum(ratio, 1.0)) @ joint.T
+    return np.asarray(larger / scale[:, None] / scale)
+
+
+def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
+    """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
+    prior = prior_of_target(target)
+    info = _information(target, fit).turned(prior.axes)
+    spare = info.equations - len(info.camera) - 6 * len(info.pose)
+    variance = info.cost / max(spare, 1.0)
+    info = info.around_given(prior.along_axes(target.offsets))
+    try:
+        if prior.stated is not None:
+            variance = noise_variance(info, prior, target.sizes["stated"])
+        found = known_sizes(info, prior, target.sizes, variance)
+    except np.linalg.LinAlgError:
+        return None
+    return found.variance * found.camera
+
+
+def _information(target: Target, fit: RigFit) -> Information:
+    problem, state, n = fit.problem, fit.state, len(target.given)
+    columns, shared = state.columns, np.flatnonzero(fit.free)
+    N, _ = problem.normal(state)
+    point, point_right = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    point_shared = np.zeros((n, 3, columns.n_shared))
+    pose_point = np.zeros((len(problem.scale), 6, n, 3))
+    for side, (observed, own) in enumerate(zip(problem.observations, columns.cameras, strict=True)):
+        label, scale = _labels(target, problem, observed), problem.scale[observed.view]
+        camera, shared_columns = problem.camera(state, side), camera_columns(len(own) - 5)
+        terms = point_terms(observed.batches, camera, scale, label, shared_columns, n)
+        T, w = problem.jacobian(state, side)[:, POSE], observed.weight
+        point += w * terms.point
+        point_right += w * terms.point_right
+        point_shared[:, :, own] += w * terms.point_camera
+        point_shared[:, :, columns.rig] += w * np.einsum(
+            "vqnj,vqr->njr", terms.pose_point, T[:, :, columns.rig]
+        )
+        pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, T[:, :, columns.pose])
+    return Information(
+        camera=N[:, shared[:, None], shared].sum(axis=0),
+        camera_right=N[:, shared, -1].sum(axis=0),
+        pose=N[:, columns.pose[:, None], columns.pose],
+        pose_camera=N[:, columns.pose[:, None], shared],
+        pose_right=N[:, columns.pose, -1],
+        point=point,
+        point_camera=point_shared[:, :, shared],
+        point_right=point_right,
+        pose_point=pose_point,
+        cost=float(N[:, -1, -1].sum()),
+        equations=sum(observed.n_equations for observed in problem.observations),
+    )
+
+
+def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDArray[np.intp]:
+    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
+    batches = observed.batches
+    frame = observed.view[batches.view]
+    world = batches.local * problem.scale[frame][:, None, None] + problem.centre[frame][:, :, None]
+    label = target.rows_of(np.swapaxes(world, 1, 2).reshape(-1, 3)).reshape(len(world), -1)
+    return label if batches.whitening is None else np.where(batches.whitening[:, 0] == 0, -1, label)
+
+
+def covariance_of_choice(fit: RigFit) -> Array | None:
+    """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
+    problem, before = fit.problem, fit.state
+    own = [fit.free[place] for place in before.columns.cameras]
+    # A camera that the common bundle adjustment did not change has no open coefficients either.
+    opened = [
+        open_of_calibration(calibration, free, camera.k) if free.any() else None
+        for calibration, free, camera in zip(problem.calibrations, own, before.cameras, strict=True)
+    ]
+    if opened == [None, None]:
+        return None
+    left, right = (
+        camera if found is None else found.state(camera)
+        for camera, found in zip(before.cameras, opened, strict=True)
+    )
+    state = replace(before, cameras=(left, right))
+    parts = []
+    for found, free in zip([*opened, None], [*own, fit.free[before.columns.rig]], strict=True):
+        none = np.zeros(int(free.sum()), dtype=bool)
+        if found is None:
+            parts.append((free, none, none))
+        else:
+            parts.append((found.free, found.prior.is_open, found.prior.left_out))
+    all_free, is_open, left_out = (np.concatenate(part) for part in zip(*parts, strict=True))
+    prior = _joined(is_open, left_out, [found.prior for found in opened if found is not None])
+    kept = np.append(np.flatnonzero(all_free), state.columns.width - 1)
+    whole = eliminate(problem.normal(state)[0], kept, state.columns.pose)[0].sum(axis=0)
+    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], fit.variance, prior)
+    follow = spread.follow[~prior.left_out]
+    added = follow @ spread.E @ follow.T
+    return added if np.isfinite(added).all() else None
+
+
+def _joined(is_open: Mask, left_out: Mask, priors: list[OpenPrior]) -> OpenPrior:
+    """Both cameras' open coefficients, each with groups of its own."""
+    starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
+    groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
+    value, size = (np.concatenate(parts) for parts in zip(*((p.value, p.size) for p in priors), strict=True))
+    odds = tuple(own for prior in priors for own in prior.odds)
+    return OpenPrior(is_open, left_out, value, size, tuple(groups), odds)
+
+
+def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
+    """Probability that the print of a target is stretched, and the covariance that this adds.
+
+    The covariance (f, f) is of the free shared unknowns of a fit to the target as given. None if the stretch
+    is negligible or the target is not flat. Cameras that were not refined respond to the stretch as well,
+    because they were calibrated on this target.
+    """
+    world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
+    if not is_flat(world) or not fit.variance > 0:
+        return None
+    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
+    columns = fit.state.columns
+    kept = np.append(np.flatnonzero(estimated), np.arange(columns.width - 1, columns.width + 2))
+    whole = eliminate(_with_stretches(fit, stretches(world)), kept, columns.pose)[0].sum(axis=0)
+    found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)
+    if found is None:
+        return None
+    T = found.follow[:-2][fit.free[estimated]]
+    return found.probability, T @ found.E @ T.T
+
+
+def _with_stretches(fit: RigFit, by: Array) -> Array:
+    """(V, D + 2, D + 2) normal matrices with columns of two stretches before the residual's."""
+    problem, state, D = fit.problem, fit.state, fit.state.columns.width
+    normal = np.zeros((len(problem.scale), D + 2, D + 2))
+    for side, observed in enumerate(problem.observations):
+        blocks = stretched_blocks(observed.batches, problem.camera(state, side), by)
+        own = problem.jacobian(state, side)
+        T = np.zeros((len(own), own.shape[1] + 2, D + 2))
+        T[:, :-3, : D - 1] = own[:, :-1, :-1]
+        T[:, -3:, D - 1 :] = np.eye(3)
+        normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
+    return normal

@@ -1,0 +1,305 @@
+"""Errors of triangulated points of known position (paper, section 5.2).
+
+The true positions are those of the target, transformed to the left camera's frame by the pose of the view.
+All errors are in that frame, with z along the optical axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
+from neurocal_cli.calibration.common_target import on_one_target
+from neurocal_cli.calibration.evaluation import other_images, predict, refuse_another_size
+from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.fit_rig import fit_rig, poses_on_rig
+from neurocal_cli.calibration.rig.pairing import Pairs, ViewPairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
+from neurocal_cli.calibration.rig.triangulation import triangulate
+from neurocal_cli.calibration.verdict.findings import Finding
+from neurocal_cli.calibration.verdict.given_points import (
+    GivenPoints,
+    given_camera,
+    given_error,
+    with_findings,
+)
+from neurocal_cli.calibration.verdict.odd_points import units_mixed
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, rotation_vector
+from neurocal_cli.camera.median import median
+from neurocal_cli.camera.pinhole import Pose, in_cameras
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
+from neurocal_cli.observations.points import Correspondences
+
+# Given points show a target of another size if the baseline differs by more than this share while the views'
+# relative poses agree with the rig within this angle [rad]; noise turns that of a view by a few thousandths.
+_OTHER_SIZE, _SAME_DIRECTION = 0.05, 0.02
+
+
+@frozen_dataclass(eq=False)
+class StereoEvaluation:
+    """Errors of two cameras at points of known position."""
+
+    unit: str
+    by_view: SpaceError  # triangulated with each view's own poses of the two cameras
+    # Triangulated through one rig for all views, as for points of unknown position; None if no rig fits them.
+    rig: SpaceError | None
+    baseline: float  # of the rig [world unit]; nan without a rig
+    pairs: tuple[tuple[str, str], ...]  # left and right names
+    alone: tuple[tuple[str, ...], tuple[str, ...]]  # views of each camera without a pair, which are not used
+    fitted: tuple[str, ...]  # views of the left camera whose poses were estimated from the same points
+    models: tuple[str, str]  # distortion models of the cameras
+    warnings: tuple[str, ...]
+    judgement: Callable[[], Verdict | None]  # computes the verdict
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Verdict on the rig, computed when it is first read; None without a rig with points of its own."""
+        return self.judgement()
+
+
+def evaluate_stereo(
+    left: Calibration,
+    right: Calibration,
+    points: tuple[Correspondences, Correspondences] | None = None,
+    *,
+    method: str = "optimal",
+) -> StereoEvaluation:
+    """Evaluate two calibrated cameras by the points of both.
+
+    Parameters
+    ----------
+    left, right : Calibration
+    points : two of Correspondences, optional
+        Default: those of the calibration, which gives smaller errors than new points. The poses of new views
+        are fitted with fixed cameras.
+    method : {"optimal", "linear", "midpoint"}
+        Of triangulation.
+
+    Raises
+    ------
+    InputError
+        No common view or point, or different image sizes or units.
+    DegenerateGeometryError
+        Cameras at one place, or points that cannot be triangulated.
+    """
+    left, right = on_one_target(left, right)
+    try:
+        rig: Rig | None = fit_rig(left, right)
+        failure = ""
+    except CoincidentCamerasError:
+        raise
+    except DegenerateGeometryError as error:
+        rig, failure = None, f"no rig fits all views: {error}"
+    return _Evaluator((left, right), rig, points, method, failure).evaluation()
+
+
+def evaluate_rig(
+    rig: Rig, points: tuple[Correspondences, Correspondences] | None = None, *, method: str = "optimal"
+) -> StereoEvaluation:
+    """Evaluate a rig by the points of both cameras; see `evaluate_stereo`.
+
+    The views of a rig have one pose for both cameras, so `by_view` and `rig` are equal.
+
+    Parameters
+    ----------
+    rig : Rig
+    points : (left, right) of Correspondences, optional
+        By default those that the rig was calibrated with.
+    method : {"optimal", "linear", "midpoint"}
+        How points are triangulated; see `triangulate`.
+
+    Raises
+    ------
+    InputError
+        There are no points, or the two cameras have none in common.
+    """
+    if points is None and not (len(rig.left.points) and len(rig.right.points)):
+        raise InputError("the rig has no points of its own; give the points to evaluate it on")
+    return _Evaluator((rig.left, rig.right), rig, points, method).evaluation()
+
+
+class _Evaluator:
+    def __init__(
+        self,
+        cameras: tuple[Calibration, Calibration],
+        rig: Rig | None,
+        points: tuple[Correspondences, Correspondences] | None,
+        method: str,
+        failure: str = "",
+    ) -> None:
+        self.cameras, self.rig, self.method, self.failure = cameras, rig, method, failure
+        self.warnings = [failure] if rig is None else list(rig.warnings)
+        self.given, target = points is not None, cameras[0].target
+        if points is not None and target is not None:
+            points = target.applied(points[0]), target.applied(points[1])
+        self.points = points or (cameras[0].points, cameras[1].points)
+        if self.given:
+            for camera, given in zip(cameras, self.points, strict=True):
+                refuse_another_size(camera, given)
+                if given.unit != camera.unit:
+                    raise InputError(
+                        f"{given.source} is in {given.unit}, but the calibration in {camera.unit}; give both "
+                        "in one unit"
+                    )
+                self.warnings += [why] if (why := undistorted_before(given, camera)) else []
+        self.views = pair_views(self.points[0].view_names, self.points[1].view_names)
+        self.pairs = pair_points(*self.points, self.views)
+        known = [
+            camera.views.keys() - (other_images(camera, some) if self.given else ())
+            for camera, some in zip(cameras, self.points, strict=True)
+        ]
+        self.new = [pair for pair in self.views.both if pair[0] not in known[0] or pair[1] not in known[1]]
+        self.fitted = self._fit_new() if self.new else None
+
+    def evaluation(self) -> StereoEvaluation:
+        """The errors of all points, through the poses of the views and through the rig."""
+        rig, pairs, through = self.rig, self.views.both, None
+        by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
+        judgement: Callable[[], Verdict | None] = self._judgement
+        if rig is not None:
+            poses, used = self._poses_on(rig), np.array([pair not in rig.left_out for pair in pairs])
+            # None if all views contradict the rig.
+            through = self._error(poses, [rig.pose], used) if used.any() else None
+            if self.given:
+                judgement = partial(self._judged, rig, poses)
+        for error in (by_view, through):
+            if error is not None and error.n_behind:
+                self.warnings.append(
+                    f"{error.n_behind} of {error.n_points + error.n_behind} points came out behind a camera "
+                    f"and are left out of all averages{' of the rig' if error is through else ''}"
+                )
+        return StereoEvaluation(
+            self.points[0].unit,
+            by_view,
+            through,
+            float("nan") if rig is None else rig.baseline,
+            pairs,
+            (self.views.left_only, self.views.right_only),
+            tuple(a for a, _ in self.new),
+            (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
+            tuple(self.warnings),
+            judgement,
+        )
+
+    def _judgement(self) -> Verdict | None:
+        """The verdict on the rig by its own points."""
+        if self.rig is not None:
+            return assess_rig(self.rig)
+        advice = ("calibrate both cameras together: neurocal stereo",)
+        return Verdict("poor", (self.failure,), advice, {})
+
+    def _fit_new(self) -> tuple[Calibration, Calibration]:
+        """Poses of the new views in each camera alone (type 3)."""
+        from neurocal_cli.calibration.calibrate import calibrate
+
+        fits = []
+        for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
+            names = {pair[side] for pair in self.new}
+            rows = np.array([name in names for name in points.view_names])[points.view_index]
+            new, seed = points.select(rows), camera.seed
+            fit = calibrate(new, type=3, intrinsics=camera, seed=seed, outliers="keep", target="given")
+            new_warnings = [text for text in fit.warnings if text not in self.warnings]
+            self.warnings += [f"fitting the poses of new views: {text}" for text in new_warnings]
+            if not fit.converged:
+                self.warnings.append(f"the poses of new views did not converge: {fit.stop_reason}")
+            fits.append(fit)
+        return fits[0], fits[1]
+
+    def _own_poses(self, pairs: Sequence[tuple[str, str]]) -> tuple[list[Pose], list[Pose]]:
+        """Poses of views in the left camera, and the relative pose of the cameras by each of them."""
+        first, rigs, new = [], [], set(self.new)
+        for pair in pairs:
+            source = self.fitted if self.fitted is not None and pair in new else self.cameras
+            left, right = (source[side].views[pair[side]].pose for side in (0, 1))
+            R = right.R @ left.R.T
+            first.append(left)
+            rigs.append(Pose.exact(R, right.t - R @ left.t))
+        return first, rigs
+
+    def _poses_on(self, rig: Rig) -> list[Pose]:
+        """The pose of each view in the left camera that fits both cameras best."""
+        poses = {name: view.pose for name, view in rig.left.views.items()}
+        if self.fitted is not None:
+            poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
+        return [poses[a] for a, _ in self.views.both]
+
+    def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
+        """The verdict with the findings about the given points."""
+        verdict = self._judgement()
+        if verdict is None:
+            return None
+        residuals = np.concatenate([self._residuals(rig, poses, side) for side in (0, 1)])
+        seen = residuals[np.isfinite(residuals)]
+        rmse_px = float(np.sqrt((seen**2).mean())) if seen.size else np.nan
+        given = GivenPoints(rmse_px, len(residuals), len(residuals) - seen.size)
+        same = "rig, with both cameras as they were"
+        findings = [given_error(verdict, rig.rmse_px, rig.left.points, given, same)]
+        if findings[0][0]:
+            findings = [*self._other_size(rig, findings[0][0]), *findings]
+        fits = self.fitted or (None, None)
+        for side, camera, fit in zip(("left", "right"), self.cameras, fits, strict=True):
+            findings += [
+                (grade, f"{side} camera: {text}", advice) for grade, text, advice in given_camera(camera, fit)
+            ]
+        return with_findings(verdict, findings)
+
+    def _other_size(self, rig: Rig, grade: int) -> Iterator[Finding]:
+        """The finding about given points of a target of another size or unit, if that is what is wrong.
+
+        The views' relative poses then have the rotation and the direction of the rig, but another baseline.
+        """
+        poses = self._own_poses(self.new)[1]
+        t = np.array([pose.t for pose in poses]).reshape(-1, 3)
+        length = np.linalg.norm(t, axis=1)
+        if not poses or not (length > 0).all():
+            return
+        turned = [np.linalg.norm(rotation_vector(pose.R @ rig.R.T)) for pose in poses]
+        aside = np.arccos(np.clip(t @ rig.t / (length * rig.baseline), -1.0, 1.0))
+        ratio = float(median(length)) / rig.baseline
+        if (
+            max(median(np.array(turned)), median(aside)) < _SAME_DIRECTION
+            and abs(np.log(ratio)) > _OTHER_SIZE
+        ):
+            units = units_mixed(max(ratio, 1 / ratio))
+            mixed = f", as with {units} mixed" if units else ""
+            yield (
+                grade,
+                f"with the given points the baseline is {ratio:.3g} times that of the rig: X,Y,Z have "
+                f"another unit{mixed}, the squares another size, or a camera slid along the baseline",
+                "check the unit of X,Y,Z and the size of the squares",
+            )
+
+    def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
+        """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
+        if side == 1:
+            poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]
+        place = {pair[side]: k for k, pair in enumerate(self.views.both) if pair not in rig.left_out}
+        points = self.points[side]
+        some = points.select(np.array([name in place for name in points.view_names])[points.view_index])
+        camera = self.cameras[side].camera
+        predicted, in_front = predict(camera, [poses[place[name]] for name in some.view_names], some)
+        return np.where(in_front, np.hypot(*(predicted - some.pixels).T), np.nan)
+
+    def _error(self, poses: list[Pose], rigs: list[Pose], used: NDArray[np.bool_]) -> SpaceError:
+        """Triangulate the points of the used views and compare them with the target."""
+        chosen = used[self.pairs.view]
+        pairs = Pairs(self.pairs.left[chosen], self.pairs.right[chosen], self.pairs.view[chosen])
+        found = triangulate(
+            *self.cameras,
+            rigs,
+            self.points[0].pixels[pairs.left],
+            self.points[1].pixels[pairs.right],
+            which=pairs.view,
+            method=self.method,
+        )
+        true = in_cameras(poses, self.points[0].world[pairs.left], pairs.view)
+        names = [a for a, _ in self.views.both]
+        triangulated = np.where(found.behind[:, None], np.nan, found.points)
+        K = self.cameras[0].intrinsics
+        return space_error(triangulated, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)

@@ -1,0 +1,115 @@
+"""Rectification: two virtual cameras, side by side, whose rows (or columns) correspond.
+
+R1, R2, P1, P2 and Q are those of OpenCV's ``stereoRectify`` (Bouguet), with zero disparity at infinity. Each
+camera is turned by half of the rig's rotation. Both are then turned together until the baseline is
+parallel to an axis, the one along its longer component.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, cross_matrix, nearest_rotation
+from neurocal_cli.camera.undistorted_view import plane_like
+from neurocal_cli.errors import UsageError
+
+_GRID = 9  # samples along each side of the image, as in OpenCV
+_WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
+
+
+@frozen_dataclass(eq=False)
+class Rectification:
+    """Rectified cameras."""
+
+    R1: Array  # (3, 3) from each camera's frame to its rectified one
+    R2: Array
+    P1: Array  # (3, 4) projections from the left rectified frame into both rectified images
+    P2: Array
+    Q: Array  # (4, 4) (u, v, disparity, 1) of the left image to homogeneous points in its rectified frame
+
+
+def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
+    """Rectify a rig; None where the image sizes are unknown or differ.
+
+    The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
+    pixels of the original images, and values in between interpolate. With None nothing is scaled. The
+    focal length is negative, as OpenCV's, where the optical axes differ so much that no scale does this.
+    """
+    if alpha is not None and not 0 <= alpha <= 1:
+        raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")
+    size = rig.left.image_size
+    if size is None or size != rig.right.image_size:
+        return None
+    half = nearest_rotation(rig.R + np.eye(3))  # its square is R
+    t = half.T @ rig.t
+    axis = 0 if abs(t[0]) > abs(t[1]) else 1
+    turn = _shortest_turn(t, np.eye(3)[axis] * (1.0 if t[axis] > 0 else -1.0))
+    rotations = turn @ half, turn @ half.T
+    cameras = [(rig.left.camera, rotations[0]), (rig.right.camera, rotations[1])]
+    along = float((rotations[1] @ rig.t)[axis])
+    f = 0.5 * float(sum(plane_like(camera).A[1 - axis, 1 - axis] for camera, _ in cameras))
+    centres = [_centre(camera, R, f, size) for camera, R in cameras]
+    centre = 0.5 * (centres[0] + centres[1])  # one for both: disparity 0 at infinity
+    if alpha is not None:
+        f *= _scale(cameras, f, centre, size, alpha)
+    P1 = np.array([[f, 0.0, centre[0], 0.0], [0.0, f, centre[1], 0.0], [0.0, 0.0, 1.0, 0.0]])
+    P2 = P1.copy()
+    P2[axis, 3] = f * along
+    Q = np.zeros((4, 4))
+    Q[:2, :2], Q[:2, 3], Q[2, 3], Q[3, 2] = np.eye(2), -centre, f, -1.0 / along
+    return Rectification(*rotations, P1, P2, Q)
+
+
+def _shortest_turn(a: Array, b: Array) -> Array:
+    """The rotation about the normal of both that takes the direction of a to the unit vector b."""
+    a = a / np.linalg.norm(a)
+    K = cross_matrix(np.cross(a, b))
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + a @ b))
+
+
+def _rectified(camera: Camera, R: Array, pixels: Array) -> Array:
+    """Normalised rectified points of pixels, (N, 2).
+
+    nan where the distortion does not reach a pixel, and where its ray is behind the rectified image plane.
+    """
+    rays = camera.unproject(pixels) @ R.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
+
+
+def _centre(camera: Camera, R: Array, f: float, size: tuple[int, int]) -> Array:
+    """Principal point that centres the corners of the image in the rectified one, its middle if wide."""
+    last = np.array(size, dtype=float) - 1
+    if camera.distortion.wide:  # the corners are far out, or behind
+        middle = _rectified(camera, R, last[None] / 2)[0]
+        return np.asarray(0.5 * last - f * (middle if np.isfinite(middle).all() else 0.0))
+    corners = _rectified(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
+    if not np.isfinite(corners).all():  # beyond the distortion: the middles of the sides
+        corners = _rectified(camera, R, np.array([[0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]]) * last)
+    middle = corners.mean(axis=0) if np.isfinite(corners).all() else np.zeros(2)
+    return np.asarray(0.5 * last - f * middle)
+
+
+def _scale(
+    cameras: list[tuple[Camera, Array]], f: float, centre: Array, size: tuple[int, int], alpha: float
+) -> float:
+    """Factor of the focal length."""
+    last = np.array(size, dtype=float) - 1
+    grid = np.linspace(0.0, 1.0, _GRID)
+    pixels = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2) * last
+    room = np.array([centre, last - centre])  # to the left and top, to the right and bottom
+    fill, hold = [], []
+    for camera, R in cameras:
+        image = f * _rectified(camera, R, pixels).clip(-_WIDEST, _WIDEST).reshape(_GRID, _GRID, 2)
+        # What is behind sets no limit.
+        near = [np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1])]
+        far = [np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])]
+        inner = np.array([near, far])
+        outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])
+        signs = np.array([[-1.0], [1.0]])
+        fill.append((room / (signs * inner)).max())
+        hold.append((room / (signs * outer)).min())
+    return float((1 - alpha) * max(fill) + alpha * min(hold))

@@ -1,0 +1,266 @@
+"""Assembly of a `Rig` in pixels and world units from the adjusted, normalised one, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.normal_equations import solve_scaled
+from neurocal_cli.adjustment.parameter_uncertainty import (
+    parameter_covariance,
+    parameter_warnings,
+    pose_std,
+    with_scale,
+)
+from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.adjustment.reprojection import POSE, CameraState, residuals
+from neurocal_cli.adjustment.schur_complement import SchurCovariance, schur_covariance
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
+from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
+from neurocal_cli.calibration.rig.adjust import Observations, RigFit
+from neurocal_cli.calibration.rig.covariance import covariance_of_choice, not_smaller
+from neurocal_cli.calibration.rig.given_cameras import covariance_by_given
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array, euler_jacobian
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.observations.target import scale_of
+
+_SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
+
+
+def assemble_rig(
+    fit: RigFit,
+    left_out: Mapping[tuple[str, str], str],
+    least: Array | None = None,
+    stretched: Array | None = None,
+) -> Rig:
+    """Convert an adjusted rig to the user's units.
+
+    `least` (f, f) is a lower bound of the covariance of the free shared parameters, normalised. `stretched`
+    is the covariance to add to it because the print may be stretched. Points that do not determine the
+    parameters are an error.
+    """
+    return _RigAssembly(fit, least, stretched).rig(left_out)
+
+
+def non_monotonic_sides(fit: RigFit) -> list[int]:
+    """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
+    return [
+        side
+        for side, (camera, given) in enumerate(zip(fit.state.cameras, fit.problem.calibrations, strict=True))
+        if fit.free[fit.state.columns.cameras[side]].any()
+        and where_not_monotonic(camera.distortion, _intrinsics(fit, side).A, given.points) is not None
+    ]
+
+
+class _RigAssembly:
+    def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
+        self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
+        self.scale_std = scale_of(self.problem.calibrations[0].points).std
+        self.shared = np.flatnonzero(fit.free)
+        inverse = schur_covariance(fit.normal, self.shared, self.columns.pose)
+        if not inverse.smallest > _SINGULAR:
+            raise DegenerateGeometryError(
+                "the points do not determine the rig and both cameras (the normal matrix is singular); "
+                "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
+                "--right-intrinsics)"
+            )
+        blocks = {name: fit.variance * getattr(inverse, name) for name in ("shared", "own", "cross")}
+        covariance = replace(inverse, **blocks)
+        if least is not None:
+            covariance = _widened(covariance, not_smaller(covariance.shared, least))
+        for more in (covariance_of_choice(fit), stretched):
+            if more is not None:
+                covariance = _widened(covariance, covariance.shared + more)
+        given = covariance_by_given(self.problem, self.state, fit.normal, fit.free)
+        if given is not None:
+            covariance = replace(
+                covariance,
+                shared=covariance.shared + given.shared[np.ix_(self.shared, self.shared)],
+                own=covariance.own + given.own,
+                cross=covariance.cross + given.cross[:, self.shared],
+            )
+        self.covariance = covariance
+
+    def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
+        """The rig in pixels and world units, with the pairs left out and why."""
+        problem, state = self.problem, self.state
+        squares = [
+            _squared_errors(observed, problem.camera(state, side))
+            for side, observed in enumerate(problem.observations)
+        ]
+        sums = [
+            observed.batches.sum_by_view(part.sum(axis=1))
+            for observed, part in zip(problem.observations, squares, strict=True)
+        ]
+        left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
+        pose = Pose(state.R, state.t * problem.unit)
+        covariance, std = self._rig_covariance(pose)
+        n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
+        return Rig(
+            left,
+            right,
+            pose,
+            std,
+            covariance,
+            tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
+            dict(left_out),
+            rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
+            max_px=max(left.max_px, right.max_px),
+            converged=left.converged,
+            stop_reason=left.stop_reason,
+            iterations=self.fit.iterations,
+        )
+
+    def _stop_reason(self) -> str:
+        for calibration in self.problem.calibrations:
+            if not calibration.converged:
+                return calibration.stop_reason
+        return (StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS).value
+
+    def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
+        """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
+        J, unit, baseline = np.zeros((7, 6)), self.problem.unit, np.linalg.norm(pose.t)
+        J[:3, :3] = euler_jacobian(pose.R)
+        J[3:6, 3:] = np.eye(3) * unit
+        J[6, 3:] = unit * (pose.t / baseline if baseline > 0 else 0.0)
+        block = J @ self._shared_block(self.columns.rig) @ J.T
+        followed = np.array([0.0, 0.0, 0.0, *pose.t, baseline])  # the scale of the target
+        block += self.scale_std**2 * np.outer(followed, followed)
+        std = np.sqrt(np.maximum(np.diagonal(block), 0.0)).tolist()
+        return block[:6, :6], dict(zip((*POSE_NAMES, "baseline"), std, strict=True))
+
+    def _shared_block(self, columns: NDArray[np.intp]) -> Array:
+        """Covariance of some of the shared parameters, 0 for given ones."""
+        free = np.flatnonzero(self.fit.free[columns])
+        rows = np.searchsorted(self.shared, columns[free])
+        block = np.zeros((len(columns), len(columns)))
+        block[np.ix_(free, free)] = self.covariance.shared[np.ix_(rows, rows)]
+        return block
+
+    def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
+        """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
+        given, observed = self.problem.calibrations[side], self.problem.observations[side]
+        intrinsics, batches, reason = _intrinsics(self.fit, side), observed.batches, self._stop_reason()
+        changes: dict[str, Any] = {}
+        if self.fit.free[self.columns.cameras[side]].any():
+            changes = self._intrinsic_changes(side, intrinsics)
+        rms = np.sqrt(sums / batches.counts)
+        R, t = self.problem.world_poses(self.state, side)
+        stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
+        R.setflags(write=False)
+        t.setflags(write=False)
+        views = {
+            name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
+                             int(batches.counts[k]), float(rms[k]))
+            for k, name in enumerate(self.problem.names[side])
+        }  # fmt: skip
+        rmse = float(np.sqrt(sums.sum() / batches.counts.sum()))
+        return replace(
+            given,
+            views=views,
+            rmse_px=rmse,
+            max_px=float(np.sqrt(largest)),
+            converged=reason == StopReason.CONVERGED.value,
+            stop_reason=reason,
+            network=_network(given.network, intrinsics, views, rmse, self.fit.iterations),
+            judgement=None,
+            **changes,
+        )
+
+    def _intrinsic_changes(self, side: int, intrinsics: Intrinsics) -> dict[str, Any]:
+        given, camera = self.problem.calibrations[side], self.state.cameras[side]
+        block, std = parameter_covariance(
+            intrinsics,
+            camera.model,
+            self._shared_block(self.columns.cameras[side]),
+            self.problem.observations[side].pixel_scale,
+            given.fixed,
+        )
+        names = list(std)
+        free = [k for k, name in enumerate(names) if name not in given.fixed]
+        before: tuple[str, ...] = ()
+        chosen = bool(given.lens_choice)
+        if given.std.keys() >= std.keys():
+            alone = Distortion(camera.model, given.distortion)
+            before = parameter_warnings(given.intrinsics, alone, given.std, chosen)
+        now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
+        return {
+            "intrinsics": intrinsics,
+            "std": std,
+            "distortion": camera.k,
+            "covariance": block[np.ix_(free, free)],
+            "covariance_names": tuple(names[k] for k in free),
+            "warnings": (*now, *(text for text in given.warnings if text not in before)),
+        }
+
+    def _pose_stds(self, side: int, R: Array) -> Array:
+        """Standard deviations of the angles and translations of the views, (V_c, 6)."""
+        view, T = self.problem.observations[side].view, self.problem.jacobian(self.state, side)[:, POSE]
+        by_rig, by_pose = T[:, :, self.columns.rig], T[:, :, self.columns.pose]
+        mixed = by_rig @ self.covariance.cross[view, -6:] @ np.swapaxes(by_pose, 1, 2)
+        covariance = by_pose @ self.covariance.own[view] @ np.swapaxes(by_pose, 1, 2)
+        covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
+        covariance += by_rig @ self._shared_block(self.columns.rig) @ np.swapaxes(by_rig, 1, 2)
+        centre = (R @ self.problem.centre[view][..., None])[..., 0]
+        return pose_std(R, centre, self.problem.scale[view], covariance)
+
+
+def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
+    """Replace the covariance of the shared unknowns, and propagate the change to the own ones."""
+    follow = solve_scaled(
+        np.broadcast_to(covariance.shared, (len(covariance.cross), *shared.shape)), covariance.cross
+    )
+    more = np.swapaxes(follow, 1, 2) @ (shared - covariance.shared) @ follow
+    return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
+
+
+def _intrinsics(fit: RigFit, side: int) -> Intrinsics:
+    """Intrinsic parameters of one camera [px]; given entries of A keep their exact values."""
+    given = fit.problem.calibrations[side]
+    estimated = fit.free[fit.state.columns.cameras[side]][:5]
+    if not estimated.any():
+        return given.intrinsics
+    entries = fit.problem.observations[side].in_pixels(fit.state.cameras[side].entries[0])
+    A = intrinsic_matrix(np.where(estimated, entries, given.K[ENTRIES]))
+    if not estimated[1] and not given.intrinsics.skewed:
+        return Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+    return Intrinsics.from_matrix(A)
+
+
+def _network(
+    record: NetworkRecord | None,
+    intrinsics: Intrinsics,
+    views: Mapping[str, ViewResult],
+    rmse: float,
+    iterations: int,
+) -> NetworkRecord | None:
+    """The network's weights for the refined camera, so that P = S1 W V S2 holds."""
+    if record is None or not views.keys() <= record.S2.keys():
+        return record
+    V = {}
+    for name, view in views.items():
+        S2 = record.S2[name]
+        centre = -S2[:3, 3] / S2[0, 0]
+        V[name] = np.column_stack([view.pose.R, (view.pose.R @ centre + view.pose.t) * S2[0, 0]])
+    return replace(
+        record,
+        W=np.asarray(np.linalg.solve(record.S1, intrinsics.A)),
+        V=V,
+        refine_iterations=record.refine_iterations + iterations,
+        rmse_after=rmse,
+    )
+
+
+def _squared_errors(observed: Observations, camera: CameraState) -> Array:
+    """Squared pixel errors, (T, n) [px^2]; 0 for padding."""
+    squares = (residuals(observed.batches, camera) ** 2).sum(axis=1) * observed.pixel_scale**2
+    whitening = observed.batches.whitening
+    return np.asarray(squares if whitening is None else np.where(whitening[:, 0] > 0, squares, 0.0))

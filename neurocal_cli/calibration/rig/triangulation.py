@@ -1,0 +1,140 @@
+"""Points in space from their pixels in both cameras, in the left camera's frame.
+
+`optimal` minimises the squared pixel errors of both images, with distortion. It is the maximum-likelihood
+point for Gaussian noise.
+
+`linear` takes the smallest singular vector of the four image equations, and `midpoint` the middle of the
+shortest segment between both rays. Both use undistorted pixels (Hartley and Sturm 1997).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.calibration import Calibration, camera_of
+from neurocal_cli.calibration.rig.two_view_points import PointBatch
+from neurocal_cli.calibration.rig.wide_points import WidePointBatch
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError, check_choice
+
+METHODS = ("optimal", "linear", "midpoint")
+
+_BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
+_FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
+_EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
+
+
+@frozen_dataclass(eq=False)
+class Triangulated:
+    """Points in the left camera's frame.
+
+    The covariance is that for pixels of covariance 1 px^2 (or of the given shape); times sigma^2 it is the
+    points'. The epipolar error is the length of the vector of four from both pixels to the images of the
+    point. For the optimal method it is the smallest shift that makes the rays intersect. It has one degree of
+    freedom, so its rms is the standard deviation of the pixels.
+    """
+
+    # (N, 3) X, Y, Z [unit of t]; infinite or nan where rays are parallel or the distortion does not reach
+    points: Array
+    covariance: Array | None  # (N, 6) XX, XY, XZ, YY, YZ, ZZ; None unless the method is optimal
+    epipolar: Array  # (N,) [px]
+    behind: NDArray[np.bool_]  # (N,) not in front of both cameras, or not finite
+
+    def off(self, limit: float) -> NDArray[np.bool_]:
+        """(N,) which epipolar errors exceed a limit [px]."""
+        return np.asarray(~(self.epipolar <= limit))
+
+
+def epipolar_limit(sigma: float) -> float:
+    """Epipolar error [px] of outliers, for pixels of a standard deviation [px]."""
+    return _EPIPOLAR_SIGMAS * sigma
+
+
+def triangulate(
+    left: Camera | Calibration,
+    right: Camera | Calibration,
+    pose: Pose | Sequence[Pose],
+    left_pixels: Array,
+    right_pixels: Array,
+    *,
+    which: NDArray[np.intp] | None = None,
+    method: str = "optimal",
+    whitening: tuple[Array, Array] | None = None,
+) -> Triangulated:
+    """Triangulate points from their pixels in two cameras.
+
+    Parameters
+    ----------
+    left, right : Camera or Calibration
+    pose : Pose, or a sequence of them
+        The rig, ``X_right = R X_left + t``, or several.
+    left_pixels, right_pixels : (N, 2) arrays [px]
+        Observed, so with distortion.
+    which : (N,) int array, optional
+        Index of each point's rig among several.
+    method : {"optimal", "linear", "midpoint"}
+    whitening : two of (N, 3) array, optional
+        Upper triangular factors of the pixels' inverse covariances: entries (0, 0), (0, 1), (1, 1). For
+        the optimal method.
+
+    Raises
+    ------
+    UsageError
+        An unknown method.
+    InputError
+        Arrays of different lengths or wrong shapes, or a rig that is no Pose.
+    """
+    check_choice("method", method, METHODS)
+    pixels = _pixels(left_pixels), _pixels(right_pixels)
+    n = len(pixels[0])
+    if len(pixels[1]) != n:
+        raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
+    cameras = camera_of(left), camera_of(right)
+    poses = [pose] if isinstance(pose, Pose) else pose
+    if not all(isinstance(one, Pose) for one in poses):
+        raise InputError("the rig must be a Pose, such as Pose(R, t), or a sequence of them")
+    rigs = np.stack([one.D for one in poses])
+    if len(rigs) == 1:
+        which = None
+    elif which is None or len(which) != n:
+        raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
+    wide = any(_sees_sideways(camera, seen) for camera, seen in zip(cameras, pixels, strict=True))
+    batch_type: type[PointBatch] | type[WidePointBatch] = WidePointBatch if wide else PointBatch
+    points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
+    covariance = np.empty((n, 6)) if method == "optimal" else None
+    with np.errstate(all="ignore"):
+        for start in range(0, n, _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
+            rig = np.moveaxis(rigs if which is None else rigs[which[rows]], 0, -1)
+            batch = batch_type(cameras, rig, pixels[0][rows].T, pixels[1][rows].T, factors)
+            if covariance is None:
+                points[rows] = batch.linear() if method == "linear" else batch.midpoint()
+                epipolar[rows], behind[rows] = batch.compare(points[rows])
+            else:
+                points[rows], covariance[rows], epipolar[rows], behind[rows] = batch.optimal()
+    return Triangulated(points, covariance, epipolar, behind)
+
+
+def _sees_sideways(camera: Camera, pixels: Array) -> bool:
+    """Whether any ray is too far from the axis for the faster parametrisation (x, y, 1) / w."""
+    if not camera.distortion.wide or not len(pixels):
+        return False
+    # Only pixels farthest from the principal point need a test; several, because of tangential terms.
+    away = np.nan_to_num(np.hypot(*(pixels - camera.A[:2, 2]).T))
+    farthest = np.argsort(-away, kind="stable")[:_FARTHEST]
+    return not bool((camera.unproject(pixels[farthest])[:, 2] > _LEAST_DEPTH).all())
+
+
+def _pixels(values: Array) -> Array:
+    pixels = real_array("pixels", values)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
+    return pixels

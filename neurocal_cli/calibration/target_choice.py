@@ -1,0 +1,211 @@
+"""Estimate the target's shape with the camera if the data support it, and select lens and target together.
+
+Residuals of a bent board look like lens distortion. So the target is estimated with the lens selected for the
+given target, the lens is selected again for that target, and so on until the distortion model stays the same.
+The outliers are judged again as well: many of them contradict only the given target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, enough_views, find_target
+from neurocal_cli.adjustment.board.view_bends import find_bends
+from neurocal_cli.adjustment.outlier_views import free_networks
+from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.calibration.calibration import Rejected
+from neurocal_cli.calibration.common_target import find_shape, views_suffice
+from neurocal_cli.calibration.fit import fit, fit_again
+from neurocal_cli.calibration.odd_views import may_be_bent
+from neurocal_cli.calibration.other_causes import groups_of_views, has_other_cause
+from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
+from neurocal_cli.calibration.point_errors import rms
+from neurocal_cli.calibration.surveyed_points import with_survey
+from neurocal_cli.calibration.verdict.view_groups import OWN_STEPS, variance_of_views
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.network.options import Options
+from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.target import Target, distinct_points
+
+_ROUNDS = 3
+_WORTH = 0.8  # least effective share of the views, where some repeat a pose
+_OF_LINES = "k1k2p1p2"  # the model that `plumb-line` estimates
+# Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
+# most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
+# half 3 % worse.
+_SHARE, _NOISE = 0.9, 1.1
+_SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
+
+
+def with_target(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """Estimate the target's shape, and fit the camera to it.
+
+    The problem has all points, at the world coordinates of their file; the solution and the rejected points
+    are for the given target. They are returned unchanged if it stays. The choice is "auto", "given", "flat"
+    or "free".
+    """
+    if choice != "given" and problem.points.world_std is not None and not solution.refusal:
+        return with_survey(problem, solution, rejected, options)
+    rich = solution.state.model == "rich"  # flexible enough to absorb a bent target
+    if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
+        return solution, rejected
+    known = _searched(problem, solution, rejected, options, choice)
+    if not _may_contradict_only_given(problem, *known):
+        return known
+    try:
+        found = _searched(problem, solution.of_all or fit(problem, options), known[1], options, choice)
+    except DegenerateGeometryError:
+        return known
+    explained = found[0].target is not None and not found[1].views and len(found[1]) <= len(known[1])
+    return found if explained and rms(found[0]) <= NO_WORSE * rms(known[0]) else known
+
+
+def _may_contradict_only_given(problem: Problem, solution: Solution, rejected: Rejected) -> bool:
+    """Whether the rejected views or points may contradict only the given target, so all are tried again."""
+    target, views = solution.target, rejected.views
+    if views:
+        unexplained = target is None or target.bends is not None
+        return unexplained and all(map(may_be_bent, views.values()))
+    if not len(rejected) or problem.views.n_views > 1:
+        return False
+    # A plane that stands elsewhere in the only view; in other views its points would have come back.
+    given, _, ids = distinct_points([problem.points])
+    return bool(planes_of(given, ids).any())
+
+
+def _searched(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """Alternate between target and camera as `with_target` does, from the views of one solution."""
+    if not _can_tell(solution, choice, None):
+        return solution, rejected
+    found = _found(solution, choice, None)
+    if choice != "flat":
+        found = _with_bends(solution, found)
+    if found is not None and choice == "auto" and has_other_cause(solution, found):
+        return solution, rejected
+    best = replace(solution, target_kept=choice == "auto")
+    for _ in range(_ROUNDS):
+        if found is None:
+            break
+        (new, adjusted), *_ = found.fits
+        lens = new.distortion.model
+        # Views that contradicted only the given target have come back, so the record is the latest one.
+        start = replace(solution, problem=new, adjusted=adjusted, record=best.record)
+        again = _fitted_to(problem, found.target, start, rejected, options)
+        if again is None:
+            break
+        fitted, outliers = again
+        same_views = fitted.problem.views.names == solution.problem.views.names
+        if not (same_views or _can_tell(fitted, choice, found.target)):
+            break
+        if not _is_where_it_was(found, fitted):
+            found = _found(fitted, choice, found.target)
+        if found is None:
+            break
+        (new, adjusted), *_ = found.fits
+        posterior = None if found.posterior is None else (adjusted, found.posterior)
+        best = replace(
+            fitted, problem=new, adjusted=adjusted, target=found.target, target_posterior=posterior
+        )
+        rejected = outliers
+        if new.distortion.model == lens:
+            break
+    return best, rejected
+
+
+def lines_that_are_bent(solution: Solution, unit: str) -> str:
+    """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent.
+
+    The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
+    """
+    problem = solution.problem.with_model(_OF_LINES)
+    adjusted = problem.adjust(solution.adjusted)
+    _, label, _ = distinct_points([problem.points])
+    if not problem.free_poses or not enough_views(label, problem.views.n_views):
+        return ""
+    found = find_target([(problem, adjusted)], least_gain=LEAST_GAIN)
+    if found is None or has_other_cause(replace(solution, problem=problem, adjusted=adjusted), found):
+        return ""
+    target = found.target
+    off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
+    return (
+        f"the target is bent by {target.bend():.2g} {unit}, and its points lie {off:.2g} {unit} rms from "
+        "where they are given; its lines are not straight, which biases the distortion estimated from them; "
+        "estimate it from the points instead (--distortion auto)"
+    )
+
+
+def _with_bends(solution: Solution, common: Found | None) -> Found | None:
+    """Add a bend to each view if that explains why the views contradict each other.
+
+    Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
+    """
+    given = solution.problem, solution.adjusted
+    found = find_bends(given, common)
+    if found is None or found.target.bends is None:
+        return found
+    before, after = given if common is None else common.fits[0], found.fits[0]
+    least, flat = variance_of_views(after[0].views, after[1].state), _noise(*before, 0.0)
+    bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
+    if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
+        return common
+    # No two cameras of this lens can fit better than a camera for each view.
+    least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
+    if float(after[1].cost.sum()) < least_of_groups:
+        return found
+    groups = groups_of_views(*before)
+    explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
+    return found if groups is None or groups.explained < explained else common
+
+
+def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
+    """Residual variance, normalised; `determined` unknowns are counted besides camera and poses."""
+    unknowns = int(problem.free_camera.sum()) + 6 * problem.views.n_views + determined
+    return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
+
+
+def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
+    """Whether there are enough independent views to estimate the target."""
+    problem = solution.problem
+    points = problem.points if known is None else known.straightened(problem.points)
+    if not views_suffice([points], known, solution.repeated.n_poses):
+        return False
+    # Errors common to repeated views look like errors of the target.
+    return choice != "auto" or not solution.repeated.worth < _WORTH
+
+
+def _is_where_it_was(found: Found, again: Solution) -> bool:
+    """Whether fitting the camera to the found target left it where it was when the target was found."""
+    (problem, adjusted), new = found.fits[0], again.problem
+    if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
+        return False
+    if not np.array_equal(problem.points.pixels, new.points.pixels):
+        return False
+    cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
+    stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    return stays and np.array_equal(problem.free_camera, new.free_camera)
+
+
+def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
+
+
+def _fitted_to(
+    problem: Problem, target: Target, solution: Solution, rejected: Rejected, options: Options
+) -> tuple[Solution, Rejected] | None:
+    """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
+    try:
+        if len(rejected) or rejected.views:
+            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
+        else:  # the solution has all points, where the target has them
+            again = fit_again(solution, solution.problem.points, options, only_from_here=True)
+    except DegenerateGeometryError:
+        return None
+    return None if again.refusal else (again, rejected)

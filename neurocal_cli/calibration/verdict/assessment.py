@@ -1,0 +1,396 @@
+"""Measure the quality of a calibration beyond its reprojection error, and reach a verdict.
+
+All measures (`Evidence`) are computed from the calibration and its points, so a file can be judged like a
+fresh result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.board.camera_covariance import CameraSeen, camera_covariance
+from neurocal_cli.adjustment.chi_squared import chi_squared
+from neurocal_cli.adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
+from neurocal_cli.adjustment.given_camera import covariance_by_camera, entry_covariance
+from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
+from neurocal_cli.adjustment.repeated_poses import repeated_poses
+from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
+from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.adjustment.reweighting import weighed
+from neurocal_cli.adjustment.stored_state import stored_state
+from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.view_covariance import scores_of_poses
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.calibration.calibration import Calibration, Verdict, estimated_parameters, free_entries
+from neurocal_cli.calibration.verdict.board_shape import BoardShape, board_shape
+from neurocal_cli.calibration.verdict.coverage import cover
+from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.findings import pixel_spread, verdict_of
+from neurocal_cli.calibration.verdict.given_parameters import (
+    Doubt,
+    Reestimated,
+    doubt_about_given,
+    reestimate_centre,
+    reestimate_centre_and_target,
+    reestimate_given,
+)
+from neurocal_cli.calibration.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
+from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
+from neurocal_cli.calibration.verdict.odd_points import repeated_views
+from neurocal_cli.calibration.verdict.projection_uncertainty import (
+    ProjectionUncertainty,
+    image_grid,
+    projection_uncertainty,
+)
+from neurocal_cli.calibration.verdict.proportions import Proportions, proportions
+from neurocal_cli.calibration.verdict.rules import reach_verdict
+from neurocal_cli.calibration.verdict.view_change import ViewChange, view_change
+from neurocal_cli.calibration.verdict.view_groups import ViewGroups, view_groups
+from neurocal_cli.camera.directions import xi_is_flat
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.median import median
+from neurocal_cli.observations.points import Correspondences
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.verdict.moving_centre import MovingCentre
+
+_STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
+_IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
+# Relative change of the focal length that bends of single views can mimic: 0.26 % in one of 18 sets of
+# photographs and their halves, and none in simulated boards that bend from view to view.
+_BY_FLEXING = 0.005
+_CONTRADICTED = 1.6  # error over the noise floor from which on the board's proportions are tested
+_EXACT = 1e-4  # of the spread of the pixels: negligible errors
+_DISTANT = 10.0  # times the distance of the farthest point
+
+
+# In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def gather_evidence(calibration: Calibration) -> Evidence:
+    """Compute all measures of the quality of a calibration, which has its points."""
+    return _AtMinimum(calibration).evidence()
+
+
+def assess(calibration: Calibration) -> Verdict | None:
+    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own."""
+    if not _has_points(calibration):
+        return None
+    behind = _views_behind(calibration)
+    if behind:
+        reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
+        return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
+    return reach_verdict(calibration, gather_evidence(calibration))
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | None:
+    """Uncertainty of projected pixels over the image; None without points or image size."""
+    if not _has_points(calibration) or _views_behind(calibration):
+        return None
+    return _AtMinimum(calibration).projection()
+
+
+def _has_points(calibration: Calibration) -> bool:
+    return bool(calibration.views) and set(calibration.points.view_names) == set(calibration.views)
+
+
+def _views_behind(calibration: Calibration) -> int:
+    """Number of views with points behind the camera or in its plane, according to their stored poses.
+
+    For a wide lens: with points outside the domain of its model.
+    """
+    points, view = calibration.points, calibration.points.view_index
+    state = stored_state(calibration, points.view_names)
+    if calibration.camera.distortion.wide:
+        seen = calibration.camera.sees((state.R[view] @ points.world[..., None])[..., 0] + state.t[view])
+    else:
+        depth = (points.world * state.R[view, 2]).sum(axis=1) + state.t[view, 2]
+        seen = depth > _IN_PLANE * np.abs(depth).max()
+    return int(np.count_nonzero(np.bincount(view[~seen])))  # np.unique would load numpy.ma
+
+
+class _AtMinimum:
+    """A calibration in normalised units, adjusted to its minimum."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration, self.points = calibration, calibration.points
+        views = [calibration.views[name] for name in self.points.view_names]
+        self.camera, self.given = calibration.camera, stored_state(calibration, self.points.view_names)
+        self.views = self._arranged(self.points)
+        self.free = estimated_parameters(calibration)
+        if xi_is_flat(calibration.distortion_model, calibration.distortion):
+            self.free[5] = False  # xi: alpha and alpha_u determine what is projected
+        self.free_poses = not all(view.fixed for view in views)
+        state = normalised(self.given, self.views)
+        adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
+        self.state, self.normal = adjusted.state, adjusted.normal
+        self.cost = float(self.normal[:, -1, -1].sum())
+        self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
+        self.errors = point_residuals(self.views, self.state)
+        self.repeated = repeated_poses(self.views, self.state, self.errors)
+        known = camera_covariance(
+            CameraSeen(
+                self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
+                self.points, calibration.target, choice=tuple(calibration.lens_choice),
+                target_kept=calibration.target_stretched > 0,
+            )
+        )  # fmt: skip
+        self.normal = known.basis.normal
+        self.minimum = Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+        self.spare = max(known.basis.n_equations - self.unknowns, 1)
+        self.variance = self.cost / self.spare
+        self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
+        self.covariance, self.wide = known.found.entries, known.wide
+        self.pose_covariance = known.found.poses
+        if calibration.given_names:
+            by_camera = covariance_by_camera(self.views, self.state, self._covariance_of_given())
+            self.pose_covariance = self.pose_covariance + by_camera
+
+    def _covariance_of_given(self) -> Array:
+        """(5 + K, 5 + K) covariance of a given camera, normalised."""
+        return self._of_entries(self.calibration.given_names, self.calibration.given_covariance)
+
+    def _of_entries(self, names: tuple[str, ...], covariance: Array) -> Array:
+        c, px = self.calibration, self.views.pixel_scale
+        return entry_covariance(c.intrinsics, c.distortion_model, names, covariance, px)
+
+    def _stored(self) -> tuple[NDArray[np.bool_], Array]:
+        """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
+        c = self.calibration
+        free = free_entries(c)
+        return free, self._of_entries(c.covariance_names, c.covariance)[np.ix_(free, free)]
+
+    def _arranged(self, points: Correspondences) -> Views:
+        """The points, at these or other world coordinates, with the weights that the residuals bear out."""
+        if points.covariance is None:
+            return arrange(points)
+        return weighed(points, -self._residuals())
+
+    def evidence(self) -> Evidence:
+        """All measures that the rules use."""
+        views = self.views
+        precision, contradiction = self._precision()
+        # Residuals beyond an estimated target come from bends that differ from view to view.
+        found = self.calibration.target is not None
+        noise = self.variance * (max(contradiction, 1.0) ** 2 if found else 1.0)
+        alike, residuals = correlation(views, self.errors), self._residuals()
+        stated = tuple(stated_noise(self.points, residuals, alike))
+        return Evidence(
+            rmse_px=self.calibration.rmse_px,
+            held_out_px=self._held_out(),
+            precision_px=precision,
+            contradiction=contradiction,
+            disagreement=self._disagreement(),
+            correlation=alike,
+            condition=self.condition,
+            coverage=cover(self.points, views, self.state),
+            projection=self.projection(),
+            repeated=repeated_views(self.points),
+            poses=self.repeated.n_poses,
+            # Sigmas that are wrong give single points the weight that all this is computed with.
+            change=None if stated else self._change(noise),
+            centre=None if stated else self._centre(contradiction),
+            turned=() if stated else self._turned(contradiction),
+            board=None if stated else self._board(),
+            mirrored=tuple(seen_from_behind(views, self.state)),
+            reestimated=self._reestimated(),
+            doubt=self._doubt(),
+            noise=(
+                *stated,
+                *stated_survey(self.calibration.target),
+                *noise_shape(self.points, residuals, alike),
+            ),
+            stated=bool(stated),
+            groups=None if stated else self._groups(),
+            missing=self._missing(),
+            proportions=self._proportions(contradiction),
+        )
+
+    def _reestimated(self) -> tuple[Reestimated, ...]:
+        """Given parameters as the points have them; of several estimates of a centre, the farthest one."""
+        given, rich = self.calibration.fixed, self.state.model == "rich"
+        found = reestimate_given(self.views, self.state, given, self.free_poses)
+        target, p = self.calibration.target, {"p1", "p2"} - given
+        if target is None and not rich and p.isdisjoint(coefficient_names(self.state.model)):
+            return found
+        points, views = self._as_given()
+        simpler: tuple[Reestimated, ...] = ()
+        if not rich:
+            state = normalised(self.given, views)
+            simpler = reestimate_centre(views, state, given, self.free_poses, self.variance)
+        if self.calibration.type == 2 and not self._is_exact():
+            simpler += reestimate_centre_and_target(points, views, self.given, given, self.variance)
+        farthest: dict[str, Reestimated] = {}
+        for a in (*simpler, *found):
+            if a.name not in farthest or abs(a.found - a.given) > abs(farthest[a.name].found - a.given):
+                farthest[a.name] = a
+        return tuple(farthest.values())
+
+    def _doubt(self) -> Doubt | None:
+        if not self.free_poses or self._is_exact() or self.state.model == "rich":
+            return None
+        std = np.sqrt(np.maximum(np.diagonal(self.pose_covariance, axis1=1, axis2=2), 0.0))
+        return doubt_about_given(self.views, self.state, self.calibration.fixed, self.normal, std)
+
+    def _residuals(self) -> Array:
+        """(N, 2) predicted minus observed [px], in the order of the points."""
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
+        return predicted - self.points.pixels
+
+    def _is_exact(self) -> bool:
+        return self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
+
+    def _groups(self) -> ViewGroups | None:
+        if self._is_exact() or not (self.free_poses and self.free[:5].any()):
+            return None
+        return view_groups(self.views, self.state, self.normal, self.free, self.networks)
+
+    @cached_property
+    def networks(self) -> Array:
+        """(V,) squared error of a free network for each view."""
+        return free_networks(self.views, self.state)
+
+    def _held_out(self) -> float:
+        lost = self._held_out_with_prior() if self.state.model == "rich" else held_out(self.minimum)
+        return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
+
+    def _held_out_with_prior(self) -> Array:
+        """Squared errors of held-out views, with a rich lens's displacement estimated without them.
+
+        At the minimum the gradients of points and prior cancel. Without a fold F of the views the minimum is
+        at -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
+        """
+        free, shared = self._stored()
+        q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
+        S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
+        inverse = shared / self.variance
+        steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
+        return q.at(np.asarray(steps[fold], dtype=float))
+
+    def _precision(self) -> tuple[float, float]:
+        freedom = 6 + conditions_on_views(self.views, self.state)
+        own_spare = self.views.n_equations - int(freedom.sum())
+        if own_spare <= 0 or freedom.sum() <= self.unknowns:
+            return np.nan, np.nan
+        own = float(self.networks.sum()) / own_spare
+        px = self.views.pixel_scale
+        floor = (1e-9 * px) ** 2
+        ratio = np.sqrt((self.variance + floor) / (own + floor))
+        of_point = self.views.n_equations / len(self.points)
+        return float(np.sqrt(of_point * own)) * px, float(ratio)
+
+    def _change(self, variance: float) -> ViewChange | None:
+        if not self.free.any() or self.repeated.n_poses < 2:
+            return None
+        scores = scores_of_poses(self.normal, self.free, self.free_poses, self.repeated)
+        change = view_change(
+            self.views, self.state, self.free, scores, self.repeated.group, variance, self.spare
+        )
+        if change is None or change.pattern != "groups" or self.calibration.target is None:
+            return change
+        # A board that bends differently in each view mimics two slightly different groups of views.
+        return None if abs(change.amount) < _BY_FLEXING else change
+
+    def _centre(self, contradiction: float) -> MovingCentre | None:
+        # The rays of a wide lens do not meet in one point, and a rich lens takes in every error.
+        special = self.camera.distortion.wide or self.state.model == "rich"
+        if special or not self.free_poses or self._is_exact():
+            return None
+        from neurocal_cli.calibration.verdict.moving_centre import moving_centre
+
+        q = reduced(self.normal, self.free, self.free_poses)
+        try:
+            return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
+        except np.linalg.LinAlgError:  # the views do not determine the camera
+            return None
+
+    def _turned(self, contradiction: float) -> tuple[str, ...]:
+        special = self._is_exact() or self.state.model == "rich"
+        if self.points.image_size is None or special or not (self.free_poses and self.free[3:5].all()):
+            return ()
+        from neurocal_cli.calibration.verdict.turned_images import WithBoard, can_show, turned_images
+
+        if not can_show(self.views.n_views, contradiction, self.spare):
+            return ()
+        points, views = self._as_given()
+        estimated = None
+        if self.calibration.target is not None:
+            q = reduced(self.normal, self.free, True)
+            estimated = WithBoard(self.views, self.state, q)
+        floor = self.cost * self.views.pixel_scale**2 / contradiction**2
+        try:
+            state = normalised(self.given, views)
+            return turned_images(points, views, state, self.free, self.spare, floor, estimated)
+        except np.linalg.LinAlgError:  # the views do not determine the camera
+            return ()
+
+    def _as_given(self) -> tuple[Correspondences, Views]:
+        """The points at the coordinates of the given target, also arranged by views."""
+        target = self.calibration.target
+        points = self.points if target is None else target.as_given(self.points)
+        return points, self.views if target is None else self._arranged(points)
+
+    def _board(self) -> BoardShape | None:
+        if not self.free[0] or not self.free_poses or self.calibration.target is not None:
+            return None
+        std = float(np.sqrt(self.covariance[0, 0]))
+        times = float(self.repeated.variance.mean())
+        return board_shape(self.minimum, self.variance, self.spare, times, std)
+
+    def _missing(self) -> MissingCoefficients | None:
+        selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
+        if selected or self._is_exact() or not self.free[0]:
+            return None
+        std = np.zeros(len(self.free))
+        std[self.free] = np.sqrt(np.diagonal(self.covariance))
+        return missing_coefficients(self.minimum, std[:5])
+
+    def _proportions(self, contradiction: float) -> Proportions | None:
+        given = self.calibration.target is None and self.calibration.type in (1, 2)
+        if not given or self._is_exact() or not contradiction > _CONTRADICTED:
+            return None
+        return proportions(self.points)
+
+    def _disagreement(self) -> float:
+        if not self.free.any() or self.calibration.straight_lines is not None:
+            return np.nan
+        difference, cov = disagreement(self.minimum)
+        if not np.isfinite(cov).all():
+            return np.nan
+        chi = chi_squared(difference, cov)
+        return chi * self.spare / max(self.cost, 1e-300) / len(difference)
+
+    def projection(self) -> ProjectionUncertainty | None:
+        """Uncertainty of projected pixels over the image; None if its size is unknown."""
+        if self.points.image_size is None:
+            return None
+        view = self.points.view_index
+        depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
+        angle = None
+        if self.camera.distortion.wide:  # beyond 90 degrees there is no depth, so use distances
+            angle = farthest_angle(self.views, self.state)
+            depth = np.linalg.norm(
+                (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
+            )
+        depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
+        m, camera, shared = self.minimum, self.camera, self.covariance
+        if self.wide is not None:
+            lens, shared = self.wide.open, self.wide.entries
+            m = replace(m, state=lens.state(m.state), normal=self.wide.normal, free=lens.free)
+            camera = replace(camera, distortion=Distortion(lens.model, lens.k))
+        if camera.distortion.model == "rich":
+            free, shared = self._stored()
+            m = replace(m, free=free)
+        if self.calibration.given_names:
+            given = self._covariance_of_given()
+            free = np.diagonal(given) > 0
+            m, shared = replace(m, free=free), given[np.ix_(free, free)]
+        pixels = image_grid(self.points.image_size)
+        return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)

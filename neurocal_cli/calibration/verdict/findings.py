@@ -1,0 +1,70 @@
+"""The parts of a verdict: findings with a grade, a reason and advice, and the limits for the grades."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.observations.points import Correspondences
+
+WORDS = ("good", "usable", "poor")
+"""By grade."""
+
+Finding = tuple[int, str, str]
+"""Grade (0 good, 1 usable, 2 poor), reason, advice."""
+
+_SHOWN = 3
+
+
+@frozen_dataclass
+class Limit:
+    """Limits above which a quantity is no longer good, and above which it is poor."""
+
+    good: float
+    poor: float
+
+    def grade(self, value: float) -> int:
+        """0 good, 1 usable, 2 poor; nan counts as good."""
+        return int(value > self.good) + int(value > self.poor)
+
+
+def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:
+    """Verdict with the word of the worst finding, and all reasons and advice, the worst first, each once."""
+    found = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
+    return Verdict(
+        WORDS[found[0][0] if found else 0],
+        tuple(dict.fromkeys(f[1] for f in found if f[1])),
+        tuple(dict.fromkeys(f[2] for f in found if f[2])),
+        measures,
+    )
+
+
+def two_digits(value: float) -> str:
+    """Write a number with two significant digits, a large one without an exponent.
+
+    Examples
+    --------
+    >>> two_digits(0.123), two_digits(234.5)
+    ('0.12', '230')
+    """
+    return f"{float(f'{value:.2g}'):.15g}"
+
+
+def name_some(names: Iterable[object]) -> str:
+    """List the first names, and the number of further ones."""
+    some = [str(name) for name in names]
+    more = len(some) - _SHOWN
+    return ", ".join(some[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def image_diagonal(points: Correspondences) -> float:
+    """Diagonal of the image [px]; of the pixels' bounding box if the image size is unknown."""
+    return float(np.hypot(*(points.image_size or np.ptp(points.pixels, axis=0))))
+
+
+def pixel_spread(points: Correspondences) -> float:
+    """Rms distance of the pixels from their mean [px]."""
+    return float(np.sqrt(points.pixels.var(axis=0).sum()))

@@ -1,0 +1,97 @@
+"""The verdict on a calibration with new points, from which it was not calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.findings import (
+    WORDS,
+    Finding,
+    Limit,
+    image_diagonal,
+    pixel_spread,
+    two_digits,
+    verdict_of,
+)
+from neurocal_cli.calibration.verdict.rules import ERROR, given_parameters
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.observations.points import Correspondences
+
+# Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
+# tests/test_given_points.py.
+_LARGER = Limit(1.5, 4.0)
+_CHANCE = 3.0  # standard deviations by which the rms error of few points may be larger
+_ROUNDING = 1e-4  # of the pixels' spread: smaller errors are negligible
+
+
+@frozen_dataclass
+class GivenPoints:
+    """The error of a calibration on given points."""
+
+    rmse_px: float  # px; nan if no point lies in front of the camera
+    n_points: int
+    n_behind: int
+    fit: Calibration | None = None  # the views whose poses were fitted to these points, with the camera given
+
+
+def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Verdict:
+    """Add the findings about given points to the verdict of the calibration, which becomes no better."""
+    findings = [given_error(verdict, calibration.rmse_px, calibration.points, given)]
+    return with_findings(verdict, [*findings, *given_camera(calibration, given.fit)])
+
+
+def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Finding]:
+    """Findings about the camera from views whose poses were fitted with it."""
+    if fit is None:
+        return []
+    return list(given_parameters(gather_evidence(fit).reestimated, calibration.intrinsics, calibration.std))
+
+
+def with_findings(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:
+    """Add findings to a verdict, which becomes no better."""
+    found = verdict_of(findings, {})
+    return replace(
+        verdict,
+        word=max(found.word, verdict.word, key=WORDS.index),
+        reasons=(*found.reasons, *verdict.reasons),
+        advice=tuple(dict.fromkeys((*found.advice, *verdict.advice))),
+    )
+
+
+def given_error(
+    verdict: Verdict,
+    rmse_px: float,
+    own_points: Correspondences,
+    given: GivenPoints,
+    same: str = "camera at the same zoom and focus",
+) -> Finding:
+    """The finding about the error on given points.
+
+    The verdict, the reprojection error [px] and its own points are those of the calibration; `same` names
+    what should not have changed, for the advice.
+    """
+    error, seen = given.rmse_px, given.n_points - given.n_behind
+    if 2 * seen < given.n_points:
+        return (
+            2,
+            f"{given.n_behind} of the {given.n_points} given points lie behind the camera",
+            "check the signs of X,Y,Z, and that the points are of these views",
+        )
+    # With few points, the error of a calibration on its own points is too small, so use cross-validation.
+    held_out = verdict.measures.get("held_out_px", np.nan)
+    own = float(np.fmax(rmse_px, held_out))
+    own = max(own, _ROUNDING * pixel_spread(own_points))
+    # The relative standard deviation of an rms error of n numbers is 1 / sqrt(2 n); a point has two.
+    ratio = error / (own * (1 + _CHANCE / np.sqrt(4 * seen)))
+    grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
+    return (
+        grade,
+        f"the rms error of {error:.3g} px on the given points is {two_digits(error / own)} times the "
+        f"{own:.3g} px of the calibration",
+        f"check that the given points are of the same {same}; look at the views with the largest errors",
+    )

@@ -1,0 +1,125 @@
+"""Test whether the residuals look like measurement noise, and agree with the stated standard deviations.
+
+Measurement noise has the same size in u and v and in all views. Standard deviations may be stated for the
+pixels and for the world points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
+from neurocal_cli.adjustment.common_noise import common_share, measured
+from neurocal_cli.calibration.verdict.findings import Finding, name_some, pixel_spread
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.median import median
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import Target
+
+# Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
+_ONE_WAY = 2.5  # rms along u over that along v, or the reverse
+_VIEW = 4.0  # rms of a view over the lower quartile of all views
+_SYSTEMATIC = 0.5  # correlation of neighbouring residuals above which the target or the lens is the cause
+_FEWEST = 12  # fewest points; 12 determine a std to a fifth
+_ROUNDING = 1e-4  # of the pixels' spread
+_SHARE = 0.5  # common share of the noise from which on the stated sigmas are wrong
+# Points with a sigma below this share of the median one are compared with the others, from so many on.
+_FAR_BELOW, _FEWEST_SMALL = 0.5, 6
+_CHANCE = 4.75  # sigmas: one clean set in a million
+_FACTOR = 2.0  # between views whose sigma is too small and the others
+
+
+def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
+    """Findings about a direction, or views, with much larger residuals (N, 2) [px] than the others.
+
+    Neighbouring residuals that are correlated are no measurement noise.
+    """
+    if points.covariance is not None or len(points) < _FEWEST or correlation > _SYSTEMATIC:
+        return
+    u, v = np.sqrt((residuals**2).mean(axis=0))
+    least = _ROUNDING * pixel_spread(points)
+    if max(u, v) > max(_ONE_WAY * min(u, v), least):
+        ratio, (most, other) = max(u, v) / max(min(u, v), 1e-12), ("u", "v") if u > v else ("v", "u")
+        yield (
+            1,
+            f"the residuals along {most} are {ratio:.2g} times those along {other}, as with motion blur",
+            "keep the camera and the target still",
+        )
+    index, n_views = points.view_index, points.n_views
+    counts = np.bincount(index, minlength=n_views)
+    rms = np.sqrt(np.bincount(index, (residuals**2).sum(axis=1), n_views) / counts)
+    usual = float(np.interp(0.25 * (n_views - 1), np.arange(n_views), np.sort(rms)))
+    off = (rms > max(_VIEW * usual, least)) & (counts >= _FEWEST)
+    if n_views > 2 and off.any():
+        names = np.array(points.view_names)[off]
+        yield (
+            1,
+            f"{name_some(names)}: the residuals are {float(np.median(rms[off])) / usual:.2g} times those of "
+            "the best views, as of blurred images",
+            "leave out blurred images, or state sigma",
+        )
+
+
+def stated_noise(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
+    """Findings about points or views whose sigma is too small, or unrelated to the residuals (N, 2) [px].
+
+    A few points with a small sigma have most of the weight, so all else that seems wrong may come from them.
+    If neighbouring residuals are correlated, it is the target or the lens that makes them larger than sigma.
+    Covariances measured by a detector are not judged here, because `reweighting` handles them.
+    """
+    covariance = points.covariance
+    if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:
+        return
+    advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
+    if common_share(covariance, residuals) < _SHARE:
+        if correlation <= _SYSTEMATIC:
+            yield from _too_small_at_some(np.sqrt(covariance[:, 0]), residuals, advice)
+        return
+    V = points.n_views
+    counts = np.bincount(points.view_index, minlength=V)
+    squared = (residuals**2).sum(axis=1) / (2 * covariance[:, 0])
+    level = np.sqrt(np.bincount(points.view_index, squared, V) / counts)
+    order = np.sort(level)
+    step = int(np.argmax(order[1:] / order[:-1])) if V > 1 else 0  # the largest gap between two views
+    small = (level > order[step]) & (counts >= _FEWEST)
+    if V > 1 and small.any() and order[step + 1] > _FACTOR * order[step]:
+        names = np.array(points.view_names)[small]
+        factor = float(np.median(level[small])) / float(np.median(level[~small]))
+        yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
+    else:
+        yield 1, "the stated sigmas do not predict the residuals", advice
+
+
+def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[Finding]:
+    """Finding about the points of the smallest sigma (N,), if their residuals are not as small."""
+    usual = median(sigma)
+    few = sigma < _FAR_BELOW * usual
+    n = int(few.sum())
+    if n < _FEWEST_SMALL:
+        return
+    squared = (residuals**2).sum(axis=1) / sigma**2
+    ratio = float(squared[few].mean() / max(squared[~few].mean(), 1e-300))
+    if ratio > max(_FACTOR**2, float(exceeded_by_chance(2 * n, _CHANCE))):
+        yield (
+            1,
+            f"{n} points have a stated sigma of {median(sigma[few]):.2g} px, but their residuals are "
+            f"{np.sqrt(ratio):.2g} times as large for their sigma as those of the others, with {usual:.2g} "
+            "px",
+            advice,
+        )
+
+
+def stated_survey(target: Target | None) -> Iterator[Finding]:
+    """Finding about surveyed points that are more or less exact than stated."""
+    factor = 1.0 if target is None or target.stated is None else target.sizes["stated"]
+    if factor == 1.0:
+        return
+    small = factor > 1.0
+    yield (
+        1,
+        f"the standard deviations sX,sY,sZ of the points are {factor if small else 1 / factor:.2g} times too "
+        f"{'small' if small else 'large'}; they are scaled to match the residuals",
+        "state sX,sY,sZ as the survey has them, in the unit of the points",
+    )

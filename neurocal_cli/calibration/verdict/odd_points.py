@@ -1,0 +1,328 @@
+"""Findings about implausible points, and about outliers.
+
+Pixels may be rounded, clipped, normalised, outside the image, or given twice. World coordinates of some views
+may have another unit or size of squares than the others'. The pose of each view absorbs such a scale: the
+camera stays right, but the poses are wrong. Outliers may be whole views, many points of a view, or the same
+points of the target in most views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.verdict.findings import Finding, Limit, name_some
+from neurocal_cli.camera.geometry import Array, distinct_rows
+from neurocal_cli.camera.median import median
+from neurocal_cli.observations.points import Correspondences
+
+_FEWEST = 20  # fewest points from which whole numbers are no chance
+# Clipped: at least this number of points, and this share, have exactly the same outermost coordinate.
+_ALIKE = 6
+_ALIKE_SHARE = 0.01
+_BESIDE = 1.0  # px by which a detected point may lie outside the image
+_SOME = 0.01  # share of points outside the image up to which they count as single outliers
+_SAME = 1e-3  # px by which a copy of a view may differ
+_NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
+_SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
+_SHARED = 0.5  # share of a view's points that other views show as well: the same target, only partly seen
+_MOST_POINTS = 400  # most points of a view that are used
+_ROUND, _ROUGHLY = 0.01, 0.3  # relative difference within which a ratio is one of two units
+_MANY = 5.0  # ratio of the spacing of points for which targets of two sizes are no likely cause
+_UNITS = {
+    25.4: "inches and millimetres",
+    10.0: "centimetres and millimetres",
+    2.54: "inches and centimetres",
+    1000.0: "metres and millimetres",
+    100.0: "metres and centimetres",
+    304.8: "feet and millimetres",
+    12.0: "feet and inches",
+}
+_OUTLIERS = Limit(0.02, 0.2)  # of the points
+_OF_A_VIEW = 0.2  # share of a view's points from which on it is named; clean views lose none
+_FEWEST_OUTLIERS = 4  # fewest outliers of a view, or views of a point
+_OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
+
+
+def odd_points(calibration: Calibration) -> Iterator[Finding]:
+    """All findings about the points of a calibration, outliers included."""
+    points = _with_rejected(calibration)
+    yield from _rejected_points(calibration)
+    # What is wrong with a view that was left out is a reason of its own.
+    used = np.isin(points.view_names, calibration.points.view_names)
+    yield from odd_pixels(points.select(used[points.view_index]))
+    yield from points_given_twice(points)
+    yield from views_of_another_scale(calibration.points)
+
+
+def are_normalised(points: Correspondences) -> bool:
+    """Whether the pixels are normalised coordinates."""
+    return bool(np.abs(points.pixels).max() < _NORMALISED)
+
+
+def odd_pixels(points: Correspondences) -> Iterator[Finding]:
+    """Findings about the pixels as numbers."""
+    if are_normalised(points):
+        yield (
+            2,
+            "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",
+            "multiply u,v by the width and the height of the image",
+        )
+        return
+    first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
+    pixels = points.pixels[first]
+    step = _step(pixels)
+    if step:
+        to = "whole numbers" if step == 1 else f"multiples of {step} px"
+        yield 1, f"the pixels are rounded to {to}", "give sub-pixel coordinates, as `neurocal detect` does"
+    else:
+        yield from _clipped(pixels)
+    yield from _outside(points)
+
+
+def _step(pixels: Array) -> int:
+    """Greatest common divisor of all coordinates; 0 if they are not whole numbers."""
+    if len(pixels) < _FEWEST or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
+        return 0
+    return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
+
+
+def _clipped(pixels: Array) -> Iterator[Finding]:
+    enough = max(_ALIKE, _ALIKE_SHARE * len(pixels))
+    for name, values in zip("uv", pixels.T, strict=True):
+        for limit in (values.min(), values.max()):
+            count = np.count_nonzero(values == limit)
+            if count >= enough:
+                yield (
+                    1,
+                    f"{count} points have the very same outermost {name} = {limit:.6g}: they are clipped",
+                    "leave out points that are not seen",
+                )
+
+
+def _outside(points: Correspondences) -> Iterator[Finding]:
+    if points.image_size is None:
+        return
+    size = np.array(points.image_size, dtype=float)
+    count = int(_beyond(points.pixels, size).sum())
+    if count == 0:
+        return
+    text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
+    if count <= _SOME * len(points):
+        yield 1, text, "correct or leave out these points"
+    elif not _beyond(points.pixels, size[::-1]).any():
+        yield (
+            2,
+            f"{text}, as if its width and height, or u and v, were exchanged",
+            "check the order of u and v and of image_size",
+        )
+    elif not _beyond(points.pixels + size / 2, size).any():
+        yield (
+            2,
+            f"{text}, as if u,v were measured from its middle",
+            "measure u,v from the first pixel of the image",
+        )
+    else:
+        u, v = points.pixels.max(axis=0)
+        yield 2, f"{text}: they reach to ({u:.0f}, {v:.0f})", "correct image_size or the points"
+
+
+def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
+    beyond = (pixels < -0.5 - _BESIDE) | (pixels > size - 0.5 + _BESIDE)
+    return np.asarray(beyond.any(axis=1))
+
+
+def points_given_twice(points: Correspondences) -> Iterator[Finding]:
+    """Findings about views with the points of several images, or several pixels for the same point."""
+    table = np.column_stack([points.view_index, points.world])
+    first, label = distinct_rows(table)
+    seen, _ = distinct_rows(np.column_stack([label, points.pixels]))
+    different = np.bincount(label[seen])
+    view = points.view_index[first]
+    n_twice = np.bincount(view, different > 1, points.n_views)
+    n_points = np.bincount(view, minlength=points.n_views)
+    whole = 2 * n_twice > n_points
+    some = (n_twice > 0) & ~whole
+    twice = "points are given twice with different pixels"
+    for which, reason, advice in (
+        (whole, f"most {twice}, as of two images under one name", "give each image a name of its own"),
+        (some, f"{int(n_twice[some].sum())} {twice}", "check the ids and X,Y,Z of these points"),
+    ):
+        if which.any():
+            yield 1, f"{name_some(np.array(points.view_names)[which])}: {reason}", advice
+
+
+def repeated_views(points: Correspondences) -> tuple[str, ...]:
+    """Names of views with the same pixels as an earlier view, and of views with duplicated rows."""
+    table = np.round(np.column_stack([points.pixels / _SAME, points.world]), 6)
+    order = np.lexsort((*table.T, points.view_index))
+    table, view = table[order], points.view_index[order]
+    again = (table[1:] == table[:-1]).all(axis=1) & (view[1:] == view[:-1])
+    doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
+    of_views = np.split(np.round(table[:, :2]), np.cumsum(np.bincount(points.view_index))[:-1])
+    found, known = [], set()
+    for name, pixels, twice in zip(points.view_names, of_views, doubled, strict=True):
+        key = pixels.tobytes()
+        if key in known or twice:
+            found.append(name)
+        known.add(key)
+    return tuple(found)
+
+
+def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
+    """Findings about views in which the points are spaced wider or closer than in most views."""
+    if points.n_views < 2:
+        return
+    worlds = worlds_by_view(points)
+    step = _steps(worlds)
+    # The spacing that most views have; of two equally common ones, the first view's.
+    alike = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
+    usual = float(step[np.argmax(alike.sum(axis=1))])
+    off = np.abs(np.log(step / usual)) > np.log(_SCALED)
+    if not off.any():
+        return
+    off &= ~_seen_in_others(worlds, off)
+    for ratio in np.unique(np.round(np.log(step[off] / usual), 3)):
+        names = np.array(points.view_names)[off & (np.abs(np.log(step / usual) - ratio) < _ROUND)]
+        factor = float(np.exp(abs(ratio)))
+        unit = units_mixed(factor)
+        yield (
+            1,
+            f"{name_some(names)}: the points lie {float(f'{factor:.3g}'):g} times "
+            f"{'farther apart' if ratio > 0 else 'closer together'} than in the other views"
+            + (f", as with {unit} mixed" if unit else ""),
+            "give X,Y,Z of all views in one unit"
+            if unit
+            else "check the unit of X,Y,Z and the size of the squares in these views",
+        )
+
+
+def units_mixed(factor: float, within: float = _ROUND) -> str:
+    """The two units of length whose ratio is nearest to this factor above 1; "" if none is this near."""
+    known = min(_UNITS, key=lambda ratio: abs(factor / ratio - 1))
+    return _UNITS[known] if abs(factor / known - 1) < within else ""
+
+
+def view_of_another_unit(points: Correspondences) -> str:
+    """What is odd about the view whose points are spaced many times wider or closer than in most; or "".
+
+    The targets of the views may differ in size.
+    """
+    step = _steps(worlds_by_view(points))
+    ratio = step / median(step)
+    odd = int(np.argmax(np.abs(np.log(ratio))))
+    factor = float(max(ratio[odd], 1 / ratio[odd]))
+    if not factor > _MANY:
+        return ""
+    how, unit = "farther apart" if ratio[odd] > 1 else "closer together", units_mixed(factor, _ROUGHLY)
+    return f"the points of {points.view_names[odd]} lie {factor:.2g} times {how} than in most views" + (
+        f", as with {unit} mixed" if unit else ""
+    )
+
+
+def worlds_by_view(points: Correspondences) -> list[Array]:
+    """World points of each view."""
+    order = np.argsort(points.view_index, kind="stable")
+    return np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
+
+
+def _steps(worlds: list[Array]) -> Array:
+    """(V,) median distance of a point's nearest neighbour; computed once for equal points."""
+    known: dict[bytes, float] = {}
+    found = []
+    for world in worlds:
+        world = world[:_MOST_POINTS]
+        key = world.tobytes()
+        if key not in known:
+            squares = ((world[:, None] - world[None]) ** 2).sum(axis=-1)
+            squares[squares == 0] = np.inf
+            known[key] = float(median(np.sqrt(squares.min(axis=1))))
+        found.append(known[key])
+    return np.array(found)
+
+
+def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V,) whether most points of each suspect view are also points of the other views."""
+    known = np.unique(
+        np.concatenate([np.round(w, 6) for w, one in zip(worlds, off, strict=True) if not one]), axis=0
+    )
+    shared = np.zeros(len(worlds), dtype=bool)
+    for k in np.flatnonzero(off):
+        both = np.concatenate([known, np.unique(np.round(worlds[k], 6), axis=0)])
+        common = len(both) - len(np.unique(both, axis=0))
+        shared[k] = common > _SHARED * (len(both) - len(known))
+    return shared
+
+
+def _with_rejected(calibration: Calibration) -> Correspondences:
+    """All given points, outliers included: world points and pixels by view."""
+    kept, lost = calibration.points, calibration.rejected.points
+    if lost is None:
+        return kept
+    names = [np.array(part.view_names)[part.view_index] for part in (kept, lost)]
+    return Correspondences(
+        np.concatenate([kept.world, lost.world]),
+        np.concatenate([kept.pixels, lost.pixels]),
+        np.concatenate(names),
+        kept.image_size,
+    )
+
+
+def _rejected_points(calibration: Calibration) -> Iterator[Finding]:
+    """Finding about the number of outliers, and what they have in common."""
+    rejected = calibration.rejected
+    lost = rejected.points
+    if lost is None:
+        return
+    total = len(calibration.points) + len(lost)
+    views = _of_views(calibration, lost)
+    targets = _of_targets(calibration.points, lost, set(rejected.views))
+    where = [f"{name} ({why})" for name, why in list(rejected.views.items())[:2]]
+    if len(rejected.views) > 2:
+        where.append(f"{len(rejected.views) - 2} more views")
+    if views:
+        where.append(", ".join(f"{count} in {name}" for name, count in list(views.items())[:3]))
+    advice = "look at the points and views that are listed as outliers"
+    if targets:
+        where.append(f"{name_some(targets)} in most views")
+        advice = "check X,Y,Z of the points that are outliers in most views"
+    yield (
+        max(_OUTLIERS.grade(len(lost) / total), int(bool(where))),
+        f"{len(lost)} of {total} points are outliers and were left out"
+        + (": " if where else "")
+        + "; ".join(where),
+        advice,
+    )
+
+
+def _of_views(calibration: Calibration, lost: Correspondences) -> dict[str, int]:
+    """Number of outliers in views that lost many of their points, but not all."""
+    kept = dict(
+        zip(calibration.points.view_names, np.bincount(calibration.points.view_index).tolist(), strict=True)
+    )
+    counts = dict(zip(lost.view_names, np.bincount(lost.view_index).tolist(), strict=True))
+    return {
+        name: count
+        for name, count in counts.items()
+        if name in kept and count >= _FEWEST_OUTLIERS and count > _OF_A_VIEW * (count + kept[name])
+    }
+
+
+def _of_targets(kept: Correspondences, lost: Correspondences, wrong_views: set[str]) -> list[str]:
+    """Points of the target that are outliers in most of the views that show them."""
+    here = np.array([name not in wrong_views for name in lost.view_names])[lost.view_index]
+    if not here.any():
+        return []
+    lost = lost.select(here)
+    keys, place = np.unique(np.concatenate([lost.world, kept.world]), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    n_lost = np.bincount(place[: len(lost)], minlength=len(keys))
+    n_seen = np.bincount(place, minlength=len(keys))
+    found = np.flatnonzero((n_seen >= _FEWEST_OUTLIERS) & (n_lost > _OF_A_POINT * n_seen))
+    if lost.point is None:
+        return [f"the point ({', '.join(f'{x:g}' for x in keys[k])})" for k in found]
+    names = dict(zip(place[: len(lost)].tolist(), np.asarray(lost.point).tolist(), strict=True))
+    return [f"point {names[k]}" for k in found.tolist()]

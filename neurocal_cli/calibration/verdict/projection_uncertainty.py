@@ -1,0 +1,106 @@
+"""Projection uncertainty: std of the pixel of a point in space due to noise in the calibration.
+
+As in mrcal, a point is fixed to the targets of the calibration. The point at a pixel and a depth is
+transformed to the target by each view's pose, and back by the perturbed pose; the perturbed camera projects
+the mean of the results. So a change of the camera that a common change of its poses compensates counts as no
+uncertainty, just as it does not matter to a user.
+
+To first order, the mean of the perturbed poses is a motion (omega, T) of the camera's frame,
+p -> p + omega x p + T, and everything follows from the normal matrices. Let S^-1 be the covariance of the
+shared parameters d, and B^-1 that of each view's pose given them. Then the motion is G d + e, where G is the
+mean of -M B^-1 C^T over the views and cov(e) that of M B^-1 M^T; M converts a view's pose step to a motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.cross_validation import Minimum
+from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, cross_matrix
+
+_ACROSS = 21  # points across the image
+# The image circle of a wide lens is assumed to reach this times the angle of the farthest point, and at least
+# this angle [rad].
+_BEYOND, _LEAST = 1.1, 1.2
+
+
+@frozen_dataclass(eq=False)
+class ProjectionUncertainty:
+    """Standard deviation of projected pixels over the image."""
+
+    pixels: Array  # (G, 2) [px] positions in the image
+    depths: Array  # (D,) distances along the optical axis [world unit]
+    std: Array  # (D, G) [px] of both coordinates, ``sqrt(var u + var v)``; nan outside the domain of the lens
+
+    @property
+    def worst(self) -> float:
+        """Largest std at the median distance of the points [px]; nan if it is nan everywhere."""
+        seen = self.std[1][np.isfinite(self.std[1])]
+        return float(seen.max()) if seen.size else float("nan")
+
+
+def image_grid(size: tuple[int, int]) -> Array:
+    """Regular grid of pixels over an image, including its corners; (G, 2)."""
+    width, height = size
+    down = max(2, round(_ACROSS * height / width))
+    u, v = np.meshgrid(np.linspace(0, width - 1, _ACROSS), np.linspace(0, height - 1, down))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def projection_uncertainty(
+    m: Minimum, camera: Camera, variance: float, pixels: Array, depths: Array, shared: Array,
+    farthest: float | None,
+) -> ProjectionUncertainty:  # fmt: skip
+    """Propagate the covariance of a calibration to projected pixels (G, 2) [px] at depths (D,).
+
+    The minimum is normalised, the camera is the same in pixels, and `variance` is that of the residuals,
+    normalised. `shared` (f, f) is the covariance of the free entries and coefficients (`view_covariance`).
+    Pixels of a wide lens that are much farther out than the angle [rad] of the `farthest` point lie beyond
+    its image circle.
+    """
+    free = np.flatnonzero(m.free)
+    gain, motion = _motions(m, camera_columns(len(m.free) - 5)[free])
+    by_camera, by_point, rays = _derivatives(camera, pixels, m.views.pixel_scale, farthest)
+    by_camera = by_camera[:, :, free]
+    std = np.empty((len(depths), len(pixels)))
+    for k, depth in enumerate(depths):
+        p = depth * rays
+        moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
+        by_motion = by_point / depth @ moved  # (G, 2, 6)
+        J = by_camera + by_motion @ gain
+        # The traces of J cov J^T.
+        of_camera = (J @ shared * J).sum(axis=(1, 2))
+        std[k] = np.sqrt(of_camera + variance * (by_motion @ motion * by_motion).sum(axis=(1, 2)))
+    return ProjectionUncertainty(pixels, depths, std)
+
+
+def _motions(m: Minimum, shared: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Gain G (6, f) and cov(e) (6, 6) of the motion, in world units, for residuals of unit variance."""
+    if not m.free_poses:
+        return np.zeros((6, len(shared))), np.zeros((6, 6))
+    V, scale = m.views.n_views, m.views.scale[:, None, None]
+    B_inverse = inverse_or_nan(m.normal[:, POSE, POSE])
+    C = m.normal[:, shared, POSE]
+    M = np.zeros((V, 6, 6))
+    M[:, :3, :3] = np.eye(3)
+    M[:, 3:, :3] = scale * cross_matrix(m.state.t)
+    M[:, 3:, 3:] = scale * np.eye(3)
+    gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
+    motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
+    return gain, motion
+
+
+def _derivatives(
+    camera: Camera, pixels: Array, scale: float, farthest: float | None
+) -> tuple[Array, Array, Array]:
+    """Derivatives of pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
+    rays = camera.seen_points(pixels)
+    if farthest is not None:
+        rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)
+    by_camera, by_point = camera.project_jacobian(rays)
+    return by_camera * np.array([scale] * 5 + [1.0] * (by_camera.shape[2] - 5)), by_point, rays

@@ -1,0 +1,343 @@
+"""The rules of the verdict: good, usable or poor, with reasons and advice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, StopReason, Verdict
+from neurocal_cli.calibration.verdict.common_errors import common_errors
+from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.findings import (
+    Finding,
+    Limit,
+    image_diagonal,
+    name_some,
+    pixel_spread,
+    two_digits,
+    verdict_of,
+)
+from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated, told_apart
+from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
+from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.observations.target import Target
+
+# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
+# in which real and simulated good data are good. The limits are what a user would call large.
+ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
+_CONTRADICTION = Limit(1.6, 2.3)
+# Rms error above the noise floor over the image's diagonal (0.16 px of 640 x 480) that a board leaves if it
+# is held by hand or on an easel and bends from view to view. If the target was estimated, the standard
+# deviations include it.
+_FLEXING = 0.0002
+# Contradiction and disagreement (three standard deviations between two halves) that flexing does not leave
+# together. Of 66 calibrations of photographs of one camera and of their halves, one with a wrong distortion
+# model exceeds both; of 18 of photographs of two cameras, two zooms, moved crops and turned images, 14 do.
+# test_two_real_cameras_are_not_good repeats one of each.
+_TOO_MUCH_TO_FLEX = (1.3, 9.0)
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DISAGREEMENT = Limit(6.0, 40.0)
+_CORRELATION = Limit(0.5, 0.85)
+_UNCOVERED = Limit(0.6, 0.9)  # share of the image
+_FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
+_ALPHA = Limit(0.01, 0.05)  # std over the value
+_CENTRE = Limit(0.01, 0.05)  # std over alpha
+_PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
+_GIVEN = Limit(0.002, 0.05)  # difference over alpha
+_SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
+_FEW_POSES = 10  # fewer poses are reported if views repeat them
+_OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
+# rad. From photographs, the image axes of eight cameras are estimated to be off a right angle by up to
+# 0.0018, and the sides of their boards by up to 0.003. A board that leans by 0.006 and stands upright in
+# all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
+_SKEW, _LEAN = 0.003, 0.004
+_STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
+_FAR_BETTER = 0.5  # share of the error that remains with another camera than the given one
+_SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
+_NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
+_TOLD = 3.0  # standard deviations
+
+
+def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
+    """Apply the rules to the measures of a calibration."""
+    projection = evidence.projection
+    worst = projection.worst if projection is not None else float("nan")
+    measures = {
+        "held_out_px": evidence.held_out_px,
+        "precision_px": evidence.precision_px,
+        "contradiction": evidence.contradiction,
+        "disagreement": evidence.disagreement,
+        "correlation": evidence.correlation,
+        "coverage": evidence.coverage.image,
+        "tilt_deg": evidence.coverage.tilt,
+        "projection_px": worst,
+        "condition": evidence.condition,
+    }
+    return verdict_of(_findings(calibration, evidence), measures)
+
+
+def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
+    if are_normalised(calibration.points):  # the other rules are in pixels
+        yield from odd_pixels(calibration.points)
+        return
+    if _oblong(calibration):  # a target stretched in one direction makes views differ as well
+        evidence = replace(evidence, groups=None)
+    axes = evidence.proportions
+    if axes is not None:  # the axes of the board explain what would be taken for another cause
+        evidence = replace(evidence, groups=None, change=None, board=None, missing=None)
+        yield 2, unlike_axes(axes), MEASURE_AXES
+    if not calibration.converged:
+        named = not calibration.lens_choice and calibration.distortion_model != "none"
+        slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
+        more = "choose a simpler --distortion, or auto" if slow else "increase --starts"
+        yield 2, f"training did not converge: {calibration.stop_reason}", more
+    # A given camera that is wrong explains the errors, so it is reported before them.
+    yield from _given(calibration, evidence)
+    errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
+    # A common error explains the others, so it is reported first even if it hardly biases the camera.
+    wide, estimated = calibration.camera.distortion.wide, calibration.target is not None
+    for grade, reason, advice in common_errors(evidence, calibration.unit, wide, estimated):
+        yield max([grade, *(of_error for of_error, *_ in errors)]), reason, advice
+    yield from errors
+    yield from _data(calibration, evidence)
+    yield from _coverage(calibration, evidence)
+    yield from _parameters(calibration, evidence)
+
+
+def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    spread, diagonal = pixel_spread(calibration.points), image_diagonal(calibration.points)
+    yield (
+        ERROR.grade(e.rmse_px / diagonal),
+        f"the rms reprojection error of {e.rmse_px:.3g} px is large",
+        "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
+    )
+    # Given poses that are wrong leave such errors as well, so they are not excused.
+    flexes = calibration.target is not None and calibration.type != 4 and _by_flexing(e, diagonal)
+    unexcused = e.rmse_px > 1e-4 * spread and not flexes
+    if unexcused:
+        yield (
+            _CONTRADICTION.grade(e.contradiction),
+            f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
+            "(the error of a separate camera for each view)",
+            "check that all views are of one camera at one zoom and focus, that the target has the true "
+            "shape, and that given parameters are right",
+        )
+    if e.rmse_px > 1e-6 * spread:
+        yield (
+            _HELD_OUT.grade(e.held_out_px / e.rmse_px),
+            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
+            f"{e.rmse_px:.3g} px",
+            "add points and views",
+        )
+        yield (
+            0 if flexes else _DISAGREEMENT.grade(e.disagreement),
+            f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
+            f"deviations{'' if _is_explained(e) else _NO_SINGLE_CAMERA}",
+            "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
+            "flat",
+        )
+        yield (
+            _CORRELATION.grade(e.correlation) if unexcused else 0,
+            f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
+            "model or the target does not fit",
+            "try another --distortion, or measure the target",
+        )
+
+
+def _is_explained(e: Evidence) -> bool:
+    """Whether a cause is known why no single camera fits."""
+    return bool(e.groups or e.missing or e.proportions or e.stated or e.turned)
+
+
+def _by_flexing(e: Evidence, diagonal: float) -> bool:
+    """Whether a board that bends from view to view may cause the error above the noise floor."""
+    above = float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
+    contradiction, disagreement = _TOO_MUCH_TO_FLEX
+    return above < _FLEXING * diagonal and not (
+        e.contradiction > contradiction and e.disagreement > disagreement
+    )
+
+
+def given_parameters(
+    reestimated: tuple[Reestimated, ...], given: Intrinsics, std: Mapping[str, float]
+) -> Iterator[Finding]:
+    """Finding about given parameters, with these standard deviations, that the points contradict."""
+    told = told_apart(reestimated, std)
+    if told:
+        off = max(abs(a.found - a.given) for a in told) / given.alpha_u
+        texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
+        yield _GIVEN.grade(off), ", ".join(texts), _SAME
+
+
+def _given(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    """Findings about given parameters: those that the points contradict, and those that harm the poses."""
+    std = dict(calibration.std) | calibration.std_of_given
+    found = list(given_parameters(e.reestimated, calibration.intrinsics, std))
+    doubt, grade = e.doubt, max((grade for grade, *_ in found), default=0)
+    if doubt is None or (grade and doubt.what != "distortion"):
+        yield from found
+        return
+    left = np.sqrt(1.0 - doubt.explained)
+    poses = f"the poses are then {doubt.poses:.2g} standard deviations from the reported ones"
+    if found and doubt.what != "distortion":
+        reason = f"{found[0][1]}; {poses}"
+    else:
+        reason = f"{_other_camera(calibration, doubt)} lowers the error by {100 * (1 - left):.2g} %; {poses}"
+    yield max(grade, 1 + int(left < _FAR_BETTER)), reason, _SAME
+
+
+def _other_camera(calibration: Calibration, doubt: Doubt) -> str:
+    if doubt.what != "distortion":
+        return f"the given camera does not fit these points: another {doubt.what}"
+    if calibration.distortion_model == "none":
+        return f"the camera is given without distortion, but {doubt.model} estimated from these points"
+    return "the given distortion does not fit these points: one estimated from them"
+
+
+def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    yield from odd_points(calibration)
+    yield from e.noise
+    if e.repeated:
+        twice = "the rows are given twice, in the view itself or in another one"
+        yield 1, f"{name_some(e.repeated)}: {twice}", "give each view once"
+    views = len(calibration.views)
+    if e.poses < min(views, _FEW_POSES):
+        yield (
+            1,
+            f"{views} views show only {e.poses} different pose{'s' * (e.poses != 1)}; views that repeat a "
+            "pose count as one",
+            "add views of other poses instead of more frames of the same ones",
+        )
+    if e.mirrored:
+        yield (
+            1,
+            f"{name_some(e.mirrored)}: the target is mirrored",
+            "check the order of the points in these views",
+        )
+
+
+def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    if calibration.type == 3:
+        return
+    cover = e.coverage
+    if np.isfinite(cover.image):
+        where = f", above all {cover.empty}" if cover.empty else ""
+        yield (
+            _UNCOVERED.grade(1 - cover.image),
+            f"the points cover {100 * cover.image:.0f} % of the image",
+            f"add views with the target elsewhere in the image{where}",
+        )
+    if calibration.type in (1, 2) and len(calibration.views) > 1:
+        yield (
+            _FLAT.grade(-cover.tilt),
+            f"the tilts of the boards differ by {cover.tilt:.0f} degrees at most",
+            "add views with the board tilted by 30 to 45 degrees in different directions",
+        )
+
+
+def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
+    more = "add views in which the target is near, tilted and fills the image"
+    if "alpha_u" not in fixed:
+        share = calibration.relative_std_of_scale
+        yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
+    off_centre = list(_off_centre(calibration))
+    if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > _ALPHA.good):
+        yield (
+            1,
+            f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
+            "determine the focal length and the centre",
+            "use a deeper target, or several views of it from different angles",
+        )
+    size = calibration.image_size
+    is_middle = size is not None and (A.u0, A.v0) == ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    if calibration.type == 2 and is_middle:
+        yield (
+            1,
+            "the given image centre is the middle of the image, from which those of real cameras differ by "
+            "tens of pixels; the rotations have that error",
+            "give the centre of this camera, or estimate it: --type 1",
+        )
+    if "u0" not in fixed:
+        centre = max(std["u0"], std["v0"])
+        yield (
+            _CENTRE.grade(centre / A.alpha_u),
+            f"the std of the image centre is {two_digits(centre)} px",
+            more,
+        )
+    if e.projection is not None and calibration.type != 3:
+        worst = e.projection.worst
+        diagonal = float(np.hypot(*(size or (np.nan, np.nan))))
+        yield (
+            _PROJECTION.grade(worst / diagonal),
+            f"the std of predicted pixels is up to {two_digits(worst)} px",
+            more,
+        )
+    if calibration.type == 3:
+        return
+    ratio = A.alpha_u / A.alpha_v
+    if _oblong(calibration):
+        yield (
+            1,
+            f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
+            "few cameras have such pixels; otherwise check the size of the squares along X and Y",
+        )
+    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + _TOLD * std["theta"]:
+        yield (
+            1,
+            f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.2f} degrees",
+            "hardly any camera has such axes; check that the sides of the target are perpendicular, turn it "
+            "by 90 degrees in some views, or give --no-skew",
+        )
+    lean = 0.0 if calibration.target is None else _lean(calibration.target)
+    if "theta" not in fixed and lean > _LEAN:
+        yield (
+            1,
+            f"the sides of the target are off a right angle by {np.degrees(lean):.2f} degrees, more than "
+            "those of prints, so theta may be wrong by more than its std",
+            "measure the target, turn it by 90 degrees in some views, or give --no-skew",
+        )
+    yield from off_centre
+
+
+def _lean(target: Target) -> float:
+    """Angle by which the sides of an estimated flat target are off a right angle [rad]; 0 for others."""
+    if target.plane.any() or not is_flat(target.given):
+        return 0.0
+    from neurocal_cli.adjustment.board.open_stretch import stretches
+
+    given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
+    linear = np.linalg.lstsq(given, found, rcond=None)[0]
+    return abs(float((stretches(given)[1] * linear).sum()))
+
+
+def _oblong(calibration: Calibration) -> bool:
+    """Whether the pixels are not square: significantly, or by far."""
+    A, std = calibration.intrinsics, calibration.std
+    ratio = A.alpha_u / A.alpha_v
+    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    return abs(ratio - 1) > _OBLONG + told or max(ratio, 1 / ratio) > _STRETCHED
+
+
+def _off_centre(calibration: Calibration) -> Iterator[Finding]:
+    A, size = calibration.intrinsics, calibration.image_size
+    if size is None or ("u0" in calibration.fixed and calibration.type != 2):
+        return
+    off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
+    uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
+    if (off > np.array(size) / 2).any():
+        yield (
+            2,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) lies outside the image",
+            "add views from other angles, or give the centre with --type 2; check image_size",
+        )
+    elif (off > _OFF_CENTRE * np.array(size) + uncertain).any():
+        yield (
+            1,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
+            "a cropped image has such a centre; otherwise check image_size and the order of u and v",
+        )

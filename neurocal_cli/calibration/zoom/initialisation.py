@@ -1,0 +1,208 @@
+"""Step 1: a calibration at each setting, without settings whose pixels do not fit, and the distortion model.
+
+The distortion model is the simplest whose cross-validation error no richer one lowers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.calibration.zoom.committee import Budget, fit_committee
+from neurocal_cli.calibration.zoom.network_training import Schedule
+from neurocal_cli.calibration.zoom.setting_normals import PixelData, Tables
+from neurocal_cli.calibration.zoom.settings import LensPoints, scaled_controls
+from neurocal_cli.calibration.zoom.static_calibration import (
+    StaticFit,
+    calibrate_each,
+    common_tables,
+    first_constants,
+)
+from neurocal_cli.calibration.zoom.zoom_lens import RejectedSetting
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.network.options import Progress
+
+_QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
+# A richer model must lower the cross-validation error to this share and the residual variance by so many
+# standard deviations. The tests of the choice in tests/test_zoom_lens.py have both outcomes.
+_LARGEST_SHARE = 0.98
+_SIGMAS = 3.0
+# Times the median rms error of the settings. As a lens may change sharply between two settings, the limit is
+# wide; the tests of settings that are left out in tests/test_zoom_lens.py check both sides.
+_WRONG_PIXELS = 3.0
+
+
+@frozen_dataclass
+class FitOptions:
+    """Options of `fit_lens`."""
+
+    training: str
+    still: bool
+    free_theta: bool
+    reject: bool
+    budget: Budget
+    seed: int
+    report: Progress
+
+
+@frozen_dataclass(eq=False)
+class CalibratedSettings:
+    """Result of step 1."""
+
+    lens: LensPoints
+    data: PixelData
+    static: StaticFit
+    tables: Tables
+    rejected: tuple[RejectedSetting, ...] = ()
+
+    @classmethod
+    def of(
+        cls, lens: LensPoints, data: PixelData, static: StaticFit, progress: Progress | None = None
+    ) -> CalibratedSettings:
+        """Calibrations of each setting with common constants."""
+        constants = first_constants(static, lens, data.still)
+        return cls(lens, data, static, common_tables(data, static.local, constants, progress))
+
+    @property
+    def controls(self) -> Array:
+        """(S, C) settings on the scale of the networks' inputs."""
+        settings = self.lens.settings
+        return scaled_controls(settings, settings.min(axis=0), settings.max(axis=0))
+
+    @property
+    def variance(self) -> float:
+        """Variance of the noise of one coordinate [px^2], from the residuals of the tables."""
+        n, S = self.data.views.n_equations, self.lens.n_settings
+        unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
+        return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
+
+    @property
+    def may_reject(self) -> bool:
+        """Whether fewer than a fifth of the settings are rejected; one always may be."""
+        return len(self.rejected) < max(1, self.lens.n_settings // 5)
+
+    def without(self, setting: int, progress: Progress | None = None) -> CalibratedSettings:
+        """The result without a setting. Only the common constants are found again."""
+        keep = np.arange(self.lens.n_settings) != setting
+        rest, views = self.lens.select(keep), keep[self.lens.view_setting]
+        check_settings(rest.n_settings, len(rest.controls), self.lens.points.source)
+        static = replace(
+            self.static,
+            local=self.static.local[keep],
+            theta=self.static.theta[keep],
+            R=self.static.R[views],
+            t=self.static.t[views],
+            good=self.static.good[keep],
+        )
+        data = PixelData.of(rest, self.data.still, self.data.model, self.data.free_theta)
+        return replace(CalibratedSettings.of(rest, data, static, progress), rejected=self.rejected)
+
+    def with_rejected(self, setting: Array, reason: str) -> CalibratedSettings:
+        """The result, which is without a setting (C,), with the reason."""
+        rejected = RejectedSetting(tuple(setting.tolist()), reason)
+        return replace(self, rejected=(*self.rejected, rejected))
+
+
+def free_pose_variance(start: CalibratedSettings) -> float:
+    """Variance of the noise if each view of a still camera had a pose of its own [px^2].
+
+    nan if the camera moves, or if some setting does not determine camera and pose by itself.
+    """
+    if not start.data.still or not start.static.good.all():
+        return np.nan
+    t_z = start.data.names.index("t_z")
+    static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
+    free = CalibratedSettings.of(start.lens, replace(start.data, still=False), static)
+    sensible = free.tables.normal.sensible and np.isfinite(free.variance)
+    return free.variance if sensible else np.nan
+
+
+def check_settings(count: int, controls: int, source: str) -> None:
+    """Refuse too few settings (`InputError`)."""
+    least = controls + 2
+    if count < least:
+        raise InputError(
+            f"{source}: {count} settings are too few for {controls} control{'s' * (controls > 1)}; give at "
+            f"least {least} settings, better 5 values of each control"
+        )
+
+
+def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
+    """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
+    data = PixelData.of(lens, options.still, model, options.free_theta)
+    static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
+    start = CalibratedSettings.of(lens, data, static, options.report)
+    while True:
+        normal = start.tables.normal
+        if not normal.sensible or not np.isfinite(normal.cost).all():
+            raise DegenerateGeometryError(
+                f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
+                "moved, give several views of the board at each setting, and --camera moving"
+            )
+        bad = _bad_pixels(np.sqrt(normal.cost / start.data.counts)) if options.reject else None
+        if bad is None or not start.may_reject:
+            return start
+        setting, reason = start.lens.settings[bad[0]], bad[1]
+        start = start.without(bad[0], options.report).with_rejected(setting, reason)
+
+
+def _bad_pixels(rms: Array) -> tuple[int, str] | None:
+    """The setting that fits far worse than the others and the reason to reject it; rms is (S,) in px."""
+    worst, typical = int(rms.argmax()), float(np.median(rms))
+    if rms[worst] <= _WRONG_PIXELS * typical:
+        return None
+    return worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
+
+
+def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
+    """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
+    best: CalibratedSettings | None = None
+    failure: DegenerateGeometryError | None = None
+    best_px: float | None = None  # computed when a richer model is compared
+    for model in POLYNOMIAL_MODELS:
+        try:
+            start = calibrate_settings(lens, model, options)
+        except DegenerateGeometryError as error:
+            failure = error
+            continue
+        if best is None:
+            best = start
+            continue
+        if not _explains_more(start, best):
+            continue
+        options.report(f"trying distortion model {model}", 0.5)
+        best_px = _held_out(best, options) if best_px is None else best_px
+        error_px = _held_out(start, options)
+        if error_px < _LARGEST_SHARE * best_px:
+            best, best_px = start, error_px
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def _explains_more(rich: CalibratedSettings, simple: CalibratedSettings) -> bool:
+    """Whether the residual variance decreases significantly."""
+    freedom = rich.data.views.n_equations
+    return rich.variance < simple.variance * (1 - _SIGMAS * np.sqrt(2 / freedom))
+
+
+def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
+    """Twofold cross-validation error [px]: every second setting is predicted from the others."""
+    x = start.controls
+    inside = np.arange(len(x)) % 2 == 0
+    squares = 0.0
+    for part in (inside, ~inside):
+        rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
+        H = start.tables.normal.H[part]
+        members = fit_committee(
+            x[part], names, local[part], H, start.variance, rng, _QUICK_BUDGET, lambda share: None
+        )
+        predicted = np.mean([nets.local(x) for nets in members], axis=0)
+        there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
+        squares += float(there.cost[~part].sum()) if np.isfinite(there.cost).all() else np.inf
+    return float(np.sqrt(squares / len(start.lens.points)))

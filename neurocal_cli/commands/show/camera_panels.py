@@ -1,0 +1,303 @@
+"""Panels of a camera: residuals, scatter, coverage, uncertainty, poses, errors by view, learning curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, camera_of
+from neurocal_cli.calibration.evaluation import CameraEvaluation, evaluate_camera
+from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.commands.show.figure import ACCENT, INK, plain, say, style
+from neurocal_cli.observations.points import Correspondences
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_ARROWS = 500  # more arrows cannot be distinguished
+_MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
+_MOST_BARS = 40  # greatest number of views with room for their names
+_LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the image width
+_ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
+_CELLS = 6  # across and down, as in the verdict
+_MOST_DOTS = 5000
+_LEVELS = 12
+_FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
+_MOST_NAMES = 8
+_SIZE = 0.12  # of a drawn camera, relative to the scene
+_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+_HERE = Pose(np.eye(3), np.zeros(3))
+
+
+@frozen_dataclass
+class Subject:
+    """A camera, points, the camera's errors on them, and its calibration if known."""
+
+    camera: Camera
+    points: Correspondences
+    evaluation: CameraEvaluation
+    calibration: Calibration | None
+
+    @classmethod
+    def of(
+        cls,
+        camera: Calibration | Camera,
+        points: Correspondences | None = None,
+        evaluation: CameraEvaluation | None = None,
+    ) -> Subject:
+        """Evaluate a camera on points; by default on a calibration's own points."""
+        calibration = camera if isinstance(camera, Calibration) else None
+        if points is None:
+            points = Correspondences.none() if calibration is None else calibration.points
+        return cls(camera_of(camera), points, evaluation or evaluate_camera(camera, points), calibration)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) [px], if known."""
+        return self.points.image_size or self.camera.image_size
+
+    @cached_property
+    def evidence(self) -> Evidence | None:
+        """Evidence for the quality of the calibration from its points; None without a calibration."""
+        if self.calibration is None or not len(self.calibration.points):
+            return None
+        return gather_evidence(self.calibration)
+
+
+def set_image(axes: Axes, subject: Subject) -> Array:
+    """Set the axes to the image, or to the points if its size is unknown; returns the four limits."""
+    left, right, top, bottom = frame = _frame(subject)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u [px]", ylabel="v [px]")
+    axes.spines[["top", "right"]].set_visible(True)
+    return frame
+
+
+def _frame(subject: Subject) -> Array:
+    if subject.image_size is not None:
+        width, height = subject.image_size
+        return np.array([-0.5, width - 0.5, -0.5, height - 0.5])
+    low, high = subject.points.pixels.min(axis=0), subject.points.pixels.max(axis=0)
+    margin = 0.05 * max(float((high - low).max()), 1.0)
+    return np.array([low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin])
+
+
+def _round_scale(scale: float) -> float:
+    """Round down to one of 1, 2, 5, 10, ..."""
+    if not np.isfinite(scale) or scale <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(scale))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step <= scale / power * (1 + 1e-9)))
+
+
+def draw_residuals(axes: Axes, subject: Subject) -> None:
+    """Draw the residuals of all views at their points in the image, enlarged."""
+    evaluation = subject.evaluation
+    left, right, _, _ = _frame(subject)
+    seen = np.flatnonzero(np.isfinite(evaluation.residuals[:, 0]))
+    # The choice is random, because every n-th point of a grid with n columns would be one column.
+    shown = np.random.default_rng(0).permutation(seen)[:_MOST_ARROWS]
+    pixels, residuals = subject.points.pixels[shown], evaluation.residuals[shown]
+    spacing = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels)) if len(pixels) else 0.0
+    length = min(_LONGEST_ARROW * (right - left), max(1.5 * spacing, 0.015 * (right - left)))
+    scale = _round_scale(length / max(evaluation.rmse_px, 1e-300))
+    axes.quiver(
+        *pixels.T, *residuals.T, color=INK, angles="xy", scale_units="xy", scale=1 / scale, width=0.0025
+    )
+    axes.plot(subject.camera.intrinsics.u0, subject.camera.intrinsics.v0, "+", color=ACCENT, markersize=11)
+    some = "" if len(shown) == len(seen) else f", {len(shown)} of {len(seen)} points"
+    style(axes, f"Residuals, predicted minus observed,\nenlarged {scale:,.10g} times{some}")
+    set_image(axes, subject)
+    axes.set_xlabel("u [px]  (+ is the image centre)")
+
+
+def draw_scatter(axes: Axes, subject: Subject) -> None:
+    """Draw the scatter of the residuals, with a circle of their rms."""
+    evaluation = subject.evaluation
+    seen = evaluation.residuals[np.isfinite(evaluation.residuals[:, 0])]
+    many = len(seen) > _MANY_DOTS
+    axes.scatter(
+        seen[:, 0], seen[:, 1], s=9, color=INK, alpha=0.15 if many else 0.5, linewidths=0, rasterized=many
+    )
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = evaluation.rmse_px * np.array([np.cos(angle), np.sin(angle)])
+    axes.plot(*circle, color=ACCENT, linewidth=1.2, label=f"rms {evaluation.rmse_px:.4g} px")
+    axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=ACCENT, markersize=9, label="mean")
+    limit = 1.1 * max(evaluation.max_px, 1e-12) if np.isfinite(evaluation.max_px) else 1.0
+    style(axes, "Residuals of all points")
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="du [px]", ylabel="dv [px]")
+    axes.legend(loc="upper right", frameon=False)
+
+
+def draw_views(axes: Axes, subject: Subject) -> None:
+    """Draw the error of each view, in the order of the data."""
+    evaluation = subject.evaluation
+    errors = np.array([view.rmse_px for view in evaluation.views.values()])
+    if len(errors) <= _MOST_BARS:
+        axes.bar(np.arange(len(errors)), errors, color=INK, width=0.8 if len(errors) > 3 else 0.3)
+    else:
+        edges = np.arange(len(errors) + 1) - 0.5
+        axes.stairs(np.nan_to_num(errors), edges, fill=True, color=INK)
+    axes.axhline(evaluation.rmse_px, color=ACCENT, linewidth=1.2, label="all points")
+    style(axes, "Error of each view")
+    axes.set(xlabel="view", ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
+    if len(errors) <= _MOST_BARS:
+        names = [plain(name[-20:]) for name in evaluation.views]
+        axes.set_xticks(np.arange(len(errors)), names, rotation=90 if len(errors) > 6 else 0)
+    highest = np.nanmax(errors, initial=0.0)
+    axes.set_ylim(0, 1.25 * highest if highest > 0 else 1.0)  # room for the legend
+    axes.legend(loc="upper right", frameon=False)
+
+
+def draw_learning(axes: Axes, subject: Subject) -> None:
+    """Draw the error of the network during training, and the error after bundle adjustment."""
+    style(axes, "Learning curve of the best start")
+    calibration = subject.calibration
+    network = None if calibration is None else calibration.network
+    if calibration is None or network is None or not network.curve:
+        say(axes, "no training was recorded")
+        return
+    curve = np.maximum(np.array(network.curve), _ZERO)
+    marker = "o" if len(curve) <= 60 else ""
+    axes.semilogy(
+        np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK, label="error of the network"
+    )
+    label = f"error after bundle adjustment, {network.rmse_after:.4g} px"
+    axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2, label=label)
+    axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
+    axes.legend(loc="upper right", frameon=False)
+
+
+def draw_coverage(axes: Axes, subject: Subject) -> None:
+    """Draw the number of points in each part of the image; parts without points are marked."""
+    left, right, top, bottom = set_image(axes, subject)
+    u, v = subject.points.pixels.T
+    across, down = np.linspace(left, right, _CELLS + 1), np.linspace(top, bottom, _CELLS + 1)
+    counts = np.histogram2d(v, u, (down, across))[0]
+    drawn = axes.pcolormesh(across, down, counts, cmap="Blues", vmin=0, vmax=max(1.0, 1.3 * counts.max()))
+    axes.figure.colorbar(drawn, ax=axes, label="points", shrink=0.7)
+    for row, column in np.argwhere(counts == 0).tolist():
+        middle = across[column : column + 2].mean(), down[row : row + 2].mean()
+        axes.plot(*middle, "x", color=ACCENT, markersize=8)
+    some = np.random.default_rng(0).permutation(len(u))[:_MOST_DOTS]
+    axes.plot(u[some], v[some], ".", color=INK, markersize=1.5, rasterized=len(u) > _MANY_DOTS)
+    style(axes, f"Coverage: {np.mean(counts > 0):.0%} of the parts of the image hold points")
+    axes.grid(False)
+
+
+def draw_uncertainty(axes: Axes, subject: Subject) -> None:
+    """Draw the standard deviation of projected pixels over the image, at the points' median distance."""
+    projection = None if subject.evidence is None else subject.evidence.projection
+    if projection is None or not np.isfinite(projection.std[1]).any():
+        style(axes, "Uncertainty of projected pixels")
+        say(axes, "known only of a calibration whose image size is known")
+        return
+    from matplotlib.colors import BoundaryNorm
+
+    set_image(axes, subject)
+    u, v = (np.unique(axis) for axis in projection.pixels.T)
+    std = np.ma.masked_invalid(projection.std[1].reshape(len(v), len(u)))
+    # Levels differ by equal factors, because corners can be 100 times as uncertain as the middle.
+    least = max(float(std.min()), 1e-12)
+    levels = np.geomspace(least, max(float(std.max()), 1.01 * least), _LEVELS)
+    drawn = axes.contourf(u, v, std, levels=levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))
+    axes.figure.colorbar(drawn, ax=axes, label="std [px]", format="%.2g", ticks=levels[::2], shrink=0.7)
+    pixels = subject.points.pixels
+    axes.plot(*pixels[:: max(1, len(pixels) // 1000)].T, ".", color="white", markersize=1, alpha=0.7)
+    style(axes, f"Uncertainty of projected pixels, {projection.worst:.3g} px at most")
+    axes.grid(False)
+
+
+def draw_poses(
+    axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
+) -> None:
+    """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs."""
+    space: Any = axes
+    style(axes, "Poses")
+    if calibration is None or not calibration.views or not len(calibration.points):
+        space.text2D(0.5, 0.5, "known only of a calibration", ha="center", transform=space.transAxes)
+        space.set_axis_off()
+        return
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    points = calibration.points
+    errors = np.array([calibration.views[name].rmse_px for name in points.view_names])
+    known = errors[np.isfinite(errors)]
+    colour = ScalarMappable(Normalize(0, float(known.max()) if known.size else 1.0), colormaps["viridis"])
+    extent = [np.zeros((1, 3))]
+    for k, name in enumerate(points.view_names):
+        world = points.world[points.view_index == k]
+        outline = calibration.views[name].pose.to_camera(_outline(world))
+        extent.append(outline)
+        shade = colour.to_rgba(errors[k])
+        flat = len(outline) < len(world)
+        closed = np.vstack([outline, outline[:1]]) if flat else outline
+        space.plot(*_turned(closed).T, "-" if flat else ".", color=shade, linewidth=1.3, markersize=2)
+        if len(points.view_names) <= _MOST_NAMES:
+            space.text(*_turned(outline[:1])[0], name[-12:].replace("$", r"\$"), fontsize=7, color="0.3")
+    size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
+    for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
+        corners = (_frustum(camera, size) - pose.t) @ pose.R
+        extent.append(corners)
+        centre, *ends = _turned(corners)
+        for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
+            space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
+    everything = _turned(np.vstack(extent))
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    space.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=1.1)
+    unit = calibration.unit.replace("$", r"\$")
+    space.set(xlabel=f"X right [{unit}]", ylabel=f"Z forward [{unit}]", zlabel=f"Y down [{unit}]")
+    space.locator_params(nbins=5)
+    space.invert_zaxis()
+    space.view_init(elev=22, azim=-60)
+    axes.figure.colorbar(colour, ax=axes, label="rms [px]", shrink=0.6, pad=0.16)
+
+
+def _turned(points: Array) -> Array:
+    """Reorder coordinates to X, Z, Y, because the third axis of the plot is the height."""
+    return points[:, [0, 2, 1]]
+
+
+def _outline(world: Array) -> Array:
+    """Corners of a flat target's convex hull, in order; all points of other targets."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    centred = world - world.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    if len(world) < 4 or sizes[-1] > _FLAT * sizes[0]:
+        return world
+    try:
+        return np.asarray(world[ConvexHull(centred @ axes[:2].T).vertices])
+    except QhullError:  # points on a line
+        return world
+
+
+def _frustum(camera: Camera, size: float) -> Array:
+    """Centre and corners of a camera's frustum in its own frame."""
+    width, height = camera.image_size or (2 * camera.intrinsics.u0, 2 * camera.intrinsics.v0)
+    pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])
+    rays = pixels @ np.linalg.inv(camera.intrinsics.A).T
+    return np.vstack([np.zeros(3), size * rays])
+
+
+def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
+    """Functions that draw the panels of a camera, by their names in `plots.CAMERA_PANELS`."""
+    panels = {
+        "residuals": draw_residuals,
+        "coverage": draw_coverage,
+        "uncertainty": draw_uncertainty,
+        "scatter": draw_scatter,
+        "poses": lambda axes, subject: draw_poses(axes, subject.calibration),
+        "learning": draw_learning,
+        "views": draw_views,
+    }
+    return {name: partial(draw, subject=subject) for name, draw in panels.items()}

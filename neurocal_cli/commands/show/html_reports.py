@@ -1,0 +1,267 @@
+"""Pages of a calibration, a rig and a zoom lens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.evaluation import predict
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
+from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.show.camera_report import parameter_rows, printable
+from neurocal_cli.commands.show.html_drawings import enlargement, error_bars, heat_map, residual_map, scatter
+from neurocal_cli.commands.show.html_page import (
+    Origin,
+    definitions,
+    figure,
+    page,
+    section,
+    table,
+    verdict_block,
+)
+from neurocal_cli.commands.show.rig_report import camera_rows, rig_rows
+from neurocal_cli.commands.show.zoom_report import lens_report
+from neurocal_cli.errors import InputError
+
+_MOST_REJECTED = 200  # rows
+_SETTINGS = 25  # samples along a control
+
+
+def calibration_page(
+    calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
+) -> str:
+    """Make the page of a camera, with the images of views as JPEG files, if given."""
+    size = calibration.image_size
+    head = (
+        f"images of {'unknown size' if size is None else f'{size[0]} x {size[1]} px'}, "
+        f"{len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+        f"{calibration.distortion_model}"
+    )
+    parts = [
+        f'<p class="soft">{escape(head)}</p>',
+        verdict_block(calibration.verdict),
+        section("Parameters", table(parameter_rows(calibration))),
+        *_camera_parts(calibration, photographs or {}),
+        _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
+    ]
+    return page(f"Calibration of {printable(calibration.camera_name)}", parts)
+
+
+def rig_page(
+    rig: Rig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
+) -> str:
+    """Make the page of a rig; see `calibration_page`."""
+    head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
+    pairs = [["pair", "left rms [px]", "right rms [px]"]]
+    for a, b in rig.pairs:
+        errors = rig.left.views[a].rmse_px, rig.right.views[b].rmse_px
+        pairs.append([printable(a if a == b else f"{a} / {b}"), *(f"{error:.4f}" for error in errors)])
+    left_out = [["pair", "reason"]]
+    left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    parts = [
+        f'<p class="soft">{escape(head)}</p>',
+        verdict_block(rig.verdict),
+        section("The right camera relative to the left one", table(rig_rows(rig))),
+        section("Both cameras", table(camera_rows(rig))),
+        section("Pairs", table(pairs, sortable=True)),
+        section("Pairs left out", table(left_out)),
+        _warnings(rig.warnings),
+    ]
+    sides = ("Left camera", rig.left), ("Right camera", rig.right)
+    for (side, camera), images in zip(sides, photographs or ({}, {}), strict=True):
+        parts.append(section(side, " "))
+        parts += _camera_parts(camera, images)
+    command = "neurocal stereo LEFT.csv RIGHT.csv" + _options(rig.left)
+    parts.append(_repeat(command, rig.left, origin))
+    return page("Calibration of two cameras", parts)
+
+
+def lens_page(lens: ZoomLens, origin: Origin) -> str:
+    """Make the page of a zoom lens; see `calibration_page`."""
+    verdict = judge_lens(lens)
+    parts = [
+        verdict_block(verdict),
+        section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
+        section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
+        section(
+            "How to repeat it",
+            _origin(f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml", origin, {}),
+        ),
+    ]
+    return page("Calibration of a zoom lens", parts)
+
+
+def _over_settings(lens: ZoomLens) -> str:
+    """Draw a map of the focal length's relative standard deviation over the range of zoom and focus."""
+    low, span = lens.low, np.maximum(lens.high - lens.low, 1e-300)
+    share = np.linspace(0, 1, _SETTINGS)
+    grid = np.stack(np.meshgrid(share, share if len(low) > 1 else [0.0, 1.0]), axis=-1)
+    settings = low + span * grid.reshape(-1, 2)[:, : len(low)]
+    try:
+        prediction = lens.predict(settings)
+    except InputError:  # the networks give no valid camera there
+        return ""
+    percent = 100 * prediction.std[:, 0] / prediction.local[:, 0]
+    height = 0.75 if len(low) > 1 else 0.15
+    dots = np.column_stack([(lens.settings - low) / span, np.full((len(lens.settings), 1), 0.5)])[:, :2]
+    ranges = " and ".join(
+        f"{name} from {a:.6g} to {b:.6g} {where}"
+        for name, a, b, where in zip(
+            lens.controls, low, lens.high, ("from left to right", "from top to bottom"), strict=False
+        )
+    )
+    return figure(
+        heat_map(
+            percent.reshape(len(grid), -1), (640.0, 640 * height), dots * (640.0, 640 * height), "%",
+            "standard deviation of the focal length",
+        ),
+        f"Standard deviation of alpha_u in per cent, {ranges}. Dots are the calibrated settings.",
+    )  # fmt: skip
+
+
+def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) -> list[str]:
+    """Sections on a camera: drawings, views, rejected points and views, warnings."""
+    parts: list[str] = []
+    points, pixels = calibration.points, calibration.points.pixels
+    if len(points):
+        poses = [calibration.views[name].pose for name in points.view_names]
+        # 0 for points that cannot be projected.
+        residuals = np.nan_to_num(predict(calibration.camera, poses, points)[0] - pixels)
+        size = calibration.image_size or tuple((np.ceil(pixels.max(axis=0)) + 1).astype(int).tolist())
+        scale = enlargement(residuals, size)
+        names = list(calibration.views)
+        errors = [view.rmse_px for view in calibration.views.values()]
+        drawings = [
+            figure(
+                residual_map(pixels, residuals, size),
+                f"Residuals (projected minus observed) of all points, {scale:.3g} times enlarged. Where "
+                "there are no points the camera is extrapolated.",
+            ),
+            _uncertainty(calibration),
+            figure(
+                scatter(residuals),
+                "du and dv. Noise makes a round cloud about the middle; the circle is three times its rms.",
+            ),
+            figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
+        ]
+        parts.append(section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'))
+        parts += _view_parts(calibration, residuals, size, scale, photographs)
+    return [*parts, _rejected(calibration), _warnings(calibration.warnings)]
+
+
+def _uncertainty(calibration: Calibration) -> str:
+    """Draw a map of the standard deviation of projected pixels at the points' median distance."""
+    found = uncertainty_over_image(calibration)
+    if found is None or calibration.image_size is None:
+        return ""
+    rows = len(np.unique(found.pixels[:, 1]))
+    drawing = heat_map(
+        found.std[1].reshape(rows, -1),
+        calibration.image_size,
+        calibration.points.pixels,
+        "px",
+        "standard deviation of projected pixels",
+    )
+    return figure(
+        drawing,
+        "How uncertain the camera is: standard deviation of a projected pixel, for points at the middle "
+        f"distance; {found.worst:.3g} px at most. Dots are the points of all views.",
+    )
+
+
+def _view_parts(
+    calibration: Calibration,
+    residuals: Array,
+    size: tuple[int, int],
+    scale: float,
+    photographs: Mapping[str, bytes],
+) -> list[str]:
+    points = calibration.points
+    unit = printable(calibration.unit)
+    rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
+    figures, rejected = [], calibration.rejected.points
+    for k, name in enumerate(points.view_names):
+        view, own = calibration.views[name], points.view_index == k
+        lengths = np.hypot(*residuals[own].T)
+        distance = float(np.linalg.norm(view.pose.to_camera(points.world[own].mean(axis=0))))
+        tilt = float(np.degrees(np.arccos(np.clip(abs(view.pose.R[2, 2]), 0, 1))))
+        rows.append(
+            [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
+             f"{distance:.5g}", f"{tilt:.1f}"]
+        )  # fmt: skip
+        crosses = None
+        if rejected is not None and name in rejected.view_names:
+            crosses = rejected.pixels[rejected.view_index == rejected.view_names.index(name)]
+        drawing = residual_map(
+            points.pixels[own], residuals[own], size, scale, bold=2.2,
+            left_out=crosses, photograph=photographs.get(name),
+        )  # fmt: skip
+        figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
+    return [
+        section("Views", table(rows, sortable=True)),
+        section(
+            "Residuals of each view",
+            f'<p class="soft">All {scale:.3g} times enlarged; a click shows one large. Crosses are '
+            "points that were left out.</p>",
+            f'<div class="views{" wider" if photographs else ""}">{"".join(figures)}</div>',
+        ),
+    ]
+
+
+def _rejected(calibration: Calibration) -> str:
+    rejected = calibration.rejected
+    rows = [["view", "point", "u", "v", "error [px]"]]
+    if rejected.points is not None:
+        points = rejected.points
+        for k in range(min(len(points), _MOST_REJECTED)):
+            name = points.view_names[points.view_index[k]]
+            label = "" if points.point is None else str(points.point[k])
+            u, v = points.pixels[k]
+            rows.append(
+                [printable(name), printable(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
+            )
+    views = [["view", "reason"], *([printable(name), why] for name, why in rejected.views.items())]
+    return section("Left out", table(views), table(rows, sortable=True))
+
+
+def _warnings(warnings: tuple[str, ...]) -> str:
+    entries = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
+    return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
+
+
+def _options(calibration: Calibration) -> str:
+    options = f" --type {calibration.type}" if calibration.type != 1 else ""
+    if calibration.method in ("neuro", "linear", "nonlinear", "tsai"):
+        options += f" --method {calibration.method}"
+    if calibration.trainer in ("lm", "backprop"):
+        options += f" --trainer {calibration.trainer}"
+    if calibration.distortion_model != "none" or not calibration.lens_choice:
+        options += f" --distortion {calibration.distortion_model}"
+    if not calibration.intrinsics.skewed:
+        options += " --no-skew"
+    return f"{options} --seed {calibration.seed}"
+
+
+def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
+    text = (
+        "The same points, options and seed give the same file, byte for byte, with the same versions. The "
+        "file holds its points; neurocal evaluate camera judges it again."
+    )
+    facts = {"seed": str(calibration.seed), "how it ended": calibration.stop_reason}
+    return section("How to repeat it", _origin(command, origin, facts), f'<p class="soft">{text}</p>')
+
+
+def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
+    """Describe the run, or a command with a similar result if the run is unknown."""
+    entries = {"command" if origin.command else "a command with a similar result": origin.command or likely}
+    entries |= facts
+    if origin.versions:
+        entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())
+    entries |= {f"SHA-256 of {printable(name)}": digest for name, digest in origin.files.items()}
+    return definitions(entries)

@@ -1,0 +1,198 @@
+"""Results of simulations as tables and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.commands.show.camera_report import number_or_none
+from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
+from neurocal_cli.simulation.rates import RateStudy
+from neurocal_cli.simulation.scenes import SimulatedScene
+from neurocal_cli.simulation.starts import StartStudy
+
+Table = list[list[str]]
+
+FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
+# The errors in the paper's Table 1, calibrated minus true.
+_PRINTED = {
+    "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
+    "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
+}  # fmt: skip
+_KINDS = {
+    "lm": "network, trained by lm",
+    "backprop": "network, trained by backprop",
+    "weights": "plain LM on (3) from the network's random weights",
+    "camera": "plain LM on (3) from a random camera",
+}
+
+
+def simulation_tables(
+    study: NoiseStudy, starts: StartStudy | None, paper: bool
+) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Tables of the studies of noise and starts, and lines below them.
+
+    For the scene of the `paper`, its printed errors are shown, too.
+    """
+    tables = [
+        ("error without noise (Table 1)", _exact(study, paper)),
+        ("rms error over the noise (Fig. 1)", _fig_1(study)),
+    ]
+    for what, cell in (
+        ("rms error of each parameter over its Cramer-Rao bound", _ratio),
+        ("mean error of each parameter over its standard error", _bias),
+    ):
+        tables.append((f"{what}, at the largest sigma", _at_largest_sigma(study, cell)))
+    if starts is not None:
+        rows = [
+            [_KINDS[kind], str(count), str(len(starts.rms[kind]))] for kind, count in starts.reached.items()
+        ]
+        title = f"single random starts that reach the minimum (noise {starts.sigma:g} px)"
+        tables.append((title, [["start", "reached", "of"], *rows]))
+    return tables, _findings(study)
+
+
+def _exact(study: NoiseStudy, paper: bool) -> Table:
+    printed = ["as printed"] if paper else []
+    rows = [["parameter", "truth", *study.methods, *printed]]
+    for p, name in enumerate(study.names):
+        errors = [_error(one.exact[p]) for one in study.methods.values()]
+        rows.append([name, f"{study.truth[p]:.6g}", *errors, *([_error(_PRINTED[name])] if paper else [])])
+    return rows
+
+
+def _error(value: float) -> str:
+    return "-" if not np.isfinite(value) else "0" if value == 0 else f"{value:.1e}"
+
+
+def _fig_1(study: NoiseStudy) -> Table:
+    rows = [["parameter", "sigma [px]", "bound", *study.methods]]
+    # That of the method with the most unknowns.
+    bound = max((one.bound for one in study.methods.values()), key=lambda bound: np.count_nonzero(bound > 0))
+    for name in FIG_1:
+        p = study.names.index(name)
+        for k, sigma in enumerate(study.sigma):
+            values = [_number(one.rms[k, p]) for one in study.methods.values()]
+            rows.append([name, f"{sigma:g}", _number(sigma * bound[p]), *values])
+    return rows
+
+
+def _at_largest_sigma(study: NoiseStudy, cell: Callable[[NoiseStudy, MethodErrors, int], str]) -> Table:
+    """A row for each parameter and a column for each method that estimates it."""
+    rows = [["parameter", *study.methods]]
+    for p, name in enumerate(study.names):
+        cells = [cell(study, one, p) if one.bound[p] != 0 else "given" for one in study.methods.values()]
+        rows.append([name, *cells])
+    return rows
+
+
+def _ratio(study: NoiseStudy, one: MethodErrors, p: int) -> str:
+    """Rms error over its bound."""
+    return _number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]))
+
+
+def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
+    """Mean error over its standard error."""
+    variance = max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0)
+    spread = np.sqrt(variance / max(study.trials - one.failed[-1], 1))
+    return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
+
+
+def _findings(study: NoiseStudy) -> list[str]:
+    lines = [
+        f"{a} and {b} differ by at most {apart:.1g} of the bound, in any parameter of any trial"
+        for (a, b), apart in study.apart.items()
+    ]
+    for method, one in study.methods.items():
+        if one.failed.any():
+            lines.append(
+                f"{method} gave no answer in {one.failed.sum()} of {study.trials * len(study.sigma)} trials"
+            )
+    return lines
+
+
+def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Tables of the data sets on which one start converges, for each pair of rates, and lines below them."""
+    head = ["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]
+    counts = [head]
+    epochs = [list(head)]
+    for a, rate in enumerate(study.rates_weights):
+        counts.append([f"{rate:g}", *map(str, study.converged[a])])
+        epochs.append([f"{rate:g}", *("-" if np.isnan(e) else f"{e:.0f}" for e in study.epochs[a])])
+    weights, gamma = study.default
+    below = [
+        f"calibrate --trainer backprop with its rates, {weights:g} and {gamma:g}, reaches the minimum on "
+        f"{study.calibrated} of {study.sets} data sets",
+        f"there, errors of alpha_u are {np.sqrt((study.alpha_u**2).mean()):.2f} reported standard deviations "
+        f"rms, {np.abs(study.alpha_u).max():.1f} at most",
+    ]
+    title = f"of {study.sets} data sets, those on which a single random start converges with these rates"
+    return [(title, counts), ("median epochs of these", epochs)], below
+
+
+def simulation_json(
+    scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None
+) -> dict[str, Any]:
+    """The studies of noise and starts for JSON; missing numbers are None."""
+    whole = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed, **noise_json(study)}
+    return whole if starts is None else {**whole, "random_starts": starts_json(starts)}
+
+
+def noise_json(study: NoiseStudy) -> dict[str, Any]:
+    """The study of noise for JSON."""
+    return {
+        "trials": study.trials,
+        "sigma": study.sigma.tolist(),
+        "parameters": list(study.names),
+        "truth": _by_name(study, study.truth),
+        "methods": {
+            name: {
+                "error_without_noise": _by_name(study, one.exact),
+                "rms": {p: _numbers(one.rms[:, k]) for k, p in enumerate(study.names)},
+                "bias": {p: _numbers(one.bias[:, k]) for k, p in enumerate(study.names)},
+                "bound_for_1_px": _by_name(study, one.bound),
+                "failed": one.failed.tolist(),
+            }
+            for name, one in study.methods.items()
+        },
+        "largest_difference_over_bound": {f"{a}, {b}": value for (a, b), value in study.apart.items()},
+    }
+
+
+def starts_json(starts: StartStudy) -> dict[str, Any]:
+    """Counts and final errors of single starts for JSON."""
+    return {
+        "sigma": starts.sigma,
+        "best_rmse_px": starts.best,
+        "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
+        "reached": starts.reached,
+        "rmse_px": {kind: _numbers(rms) for kind, rms in starts.rms.items()},
+    }
+
+
+def rates_json(study: RateStudy) -> dict[str, Any]:
+    """The study of rates for JSON."""
+    return {
+        "data_sets": study.sets,
+        "rates_weights": study.rates_weights.tolist(),
+        "rates_gamma": study.rates_gamma.tolist(),
+        "converged": study.converged.tolist(),
+        "median_epochs": [_numbers(row) for row in study.epochs],
+        "default": {"rate_weights": study.default[0], "rate_gamma": study.default[1]},
+        "calibrated": study.calibrated,
+        "alpha_u_errors_in_std": _numbers(study.alpha_u),
+    }
+
+
+def _by_name(study: NoiseStudy, values: Any) -> dict[str, float | None]:
+    return dict(zip(study.names, _numbers(values), strict=True))
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [number_or_none(float(value)) for value in values]
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"

@@ -1,0 +1,166 @@
+"""Reports of zoom lenses and their evaluations as text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
+from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.settings import CONTROLS
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.commands.show.camera_report import align, number_or_none, rounded, target_json, target_lines
+from neurocal_cli.commands.show.verdict_report import verdict_json, verdict_lines
+
+_MOST_SETTINGS = 8
+_SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}
+_TRAININGS = {
+    "joint": "trained jointly",
+    "alternating": "trained alternately",
+    "one at a time": "trained one at a time",
+}
+
+
+def lens_report(lens: ZoomLens) -> str:
+    """Summary of a lens: its data, its networks, its errors and the verdict."""
+    kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
+    points = "" if lens.known else f", {int(lens.counts.sum())} points"
+    head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
+    if lens.model != "none":
+        head += f", distortion model {lens.model}"
+    errors = (
+        f"errors of the cameras, estimated: {_camera_errors(lens)}"
+        if lens.known
+        else f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
+        f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
+    )
+    scale = _SCALES[lens.members[0].nets.scale]
+    training = _TRAININGS.get(lens.training, lens.training)
+    tail = [
+        errors,
+        *target_lines(lens.target, lens.unit),
+        f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}",
+        "converged" if lens.converged else "not converged: training stopped before the error settled",
+    ]
+    blocks = [[head], align(_network_rows(lens)), tail, verdict_lines(judge_lens(lens))]
+    return "\n\n".join("\n".join(block) for block in blocks)
+
+
+def lens_json(lens: ZoomLens) -> dict[str, Any]:
+    """The summary of a lens as JSON values; None for numbers that do not exist."""
+    return {
+        "controls": list(lens.controls),
+        "n_settings": len(lens.settings),
+        "n_points": int(lens.counts.sum()),
+        "parameters": list(lens.names),
+        "distortion": lens.model,
+        "still": bool(lens.still),
+        "known_cameras": bool(lens.known),
+        "rmse_px": number_or_none(float(lens.rmse_px)),
+        "noise_floor_px": None if lens.known else number_or_none(lens.noise_floor_px),
+        "left_out_px": number_or_none(float(lens.left_out_px)),
+        "members": len(lens.members),
+        "target": target_json(lens.target, lens.unit),
+        "converged": bool(lens.converged),
+        "warnings": list(lens.warnings),
+        "verdict": verdict_json(judge_lens(lens)),
+    }
+
+
+def _camera_errors(lens: ZoomLens) -> str:
+    """The median std of the given parameters; that of alpha is relative."""
+    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.H), axis1=1, axis2=2))
+    share = 100 * float(np.median(std[:, 0] / lens.tables.local[:, 0]))
+    others = [f"{name} {value:.3g}" for name, value in zip(lens.names, np.median(std, axis=0), strict=True)]
+    return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
+
+
+def _network_rows(lens: ZoomLens) -> list[list[str]]:
+    prediction = lens.predict(lens.settings)
+    rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
+    for j, name in enumerate(lens.names):
+        topologies = {member.nets.nets[j].topology for member in lens.members}
+        units = " ".join(f"{own}+{hidden}" for own, hidden in sorted((t.own, t.hidden) for t in topologies))
+        std = float(np.median(prediction.std[:, j]))
+        values = prediction.local[:, j]
+        low, high = rounded(float(values.min()), std), rounded(float(values.max()), std)
+        label = _labelled(name, lens.unit if name == "t_z" else "")
+        rows.append([label, units, low[0], high[0], low[1]])
+    return rows
+
+
+def _labelled(name: str, unit: str) -> str:
+    """A parameter with its unit: pixels for four of them, or the given one."""
+    unit = "px" if name in INTRINSIC_NAMES[:4] else unit
+    return f"{name} [{unit}]" if unit else name
+
+
+def camera_report(calibration: Calibration) -> str:
+    """Table of the parameters of the camera at a setting."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    values = [*calibration.intrinsics.values(), *calibration.distortion]
+    rows = [["parameter", "value", "std"]]
+    for name, value in zip(names, values, strict=True):
+        label = _labelled(name, "rad" if name == "theta" else "")
+        if name in calibration.fixed:
+            rows.append([label, f"{value:.7g}", "given"])
+        else:
+            rows.append([label, *rounded(float(value), calibration.std[name])])
+    return f"{calibration.camera_name}: {calibration.stop_reason}\n\n" + "\n".join(align(rows))
+
+
+def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict) -> str:
+    """Errors of a lens as aligned text: overall, of the baselines, at the worst settings; the verdict."""
+    shown = sorted(evaluation.settings, key=lambda setting: -np.nan_to_num(setting.rmse_px))[:_MOST_SETTINGS]
+    settings = [[*controls, "points", "rms [px]", "max [px]"]]
+    for setting in shown:
+        numbers = [f"{setting.values[name]:.10g}" for name in controls]
+        settings.append([*numbers, str(setting.n_points), _pixels(setting.rmse_px), _pixels(setting.max_px)])
+    head = (
+        f"{evaluation.n_points} points at {len(evaluation.settings)} settings: rms "
+        f"{_pixels(evaluation.rmse_px)} px, maximum {_pixels(evaluation.max_px)} px"
+    )
+    title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
+    tables = align(_baseline_rows(evaluation)), [title, *align(settings)]
+    blocks = [[head], *tables, verdict_lines(verdict)]
+    return "\n\n".join("\n".join(block) for block in blocks)
+
+
+def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
+    """A row for each baseline: fitted one parameter at a time, and jointly."""
+    rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
+    baselines = evaluation.baselines
+    for name, alone in baselines.items():
+        if not name.endswith("_joint"):
+            joint = baselines.get(f"{name}_joint")
+            rows.append([name.replace("_", " "), _pixels(alone), "" if joint is None else _pixels(joint)])
+    return rows
+
+
+def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, Any]:
+    """An evaluation as JSON values; None for numbers that do not exist."""
+    return {
+        "n_points": evaluation.n_points,
+        "rmse_px": number_or_none(evaluation.rmse_px),
+        "max_px": number_or_none(evaluation.max_px),
+        "settings": [
+            {
+                **{name: setting.values.get(name) for name in CONTROLS},
+                "n_points": setting.n_points,
+                "rmse_px": number_or_none(setting.rmse_px),
+                "max_px": number_or_none(setting.max_px),
+            }
+            for setting in evaluation.settings
+        ],
+        "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
+        "verdict": verdict_json(verdict),
+    }
+
+
+def _pixels(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "-"

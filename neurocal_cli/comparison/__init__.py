@@ -1,1 +1,0 @@
-"""Comparison of the network with other methods on the same points."""

@@ -1,0 +1,118 @@
+"""Board YAML: a chessboard target of one or several planes, as a file that users write."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.writing import write_whole
+from neurocal_cli.files.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.files.yaml_tree import parse_yaml, read_yaml
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.distances import Distance
+
+_COUNTS = ("cols", "rows")
+_VECTORS = ("origin", "x_axis", "y_axis")
+_DISTANCE_KEYS = ("from", "to", "length", "std")
+_PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS, "points")
+
+
+def read_board(path: str | Path) -> Board:
+    """Read a board.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read or is not a board; the message names the file and the key.
+    """
+    return _board(read_yaml(path))
+
+
+def parse_board(content: str, source: str = "board") -> Board:
+    """Read a board from the text of a file; see `read_board`."""
+    return _board(Field(parse_yaml(content, source), source))
+
+
+def write_board(board: Board, path: str | Path) -> None:
+    """Write a board; `read_board` gives back the same numbers to the last bit."""
+    write_whole(path, format_board(board))
+
+
+def format_board(board: Board) -> str:
+    """Text of a board file."""
+    lines = [f"unit: {text(board.unit)}", "planes:"]
+    for plane in board.planes:
+        entries = {"name": text(plane.name)} if plane.name else {}
+        entries |= {key: str(getattr(plane, key)) for key in _COUNTS}
+        entries["square"] = number(plane.square)
+        entries |= {key: flow(np.array(getattr(plane, key))) for key in _VECTORS}
+        if not plane.measured:
+            lines.append(f"  - {mapping(**entries)}")
+            continue
+        first, *others = [f"{key}: {value}" for key, value in entries.items()]
+        rows = flow(np.array(plane.measured))[2:-2].split("], [")
+        lines += [f"  - {first}", *(f"    {entry}" for entry in others)]
+        lines += ["    points:  # column, row, X, Y, Z", *(f"      - [{row}]" for row in rows)]
+    if board.distances:
+        lines.append("distances:")
+    for one in board.distances:
+        ends = {"from": quoted(one.start), "to": quoted(one.end)}
+        lines.append(f"  - {mapping(**ends, length=number(one.length), std=number(one.std))}")
+    return "\n".join([*lines, ""])
+
+
+def _board(root: Field) -> Board:
+    _only(root, ("unit", "planes", "distances"))
+    fields = list(root["planes"].items())
+    if not fields:
+        root["planes"].fail("a list of at least one plane")
+    unit = root.get("unit", "mm").text()
+    planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
+    with value_failures(root.source, "planes: "):
+        board = Board(planes, unit)
+    return replace(board, distances=_distances(root, board)) if "distances" in root else board
+
+
+def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
+    found = []
+    for field in root["distances"].items():
+        _only(field, _DISTANCE_KEYS)
+        start, end = (field[key].text() for key in ("from", "to"))
+        with value_failures(field.source, f"{field.path}: "):
+            found.append(Distance(start, end, field["length"].number(), field["std"].number()))
+            for label in (start, end):
+                board.place(label)
+    return tuple(found)
+
+
+def _plane(field: Field, *, alone: bool) -> Plane:
+    """Read a plane; a single plane needs no name, origin and axes."""
+    _only(field, _PLANE_KEYS)
+    cols, rows = (field[key].integer(2) for key in _COUNTS)
+    square = field["square"].number()
+    place: dict[str, Any] = {
+        key: tuple(field[key].array(3).tolist()) for key in _VECTORS if not alone or key in field
+    }
+    if "points" in field:
+        place["measured"] = tuple(map(tuple, field["points"].array(-1, 5).tolist()))
+    name = field["name"].text() if not alone or "name" in field else ""
+    with value_failures(field.source, f"{field.path}."):
+        return Plane(name, cols, rows, square, **place)
+
+
+def _only(field: Field, known: tuple[str, ...]) -> None:
+    """Refuse unknown keys; otherwise a misspelt axis would silently become the default axis."""
+    for key in field.entries():
+        if key not in known:
+            where = f"{field.path}: " if field.path else ""
+            field.refuse(f"{where}the key {key[:60]!r} is not known; use one of {', '.join(known)}")

@@ -1,0 +1,144 @@
+"""Adapt cameras to a file format, exactly or approximately, with the loss in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.commands.show.camera_report import plural
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+
+_NO_SKEW = 1e-3  # px; a smaller loss is not reported
+_NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported
+_AS_NEAR, _NEARER = 1.1, 0.01  # a simpler model may lose this many times more than the best, or px more
+
+_Adaptation = tuple[Camera, NearestCamera | None, str]  # None and "" if there is no loss to report
+
+
+@frozen_dataclass(eq=False)
+class AdaptedCameras:
+    """Cameras adapted to a format."""
+
+    cameras: CameraSet
+    losses: tuple[str, ...] = ()  # changes of the cameras and the shifts of pixels, for warnings
+    remarks: tuple[str, ...] = ()  # data that are not in the file, for notes
+    moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
+
+
+def adapt_cameras(
+    cameras: CameraSet, target: Format, force: bool, model: str | None = None
+) -> AdaptedCameras:
+    """Adapt cameras to a format, and to a distortion model (one of `MODELS`) if one is given.
+
+    If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
+    nearest camera without skew moves pixels less than ignoring the skew. An InputError says that the format
+    cannot represent the distortion model (unless `force` accepts the nearest one of another model), the
+    number of cameras, or an unknown unit or image size.
+    """
+    if len(cameras.cameras) > target.most_cameras:
+        raise InputError(
+            f"a file of {target.program} holds {target.most_cameras} cameras at most, and there are "
+            f"{len(cameras.cameras)}; write another format"
+        )
+    if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):
+        raise InputError(f"a file of {target.program} needs the size of the images; give --image-size W H")
+    # ROS and mrcal write the pose of a camera in its own frame, which tells nothing.
+    poses = () if target.poses else cameras.poses.values()
+    n_views = sum(not np.array_equal(pose.D, np.eye(3, 4)) for pose in poses)
+    if target.metres:
+        cameras = (cameras if target.poses else replace(cameras, poses={})).in_metres()
+    if model is not None and model not in target.models:
+        held = ", ".join(target.models)
+        raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
+    losses, remarks, adapted, moved = [], [], [], []
+    # Pixels of the points with which each camera was calibrated.
+    seen: list[Array | None] = [None] * len(cameras.cameras)
+    if cameras.origin is not None:
+        origin = cameras.origin
+        parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
+        seen = [part.points.pixels for part in parts]
+    for camera, points in zip(cameras.cameras, seen, strict=True):
+        new, near, loss = _adapted(camera, target, model, force, points)
+        adapted.append(new)
+        losses += [f"{camera.name}: {loss}"] if loss else []
+        moved.append(None if near is None else near.over_image)
+    changed = any(new is not old for new, old in zip(adapted, cameras.cameras, strict=True))
+    own = target.program == "neurocal"
+    if cameras.origin is not None and (changed or not own):
+        remarks.append(
+            f"a file of {target.program} has no place for standard deviations, points and the verdict"
+            if not own
+            else "the new camera has no standard deviations, points and verdict"
+        )
+    if n_views:
+        remarks.append(f"a file of {target.program} has no place for the poses of {plural(n_views, 'view')}")
+    found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else cameras.origin)
+    return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
+
+
+def _adapted(
+    camera: Camera, target: Format, wanted: str | None, force: bool, points: Array | None
+) -> _Adaptation:
+    models = target.models if wanted is None else (wanted,)
+    model = next((m for m in models if with_model(camera.distortion, m) is not None), None)
+    straight = target.skew or not camera.intrinsics.skewed
+    if model is not None and straight:
+        return _as_model(camera, model), None, ""
+    if wanted is not None:
+        near = nearest_camera(camera, wanted, target.skew, points)
+        return near.camera, near, f"the nearest {wanted}{'' if straight else ' without skew'} {_pixels(near)}"
+    if model is not None:
+        near = nearest_camera(camera, model, False, points)
+        if near.over_image.max_px < _NO_SKEW:
+            return _straightened(near.camera), None, ""
+        what = (
+            f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
+            f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
+        )
+        return _straightened(near.camera), near, what
+    nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
+    best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
+    # Prefer a simpler model if it is nearly as good.
+    most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
+    near = next(
+        n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
+    )
+    what = (
+        f"{target.program} has no distortion model {camera.distortion.model}; the nearest of its models, "
+        f"{near.camera.distortion.model}, {_pixels(near)}"
+    )
+    if not force:
+        raise InputError(f"{camera.name}: {what}; give --force to write it, or calibrate with this model")
+    return near.camera, near, what
+
+
+def _as_model(camera: Camera, model: str) -> Camera:
+    """Express the camera in a model that includes its distortion model; unchanged if that is the same."""
+    distortion = with_model(camera.distortion, model)
+    if distortion is camera.distortion or distortion is None:
+        return camera
+    return replace(camera, distortion=distortion)
+
+
+def _straightened(camera: Camera) -> Camera:
+    """Set the angle of the axes to exactly pi/2."""
+    a, _, b, u0, v0 = camera.entries
+    return replace(camera, intrinsics=Intrinsics(a, b, u0, v0))
+
+
+def _pixels(near: NearestCamera) -> str:
+    over, at = near.over_image, near.at_points
+    text = f"moves pixels by {over.rms_px:.3g} px rms and {over.max_px:.3g} px at most over the image"
+    if at is not None:
+        text += f", by {at.rms_px:.3g} px rms and {at.max_px:.3g} px at most where points were seen"
+    if near.lost > _NO_LOSS:
+        text += f", and it does not show {100 * near.lost:.0f} % of the image"
+    return text

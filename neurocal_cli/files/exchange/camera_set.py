@@ -1,0 +1,122 @@
+"""Contents of a camera file of any program, poses in the forms of these programs, and properties of formats.
+
+SciPy gets copies of rotations, because older versions refuse read-only arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import field, replace
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
+
+METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
+
+
+@frozen_dataclass(eq=False)
+class CameraSet:
+    """One camera, or several that are fixed to each other."""
+
+    cameras: tuple[Camera, ...]
+    relative: tuple[Pose, ...] = ()  # from the first camera to each further one, X_k = R X_0 + t
+    poses: Mapping[str, Pose] = field(default_factory=dict)  # of views, from the world to the first camera
+    unit: str | None = None  # of the translations; None if the file does not state it
+    origin: Calibration | Rig | None = None  # the whole contents of a neurocal file
+    program: str = "OpenCV"  # that wrote the file, for messages
+
+    def __post_init__(self) -> None:
+        if len(self.relative) != len(self.cameras) - 1:
+            raise InputError(
+                f"holds {len(self.cameras)} cameras, but not their relative poses; give a file with "
+                "one camera, or with the poses"
+            )
+
+    @property
+    def mounted(self) -> tuple[Pose, ...]:
+        """Poses from the first camera to each of them."""
+        return (Pose(np.eye(3), np.zeros(3)), *self.relative)
+
+    @property
+    def has_lengths(self) -> bool:
+        """Whether there is any translation, so that the unit matters."""
+        return bool(self.relative or self.poses)
+
+    def in_metres(self) -> CameraSet:
+        """Convert the translations to metres; raise an InputError if the unit is unknown or not a length."""
+        if not self.has_lengths:
+            return self
+        if self.unit not in METRES:
+            stated = "not known" if self.unit in (None, "unknown") else repr(self.unit)
+            raise InputError(
+                f"the file is to be in metres, but the unit of {self.program}'s file is {stated}; give "
+                f"--unit, one of {', '.join(METRES)}"
+            )
+        scale = METRES[self.unit]
+        return replace(
+            self,
+            relative=tuple(Pose(pose.R, scale * pose.t) for pose in self.relative),
+            poses={name: Pose(pose.R, scale * pose.t) for name, pose in self.poses.items()},
+            unit="m",
+        )
+
+
+@frozen_dataclass
+class Format:
+    """Capabilities of a file format, and the function that writes cameras which fit it."""
+
+    program: str  # name for messages
+    models: tuple[str, ...]  # our names of its distortion models, the simplest first
+    # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
+    text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
+    skew: bool = False  # whether its programs support skew
+    poses: bool = False  # whether it contains the poses of views
+    most_cameras: int = 2
+    metres: bool = False  # whether lengths are in metres
+    needs_size: bool = False  # whether the image size must be known
+
+
+def to_vector(R: Array) -> Array:
+    """Rotation vector (axis times angle [rad]) of a rotation (3, 3), like ``cv2.Rodrigues``; also near pi."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(np.array(R)).as_rotvec())
+
+
+def from_vector(r: Array) -> Array:
+    """Rotation (3, 3) of a rotation vector (axis times angle [rad])."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.array(r, dtype=float).reshape(3)).as_matrix())
+
+
+def to_quaternion(R: Array) -> Array:
+    """Unit quaternion w, x, y, z of a rotation (3, 3), with w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat()
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def from_quaternion(q: Array) -> Array:
+    """Rotation (3, 3) of a quaternion w, x, y, z of any non-zero length."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(np.roll(np.asarray(q, dtype=float), -1)).as_matrix())
+
+
+def inverse(pose: Pose) -> Pose:
+    """Inverse of a pose."""
+    return Pose(pose.R.T, -pose.R.T @ pose.t)
+
+
+def after(second: Pose, first: Pose) -> Pose:
+    """Compose two poses: ``X'' = R2 (R1 X + t1) + t2``."""
+    return Pose(second.R @ first.R, second.R @ first.t + second.t)

@@ -1,0 +1,215 @@
+"""COLMAP's text models: ``cameras.txt``, and in its folder ``images.txt``, ``rigs.txt`` and ``frames.txt``.
+
+The centre of the top-left pixel is (1/2, 1/2), so principal points are larger than ours by half a pixel. The
+pose of an image maps the world to its camera. The pose of a rig's sensor maps the rig's frame, which is that
+of its reference camera, to the sensor.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
+from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.files import read_text
+from neurocal_cli.files.yaml_text import number
+
+_HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
+
+# Our model, number of focal lengths, and for each of our coefficients the index of COLMAP's, or None for 0.
+_MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
+    "SIMPLE_PINHOLE": ("none", 1, ()),
+    "PINHOLE": ("none", 2, ()),
+    "SIMPLE_RADIAL": ("k1", 1, (0,)),
+    "RADIAL": ("k1k2", 1, (0, 1)),
+    "OPENCV": ("k1k2p1p2", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": ("rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0, None, None, None)),
+    "RADIAL_FISHEYE": ("fisheye", 1, (0, 1, None, None)),
+    # Since version 4.
+    "SIMPLE_FISHEYE": ("fisheye", 1, (None, None, None, None)),
+    "FISHEYE": ("fisheye", 2, (None, None, None, None)),
+    "EUCM": ("eucm", 2, (0, 1)),
+}
+_NAMES = {
+    "none": "PINHOLE",
+    "k1k2p1p2": "OPENCV",
+    "rational": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "eucm": "EUCM",
+}
+
+
+def is_folder(name: str) -> bool:
+    """Whether this is a folder, which only COLMAP uses for its models."""
+    return name != "-" and os.path.isdir(name)
+
+
+def read_folder(folder: str) -> CameraSet:
+    """Read the cameras of a model with their relative poses and the poses of the images."""
+    path = os.path.join(folder, "cameras.txt")
+    if not os.path.exists(path):
+        if os.path.exists(os.path.join(folder, "cameras.bin")):
+            raise FormatError(
+                "is a binary model; convert it with colmap model_converter --output_type TXT", folder
+            )
+        raise FormatError(
+            "is a folder without COLMAP's cameras.txt; give a camera file, or the two of a rig", folder
+        )
+    text, source = read_text(path)
+    with value_failures(source):
+        cameras = _cameras(text, source)
+        relative = _rig(folder, list(cameras))
+        found = CameraSet(tuple(cameras.values()), relative, program="COLMAP")
+        return replace(found, poses=_poses(folder, next(iter(cameras))))
+
+
+def parse(text: str, source: str) -> CameraSet:
+    """Read ``cameras.txt`` with one camera."""
+    return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
+
+
+def _lines(text: str) -> list[tuple[int, list[str]]]:
+    rows = [(k, line.split()) for k, line in enumerate(text.splitlines(), start=1)]
+    return [(k, words) for k, words in rows if words and not words[0].startswith("#")]
+
+
+def _cameras(text: str, source: str) -> dict[int, Camera]:
+    cameras = {}
+    for k, words in _lines(text):
+        if not words[0].isdecimal():
+            raise FormatError("is not the line of a camera; correct it", source, k)
+        cameras[int(words[0])] = _camera(words, source, k)
+    return cameras
+
+
+def _camera(words: list[str], source: str, line: int) -> Camera:
+    model = words[1] if len(words) > 1 else ""
+    if model not in _MODELS:
+        known = ", ".join(_MODELS)
+        raise FormatError(f"the camera model {model[:40]!r} is not known; use one of {known}", source, line)
+    ours, focal, places = _MODELS[model]
+    try:
+        size = int(words[2]), int(words[3])
+        values = np.array(words[4:], dtype=float)
+        if len(values) != focal + 2 + len([p for p in places if p is not None]):
+            raise ValueError
+    except (ValueError, IndexError) as error:
+        raise FormatError(
+            f"is not the line of a camera with the model {model}; correct it", source, line
+        ) from error
+    f, (cx, cy), k = values[:focal], values[focal : focal + 2] - _HALF, values[focal + 2 :]
+    coefficients = np.array([0.0 if p is None else k[p] for p in places])
+    return Camera(Intrinsics(f[0], f[-1], cx, cy), Distortion(ours, coefficients), size, f"camera{words[0]}")
+
+
+def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
+    """Poses of the further cameras relative to the first one."""
+    path = os.path.join(folder, "rigs.txt")
+    if len(ids) == 1 or not os.path.exists(path):
+        return ()
+    text, source = read_text(path)
+    rows = _lines(text)
+    if len(rows) != 1:
+        raise FormatError("holds several rigs; give a model with one", source)
+    line, words = rows[0]
+    poses, rest = {int(words[3]): Pose(np.eye(3), np.zeros(3))}, words[4:]
+    try:
+        while rest:
+            if rest[0] != "CAMERA" or rest[2] != "1":
+                raise FormatError("a sensor is no camera, or has no pose", source, line)
+            poses[int(rest[1])] = _pose(np.array(rest[3:10], dtype=float))
+            rest = rest[10:]
+        first = poses[ids[0]]
+        if np.abs(first.D - np.eye(3, 4)).max() > 0:
+            raise FormatError(f"the reference of the rig must be the camera {ids[0]}", source, line)
+        return tuple(poses[camera] for camera in ids[1:])
+    except (ValueError, IndexError, KeyError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError("is not the line of a rig of these cameras; correct it", source, line) from error
+
+
+def _poses(folder: str, camera: int) -> dict[str, Pose]:
+    """Poses of the images of one camera."""
+    path = os.path.join(folder, "images.txt")
+    if not os.path.exists(path):
+        return {}
+    text, source = read_text(path)
+    # Each image has two lines: its pose, and its points, which may be empty.
+    rows = [(k, line) for k, line in enumerate(text.split("\n"), start=1) if not line.startswith("#")]
+    poses = {}
+    for k, line in rows[::2]:
+        words = line.split(maxsplit=9)
+        if not words:
+            continue
+        try:
+            if int(words[8]) == camera:
+                poses[words[9].strip()] = _pose(np.array(words[1:8], dtype=float))
+        except (ValueError, IndexError) as error:
+            raise FormatError("is not the line of an image; correct it", source, k) from error
+    return poses
+
+
+def _pose(values: Array) -> Pose:
+    return Pose(from_quaternion(values[:4]), values[4:])
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    files = {
+        "cameras.txt": [
+            "# Camera list with one line of data per camera:",
+            "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+            *(_camera_line(k, camera) for k, camera in enumerate(cameras.cameras, start=1)),
+        ]
+    }
+    if len(cameras.cameras) == 1 and not cameras.poses:
+        return {"": _joined(files["cameras.txt"])}
+    rig = cameras.mounted
+    sensors = [f"CAMERA {k} 1 {_seven(pose)}" for k, pose in enumerate(rig[1:], start=2)]
+    files["rigs.txt"] = [" ".join([f"1 {len(rig)} CAMERA 1", *sensors])]
+    files["frames.txt"], files["images.txt"], files["points3D.txt"] = [], [], []
+    if len({_word(view) for view in cameras.poses}) < len(cameras.poses):
+        raise InputError("two names of views differ by blanks alone, which COLMAP's have not; rename one")
+    for frame, (view, pose) in enumerate(cameras.poses.items(), start=1):
+        data = []
+        for camera, mounted in enumerate(rig, start=1):
+            image = (frame - 1) * len(rig) + camera
+            data.append(f"CAMERA {camera} {image}")
+            # As in COLMAP's rigs, the images of each camera are in a folder with its name.
+            name = f"camera{camera}/{_word(view)}" if len(rig) > 1 else _word(view)
+            files["images.txt"] += [f"{image} {_seven(after(mounted, pose))} {camera} {name}", ""]
+        files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
+    return {name: _joined(lines) for name, lines in files.items()}
+
+
+def _word(name: str) -> str:
+    """Replace blanks in a name, because COLMAP's reader ends it there."""
+    return "_".join(name.split()) or "_"
+
+
+def _joined(lines: list[str]) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _camera_line(k: int, camera: Camera) -> str:
+    width, height = camera.image_size or (0, 0)
+    a, _, b, u0, v0 = camera.entries
+    values = [a, b, u0 + _HALF, v0 + _HALF, *camera.distortion.coefficients.tolist()]
+    return f"{k} {_NAMES[camera.distortion.model]} {width} {height} {' '.join(map(number, values))}"
+
+
+def _seven(pose: Pose) -> str:
+    return " ".join(map(number, [*to_quaternion(pose.R), *pose.t]))
+
+
+FORMAT = Format("COLMAP", tuple(_NAMES), _text, poses=True, most_cameras=99, needs_size=True)

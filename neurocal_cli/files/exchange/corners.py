@@ -1,0 +1,308 @@
+"""Read corners of boards measured by other programs.
+
+* A dictionary (FileStorage, JSON, ``.npz``, ``.mat``) with image points of each view and board points;
+* a single ``.npy`` array of image points;
+* mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
+* text files of numbers: one with the board points, and one for each view.
+
+If the files have no board points, the board must be given. MATLAB counts pixels from 1, and corners along the
+columns of the board. Kalibr has no file of corners: it detects them in a bag in each run.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.camera_tree import image_size
+from neurocal_cli.files.exchange.dictionary import arrays_of
+from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, unit_of
+from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.file_storage import parse_tree
+from neurocal_cli.files.files import decode, read_bytes
+from neurocal_cli.files.mat_file import read_variables
+from neurocal_cli.files.points_csv import read_points
+from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.points import Correspondences
+
+_IMAGE = (
+    "image_points", "imagePoints", "imgpoints", "img_points", "imgPoints", "ImagePoints", "corners",
+    "all_corners",
+)  # fmt: skip
+_WORLD = (
+    "object_points", "objectPoints", "objpoints", "obj_points", "objPoints", "grid_points", "worldPoints",
+    "WorldPoints", "world_points",
+)  # fmt: skip
+_VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
+_TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
+_KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
+_NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
+
+
+def read_corners(
+    paths: Sequence[str | Path], board: Board | None, notes: list[str], unit: str | None = None
+) -> Correspondences | None:
+    """Read points from files of any program; None if the first file has no points.
+
+    The files are one, or board points and then a file for each view; stdin has to be repeatable
+    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not. Remarks
+    about ignored columns are appended to `notes`.
+    """
+    names = [str(path) for path in paths]
+    data, source = read_bytes(names[0])
+    if len(names) == 1 and data.startswith(b"\x93NUMPY"):
+        try:
+            array = np.load(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+        return _corners(Field({"corners": array.tolist()}, source), board, unit)
+    if data.startswith(b"PK\x03\x04"):
+        return _corners(Field(arrays_of(data, source), source), board, unit)
+    if data.startswith(b"MATLAB 5.0 MAT-file"):
+        return _matlab(data, source, board, unit)
+    if b"\0" in data:
+        return None
+    text = decode(data, source)
+    if _KALIBR.match(text):
+        raise FormatError(
+            "is a report of Kalibr, which holds no points, and Kalibr has no file of corners; give its "
+            "camchain for the cameras, and the images of its bag to neurocal detect for points",
+            source,
+        )
+    if _VNL.match(text):
+        return _vnl(text, source, board)
+    if _NUMBERS.match(text):
+        return _separate(names, board, unit)
+    if _TABLE.match(text):
+        points = read_points(names, notes=notes)
+        if board is not None:
+            notes.append(f"{source}: has the places of its points, so the board is not used")
+        elif unit not in (None, points.unit):
+            notes.append(f"{source}: is in {points.unit}, and {unit} is not used")
+        return points
+    named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
+    if named or text.lstrip()[:1] in ("{", "<", "%"):
+        return _corners(parse_tree(text, source), board, unit)
+    return None
+
+
+def _corners(
+    root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
+) -> Correspondences | None:
+    """Read the points of a dictionary, if it has any; `first` is the coordinate of its first pixel.
+
+    Without board points, `down` tells that the corners run along the columns of the board.
+    """
+    field = root.first(_IMAGE)
+    if field is None:
+        return None
+    pixels = _stack(field, 2) - first
+    views = len(pixels)
+    names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
+    if "view_names" in root:
+        names = root["view_names"].names(views)
+    places = root.first(_WORLD)
+    world = None if places is None else _stack(places, 3)
+    stated = root["unit"].text() if "unit" in root else unit
+    ids = root.read("points", Field.texts)
+    if world is None:
+        world, ids = _of_board(board, pixels.shape[1], field, down)
+        stated = board.unit if board else stated
+    if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
+        field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
+    points = _assembled(world, pixels, names, ids, stated, root.source)
+    return replace(points, image_size=image_size(root))
+
+
+def _of_board(board: Board | None, count: int, field: Field, down: bool = False) -> tuple[Array, list[str]]:
+    """Vertices (1, N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
+    if board is None:
+        field.refuse(
+            f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
+            "--rows and --square, or --board"
+        )
+    if len(board.planes) != 1 or board.planes[0].cols * board.planes[0].rows != count:
+        sizes = " and ".join(f"{plane.cols} x {plane.rows}" for plane in board.planes)
+        field.refuse(
+            f"there are {count} corners a view, and {sizes} vertices on the board; give the board that was "
+            "measured"
+        )
+    (plane,) = board.planes
+    order = np.arange(count)
+    if down:
+        order = order.reshape(plane.rows, plane.cols).T.ravel()
+    ids = list(plane.vertex_ids())
+    return plane.vertices().reshape(1, -1, 3)[:, order], [ids[k] for k in order]
+
+
+def _stack(field: Field, width: int) -> Array:
+    """Points of each view, (V, N, width); board points may lack Z."""
+    value = field.value
+    if isinstance(value, dict):  # an OpenCV matrix, of one channel or several
+        data = field["data"].array(-1, unknown=True)
+        rows, cols = field["rows"].integer(1), field["cols"].integer(1)
+        if len(data) % (rows * cols):
+            field.fail(f"{rows} x {cols} points")
+        value = data.reshape(rows, cols, -1)
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        field.fail("the same number of points in each view, as numbers")
+    if array.ndim == 1 and array.size % 3 == 0 and width == 3:  # OpenCV writes vectors of points flat
+        array = array.reshape(1, -1, 3)
+    if array.ndim == 4:  # (V, N, 1, 2), as OpenCV's functions return them, or (V, 1, N, 2)
+        array = array.reshape(len(array), -1, array.shape[-1])
+    if array.ndim == 3 and array.shape[1] == 1 and array.shape[-1] in (2, 3) and array.shape[0] > 1:
+        array = array.reshape(1, -1, array.shape[-1])  # (N, 1, 2): one view
+    if array.ndim == 2:
+        array = array[None]
+    if width == 3 and array.ndim == 3 and array.shape[-1] == 2:
+        array = np.concatenate([array, np.zeros((*array.shape[:2], 1))], axis=2)
+    if array.ndim != 3 or array.shape[-1] != width or array.size == 0:
+        field.fail(f"points of {width} coordinates")
+    return array
+
+
+def _assembled(
+    world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
+) -> Correspondences:
+    """Join the views to one data set, without corners that are NaN; `world` is (V, N, 3) or (1, N, 3)."""
+    views, count = pixels.shape[:2]
+    found = np.isfinite(pixels).all(axis=2)
+    if not found.any():
+        raise FormatError("has no detected corner; give another file", source)
+    labels = ids if ids is not None else [str(k) for k in range(count)]
+    with value_failures(""):
+        return Correspondences(
+            np.broadcast_to(world, (views, count, 3))[found],
+            pixels[found],
+            np.repeat(names, count).reshape(views, count)[found],
+            point=np.tile(labels, views).reshape(views, count)[found],
+            unit=unit or "unknown",
+            source=source,
+        )
+
+
+def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
+    tree = read_variables(data, source)
+    field = next((name for name in _IMAGE if name in tree), None)
+    if field is None:
+        return None
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
+    root = Field(plain, source)
+    if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
+        root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
+    root.value.setdefault("unit", unit_of(tree))
+    stack = np.asarray(tree[field], dtype=float)
+    if stack.ndim == 4:  # M x 2 x P x cameras
+        raise FormatError(
+            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart", source
+        )
+    if stack.ndim == 3:  # M x 2 x P
+        root.value[field] = np.moveaxis(stack, 2, 0).tolist()
+    return _corners(root, board or _matlab_board(tree, unit, source), unit, first=FIRST_PIXEL, down=True)
+
+
+def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board | None:
+    """Read the board from variables of MATLAB's examples: [rows, columns] of squares, and their side."""
+    size = next((tree[name] for name in ("boardSize", "patternDims") if name in tree), None)
+    side = next((tree[name] for name in ("squareSize", "squareSizeInMM") if name in tree), None)
+    if size is None or side is None:
+        return None
+    try:
+        rows, cols = (int(count) - 1 for count in np.ravel(size))
+        plane = Plane("", cols, rows, float(np.ravel(side)[0]))
+    except (InputError, ValueError, TypeError, OverflowError, IndexError) as error:
+        raise FormatError(
+            "boardSize and squareSize are not those of a board; give --cols, --rows and --square", source
+        ) from error
+    return Board((plane,), "mm" if "squareSizeInMM" in tree else unit or "unknown")
+
+
+def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
+    """Read mrcal's table; ``-`` means a corner was not found, and each level doubles sigma."""
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        corners = rows.setdefault(words[0], [])
+        if "-" in words[1:3]:
+            if len(words) > 3:
+                corners.append((np.nan, np.nan, 0.0))
+            continue
+        try:
+            level = float(words[3]) if len(words) > 3 and words[3] != "-" else 0.0
+            corners.append((float(words[1]), float(words[2]), level))
+        except (ValueError, IndexError) as error:
+            raise FormatError("is not a line 'filename x y level'; correct it", source, number) from error
+    seen = {name: corners for name, corners in rows.items() if corners}
+    counts = {len(corners) for corners in seen.values()}
+    if len(counts) != 1:
+        raise FormatError(
+            "the images have different numbers of corners; write all of them, - for none", source
+        )
+    stack = np.array(list(seen.values()))
+    world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
+    # A negative level marks a corner that mrcal considers an outlier.
+    pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
+    found = np.isfinite(pixels).all(axis=2)
+    points = _assembled(world, pixels, _stems(seen), ids, board.unit if board else None, source)
+    sigma = 2.0 ** stack[:, :, 2][found]
+    if not (sigma > 1).any():
+        return points
+    return replace(points, covariance=np.column_stack([sigma**2, 0 * sigma, sigma**2]))
+
+
+def _separate(names: list[str], board: Board | None, unit: str | None) -> Correspondences | None:
+    """Read files of numbers: board points X Y Z, unless a board is given, and u v of each view."""
+    tables = [_table(name) for name in names]
+    if tables[0].shape[1] == 3 or board is None:
+        if len(tables) == 1:
+            raise FormatError("holds places alone; give the files of the pixels after it", names[0])
+        places, tables, names = tables[0], tables[1:], names[1:]
+        world = np.zeros((1, len(places), 3))
+        world[0, :, : places.shape[1]] = places
+        ids, stated = None, unit
+    else:
+        world, ids = _of_board(board, len(tables[0]), Field(None, names[0], "the file"))
+        stated = board.unit
+    for name, table in zip(names, tables, strict=True):
+        if table.shape != (world.shape[1], 2):
+            raise FormatError(
+                f"has {len(table)} rows of {table.shape[1]}; give {world.shape[1]} rows of u and v", name
+            )
+    return _assembled(world, np.stack(tables), _stems(names), ids, stated, names[0])
+
+
+def _stems(names: Iterable[str]) -> list[str]:
+    """Names of files without folder and extension; the full names if these are not distinct."""
+    stems = [Path(name).stem for name in names]
+    return stems if len(set(stems)) == len(stems) else list(names)
+
+
+def _table(name: str) -> Array:
+    data, source = read_bytes(name)
+    rows = []
+    for number, line in enumerate(decode(data, source).splitlines(), start=1):
+        words = re.split(r"[\s,;]+", line.strip())
+        if words == [""] or words[0].startswith("#"):
+            continue
+        try:
+            rows.append([float(word) for word in words if word])
+        except ValueError as error:
+            raise FormatError("is not a row of numbers; correct it", source, number) from error
+        if len(rows[-1]) != len(rows[0]) or len(rows[0]) not in (2, 3):
+            raise FormatError("must be a row of 2 numbers or of 3, as all the others", source, number)
+    if not rows:
+        raise FormatError("holds no numbers; give another file", source)
+    return np.array(rows)

@@ -1,0 +1,179 @@
+"""MATLAB's ``.mat`` files with ``cameraParameters`` or ``stereoParameters``, and those of Bouguet's toolbox.
+
+MATLAB counts pixels from 1, so principal points are larger than ours by 1. Its matrices multiply row vectors
+from the right, so K, rotations and translations are transposed; the skew is ``IntrinsicMatrix(2, 1)``.
+Bouguet's ``Calib_Results.mat`` counts from 0, multiplies column vectors, and has the skew as ``alpha_c``.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
+from neurocal_cli.files.mat_file import read_variables
+
+FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
+_STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
+
+
+def read_mat(data: bytes, source: str) -> CameraSet:
+    """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
+    tree = read_variables(data, source)
+    for name in _STRUCTS:
+        if isinstance(tree.get(name), dict):
+            tree = tree[name]
+            break
+    if "fc" in tree:
+        return CameraSet((_bouguet(tree, ""),), (), _bouguet_poses(tree), program="MATLAB")
+    if "fc_left" in tree and "fc_right" in tree:
+        pose = Pose(from_vector(_numbers(tree, "om", 3)), _numbers(tree, "T", 3))
+        return CameraSet((_bouguet(tree, "_left"), _bouguet(tree, "_right")), (pose,), program="MATLAB")
+    if "CameraParameters1" in tree and "CameraParameters2" in tree:
+        R = _numbers(tree, "RotationOfCamera2", 9).reshape(3, 3).T
+        pose = Pose(R, _numbers(tree, "TranslationOfCamera2", 3))
+        parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
+        cameras = _camera(parts[0]), _camera(parts[1])
+        return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
+    if "IntrinsicMatrix" in tree or "K" in tree:
+        return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
+    raise InputError(
+        "holds no camera that can be read; in MATLAB save a struct: "
+        "cameraParams = toStruct(cameraParams); save('camera.mat', 'cameraParams', '-v7')"
+    )
+
+
+def saved(tree: dict[str, Any]) -> bytes:
+    """Write a ``.mat`` file of variables; the same variables give the same file."""
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    savemat(buffer, tree, oned_as="row")
+    # The first 116 bytes are a comment with the current date.
+    return b"MATLAB 5.0 MAT-file, written by neurocal".ljust(116) + buffer.getvalue()[116:]
+
+
+def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
+    if name not in tree:
+        raise InputError(f"the variable {name} is missing; save it as well")
+    try:
+        values = np.asarray(tree[name], dtype=float).ravel()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers; correct it") from error
+    if (count >= 0 and len(values) != count) or not np.isfinite(values).all():
+        raise InputError(f"{name} must be {count} finite numbers, found {len(values)}; correct it")
+    return values
+
+
+def unit_of(tree: dict[str, Any]) -> str | None:
+    """Unit stated in a struct; None if there is none."""
+    unit = tree.get("WorldUnits")
+    return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
+        str(unit), unit if isinstance(unit, str) and unit else None
+    )
+
+
+def _camera(tree: dict[str, Any]) -> Camera:
+    if "IntrinsicMatrix" in tree:
+        K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
+    else:
+        K = _numbers(tree, "K", 9).reshape(3, 3)
+    K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
+    radial = _numbers(tree, "RadialDistortion")
+    tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)
+    k1, k2, k3 = [*radial, 0.0][:3] if len(radial) in (2, 3) else _wrong("RadialDistortion", "2 or 3 numbers")
+    k = np.array([k1, k2, *tangential, k3])
+    size = None
+    if "ImageSize" in tree and np.size(tree["ImageSize"]) == 2:
+        height, width = _numbers(tree, "ImageSize", 2)
+        size = int(width), int(height)
+    model = "plumb_bob" if k3 else "k1k2p1p2" if k.any() else "none"
+    lens = Distortion(model, k[: len(MODELS[model])])
+    return Camera(Intrinsics.from_matrix(K), lens, size)
+
+
+def _wrong(name: str, what: str) -> Any:
+    raise InputError(f"{name} must be {what}; correct it")
+
+
+def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
+    if "RotationMatrices" not in tree or "TranslationVectors" not in tree:
+        return {}
+    R = np.asarray(tree["RotationMatrices"], dtype=float).reshape(3, 3, -1)
+    t = np.asarray(tree["TranslationVectors"], dtype=float).reshape(-1, 3)
+    if R.shape[2] != len(t):
+        _wrong("TranslationVectors", f"{R.shape[2]} rows")
+    names = [str(name).strip() for name in tree.get("ViewNames", [])]
+    if len(names) != len(t):
+        names = [f"{k}" for k in range(1, len(t) + 1)]
+    return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
+
+
+def _bouguet(tree: dict[str, Any], side: str) -> Camera:
+    fx, fy = _numbers(tree, f"fc{side}", 2)
+    cx, cy = _numbers(tree, f"cc{side}", 2)
+    alpha = float(_numbers(tree, f"alpha_c{side}", 1)[0]) if f"alpha_c{side}" in tree else 0.0
+    k = _numbers(tree, f"kc{side}", 5)
+    size = None
+    if "nx" in tree and "ny" in tree:
+        size = int(_numbers(tree, "nx", 1)[0]), int(_numbers(tree, "ny", 1)[0])
+    K = np.array([[fx, alpha * fx, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    lens = Distortion("plumb_bob", k) if k.any() else Distortion()
+    return Camera(Intrinsics.from_matrix(K), lens, size, side.removeprefix("_") or "camera")
+
+
+def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
+    numbers = sorted(
+        int(name[4:]) for name in tree if re.fullmatch(r"omc_\d+", name) and f"Tc_{name[4:]}" in tree
+    )
+    poses = {}
+    for k in numbers:
+        om, t = (np.asarray(tree[f"{name}_{k}"], dtype=float).ravel() for name in ("omc", "Tc"))
+        if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # NaN for images left out
+            poses[f"{k}"] = Pose(from_vector(om), t)
+    return poses
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    structs = [_struct(camera, cameras.unit) for camera in cameras.cameras]
+    if cameras.poses:
+        poses = list(cameras.poses.values())
+        structs[0] |= {
+            "RotationMatrices": np.stack([pose.R.T for pose in poses], axis=2),
+            "TranslationVectors": np.stack([pose.t for pose in poses]),
+            "ViewNames": np.array(list(cameras.poses), dtype=object),
+        }
+    if len(structs) == 1:
+        return {"": saved({"cameraParams": structs[0]})}
+    (pose,) = cameras.relative
+    tree = {
+        "CameraParameters1": structs[0],
+        "CameraParameters2": structs[1],
+        "RotationOfCamera2": pose.R.T,
+        "TranslationOfCamera2": pose.t[None],
+    }
+    return {"": saved({"stereoParams": tree})}
+
+
+def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
+    k1, k2, p1, p2, k3 = np.pad(camera.distortion.coefficients, (0, 5 - len(camera.distortion.coefficients)))
+    K = camera.A + np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
+    width, height = camera.image_size or (0, 0)
+    return {
+        "IntrinsicMatrix": K.T,
+        "RadialDistortion": np.array([[k1, k2, k3] if k3 else [k1, k2]]),
+        "TangentialDistortion": np.array([[p1, p2]]),
+        "ImageSize": np.array([[float(height), float(width)]]),
+        "WorldUnits": unit or "",
+    }
+
+
+FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), _text, skew=True, poses=True, needs_size=True)

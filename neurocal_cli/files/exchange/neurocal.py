@@ -1,0 +1,124 @@
+"""neurocal's own files, for cameras calibrated by neurocal or another program."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.calibration_tree import (
+    calibration_from_field,
+    covariance_from_field,
+    distortion_from_field,
+    intrinsics_from_field,
+    neurocal_block,
+)
+from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.camera_tree import image_size
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.rig_yaml import format_rig, rig_from_field
+from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.observations.points import Correspondences
+
+_UNKNOWN = "unknown"  # unit of lengths if no file states it
+
+
+def from_tree(root: Field, whole: bool) -> CameraSet:
+    """Read a calibration or a rig, with poses and points only if `whole`."""
+    if "neurocal" not in root:
+        if not whole:
+            root.refuse("is a stereo rig; give the file of one camera")
+        return camera_set(rig_from_field(root))
+    if not whole:
+        intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
+        name = root.get("camera_name", "camera").text()
+        camera = Camera(intrinsics, Distortion(model, k), image_size(root), name)
+        return CameraSet((camera,), program="neurocal")
+    return camera_set(calibration_from_field(root))
+
+
+def without_points(root: Field, camera: CameraSet) -> Calibration:
+    """A calibration without its poses and points, from its file and the camera in it."""
+    block = neurocal_block(root)
+    own = covariance_from_field(block, "covariance")
+    names, covariance = own if own[0] else covariance_from_field(block, "given_covariance")
+    undistorted = block["observations"].get("undistorted", "").text() if "observations" in block else ""
+    with value_failures(root.source):
+        points = Correspondences.none(camera.cameras[0].image_size, _UNKNOWN, undistorted)
+    calibration = replace(_calibration(camera, 0), points=points)
+    return replace(calibration, covariance=covariance, covariance_names=names)
+
+
+def camera_set(result: Calibration | Rig) -> CameraSet:
+    """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
+    left = result if isinstance(result, Calibration) else result.left
+    poses = {name: view.pose for name, view in left.views.items()}
+    unit = None if result.unit == _UNKNOWN else result.unit
+    if isinstance(result, Calibration):
+        return CameraSet((result.camera,), (), poses, unit, result, "neurocal")
+    return CameraSet((left.camera, result.right.camera), (result.pose,), poses, unit, result, "neurocal")
+
+
+def as_rig(cameras: CameraSet) -> Rig:
+    """Convert two cameras to a rig; without points unless they come from a rig file of neurocal."""
+    if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
+        return cameras.origin
+    (pose,) = cameras.relative
+    if not pose.t.any():
+        raise InputError(
+            f"the baseline of the rig in {cameras.program}'s file is 0; give the translation between the "
+            "cameras, or the files of the single cameras"
+        )
+    left, right = (_calibration(cameras, k) for k in range(2))
+    unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
+    return Rig(
+        left,
+        right,
+        pose,
+        unknown,
+        np.full((6, 6), np.nan),
+        (),
+        stop_reason=f"from a file of {cameras.program}",
+    )
+
+
+def _calibration(cameras: CameraSet, k: int) -> Calibration:
+    camera = cameras.cameras[k]
+    unit = cameras.unit or _UNKNOWN
+    poses = cameras.poses if k == 0 else {}
+    views = {name: ViewResult(pose, {}, 0, float("nan")) for name, pose in poses.items()}
+    return Calibration(
+        intrinsics=camera.intrinsics,
+        std={},
+        fixed=frozenset(),
+        views=views,
+        points=Correspondences.none(camera.image_size, unit),
+        type=1,
+        method="convert",
+        trainer="none",
+        seed=0,
+        converged=True,
+        stop_reason=f"from a file of {cameras.program}",
+        rmse_px=float("nan"),
+        max_px=float("nan"),
+        distortion_model=camera.distortion.model,
+        distortion=camera.distortion.coefficients,
+        camera_name=camera.name,
+    )
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    if len(cameras.cameras) == 2:
+        return {"": format_rig(as_rig(cameras))}
+    origin = cameras.origin
+    return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
+
+
+FORMAT = Format("neurocal", tuple(MODELS), _text, skew=True, poses=True)

@@ -1,0 +1,130 @@
+"""Read files as bytes or text, with one-line error messages. ``-`` is stdin."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import IO
+
+from neurocal_cli.errors import FormatError, NeurocalError
+from neurocal_cli.files.failures import one_line, reading_failures
+from neurocal_cli.files.outputs import held_back
+
+_WIDE_MARKS = (
+    (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
+    (b"\x00\x00\xfe\xff", "UTF-32"),
+    (b"\xff\xfe", "UTF-16"),
+    (b"\xfe\xff", "UTF-16"),
+)
+# All of stdin within `repeatable_stdin`.
+_KEPT: ContextVar[bytes | None] = ContextVar("stdin", default=None)
+
+
+@contextmanager
+def repeatable_stdin() -> Iterator[None]:
+    """Keep what is read from stdin, so that several readers can look at it in turn."""
+    token = _KEPT.set(read_bytes("-")[0])
+    try:
+        yield
+    finally:
+        _KEPT.reset(token)
+
+
+def read_bytes(path: str | Path) -> tuple[bytes, str]:
+    """Read a whole file, or stdin for ``-``, and its name for messages."""
+    if str(path) == "-":
+        with _stdin_failures():
+            return _stdin().read(), "<stdin>"
+    source = one_line(path)
+    with reading_failures(source), open(path, "rb") as file:
+        _protect(file)
+        return file.read(), source
+
+
+def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
+    """Read a file in blocks of whole lines of about `size` bytes; without line ends it is one block."""
+    if str(path) == "-":
+        with _stdin_failures():
+            yield from _whole_lines(_stdin(), size)
+        return
+    with reading_failures(one_line(path)):
+        file = open(path, "rb")  # noqa: SIM115 - errors of the caller must not count as reading failures
+    _protect(file)
+    with file:
+        blocks = _whole_lines(file, size)
+        while True:
+            with reading_failures(one_line(path)):
+                block = next(blocks, None)
+            if block is None:
+                return
+            yield block
+
+
+def _stdin() -> IO[bytes]:
+    """Stdin, or what was kept of it; the current command may not overwrite its file."""
+    if outputs := held_back():
+        outputs.protect("-")
+    kept = _KEPT.get()
+    return sys.stdin.buffer if kept is None else io.BytesIO(kept)
+
+
+def _protect(file: IO[bytes]) -> None:
+    """Prevent the current command from overwriting a file that it reads."""
+    if outputs := held_back():
+        outputs.protect_status(os.fstat(file.fileno()))
+
+
+def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
+    rest: list[bytes] = []
+    while block := file.read(size):
+        end = block.rfind(b"\n") + 1
+        if end:
+            yield b"".join([*rest, block[:end]])
+            rest = []
+        rest.append(block[end:])
+    if any(rest):
+        yield b"".join(rest)
+
+
+def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
+    """Read a whole UTF-8 file; see `read_bytes` and `decode`."""
+    data, source = read_bytes(path)
+    return decode(data, source, kind), source
+
+
+def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
+    """Decode UTF-8; a message about a binary file names the `kind` that is wanted, and ends in `instead`."""
+    if data.isascii() and b"\0" not in data:
+        return data.decode("ascii")
+    for mark, name in _WIDE_MARKS:
+        if data.startswith(mark):
+            raise FormatError(f"is {name} text; save it as UTF-8", source)
+    if b"\0" in data:
+        # Is it ASCII text with two bytes per character and no byte order mark?
+        head = data[:1000]
+        even, odd = head[::2].count(0), head[1::2].count(0)
+        if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
+            raise FormatError("is UTF-16 text; save it as UTF-8", source)
+        raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise FormatError(
+            f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8", source, line
+        ) from error
+
+
+@contextmanager
+def _stdin_failures() -> Iterator[None]:
+    try:
+        yield
+    except NeurocalError:  # raised by the caller
+        raise
+    except (AttributeError, ValueError, OSError) as error:  # stdin is absent or closed
+        raise FormatError("stdin cannot be read; give a file", "<stdin>") from error

@@ -1,0 +1,214 @@
+"""The points of a calibration, as a block of its file.
+
+The block has a row for each point. In a long file it has each place of the target once, and a row for each
+view, whose numbers are texts: decimals, or packed if PyYAML would take too long to parse the decimals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.points_csv import OPTIONAL, PIXEL, PLACE, value_columns
+from neurocal_cli.files.text_columns import (
+    LONGEST,
+    column_lines,
+    join_ranges,
+    number_words,
+    packed_text,
+    read_columns,
+    read_numbers,
+    read_packed,
+    read_ranges,
+)
+from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.yaml_text import flow, indented, number, quoted
+from neurocal_cli.observations.distances import Distance
+from neurocal_cli.observations.points import Correspondences
+
+_MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
+
+
+def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
+    """Lines of the block ``observations``."""
+    names, blocks = value_columns(points)
+    columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
+    yield "observations:"
+    yield f"  columns: [{', '.join(columns)}]"
+    if points.undistorted:
+        yield f"  undistorted: {points.undistorted}"
+    if points.distances:
+        yield "  distances:  # from, to, length, std"
+        for one in points.distances:
+            ends = f"{quoted(one.start)}, {quoted(one.end)}"
+            yield f"    - [{ends}, {number(one.length)}, {number(one.std)}]"
+    if len(points) == 0:
+        yield "  rows: []"
+    elif long:
+        yield from indented(_long_lines(points, np.hstack(blocks)))
+    else:
+        yield "  rows:"
+        yield from _rows(points, np.hstack([points.world, *blocks]))
+
+
+def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
+    # OpenCV's FileStorage requires rows to be indented more than their key.
+    heads = [f"    - [{quoted(name)}, " for name in points.view_names]
+    heads = [heads[k] for k in points.view_index.tolist()]
+    if points.point is not None:
+        labels = np.asarray(points.point).tolist()
+        ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
+        heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
+    return map(add, heads, flow(numbers)[2:-1].split(", ["))
+
+
+def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
+    place, first = _places(points)
+    labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
+    coordinates = {name: points.world[first, k] for k, name in enumerate(PLACE)}
+    yield "places:  # each place of the target once; its columns"
+    yield from indented(column_lines({**labels, **coordinates}))
+    words = [number_words(column) for column in values.T]
+    characters = sum(len(word) + 1 for column in words for word in column)
+    packed = characters > _MOST_CHARACTERS
+    if packed:
+        yield "numbers: packed"
+    yield "views:  # name, its points among the places, and a text for each of the columns that follow Z"
+    if packed:
+        yield "  # np.frombuffer(text.encode('utf-32-le'), '<u4').astype('<u2').view('<f8')"
+    starts = np.flatnonzero(np.diff(points.view_index, prepend=-1))
+    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(points)], strict=True):
+        name = quoted(points.view_names[points.view_index[start]])
+        for k in range(start, end, LONGEST):
+            rows = slice(k, min(k + LONGEST, end))
+            if packed:
+                texts = [packed_text(column) for column in values[rows].T]
+            else:
+                texts = [f"'{','.join(column[rows])}'" for column in words]
+            yield f"    - [{name}, {', '.join([repr(join_ranges(place[rows])), *texts])}]"
+
+
+def _places(points: Correspondences) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Index of each row's place among the distinct places, and the first row of each place."""
+    bits = np.ascontiguousarray(points.world).view(np.dtype((np.void, 24))).ravel().tolist()
+    keys = bits if points.point is None else list(zip(bits, np.asarray(points.point).tolist(), strict=True))
+    number: dict[Any, int] = {}
+    place = np.array([number.setdefault(key, len(number)) for key in keys], dtype=np.int64)
+    return place, np.unique(place, return_index=True)[1]
+
+
+def read_observations(
+    observations: Field,
+    unit: str,
+    image_size: tuple[int, int] | None,
+    image_center: tuple[float, float] | None,
+    none: bool,
+) -> Correspondences:
+    """Read the block ``observations`` in either form; it may be empty if `none`."""
+    if "places" in observations:
+        columns, stands = _long_columns(observations), f"{observations.path}.views"
+    else:
+        columns, stands = _row_columns(observations), f"{observations.path}.rows"
+    if none and not columns:  # a camera from a zoom lens
+        return Correspondences.none(image_size, unit)
+    if not columns:
+        observations["rows"].fail("at least one row")
+
+    def numbers(names: tuple[str, ...]) -> Array:
+        fields = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
+        return np.column_stack([field.array(-1) for field in fields])
+
+    labels = {
+        name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
+    }
+    with value_failures(""):
+        world, pixels = numbers(PLACE), numbers(PIXEL)
+        known: dict[str, Any] = {
+            attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
+        }
+        return Correspondences(
+            world,
+            pixels,
+            view=labels.get("view"),
+            point=labels.get("point"),
+            **known,
+            distances=_distances(observations.get("distances", [])),
+            undistorted=observations.get("undistorted", "").text(),
+            image_size=image_size,
+            image_center=image_center,
+            unit=unit,
+            source=observations.source,
+        )
+
+
+def _distances(field: Field) -> tuple[Distance, ...]:
+    found = []
+    for row in field.items():
+        cells = list(row.items())
+        if len(cells) != len(fields(Distance)):
+            row.fail("a list of from, to, length, std")
+        start, end, length, std = cells
+        found.append(Distance(start.text(), end.text(), length.number(), std.number()))
+    return tuple(found)
+
+
+def _names(observations: Field) -> list[str]:
+    names = observations["columns"].texts()
+    missing = [name for name in (*PLACE, *PIXEL) if name not in names]
+    if missing or len(set(names)) < len(names):
+        observations["columns"].fail("a list of different names with X, Y, Z, u, v among them")
+    return names
+
+
+def _row_columns(observations: Field) -> dict[str, list[Any]]:
+    """Turn the table into columns by name."""
+    names = _names(observations)
+    rows = observations["rows"]
+    if not isinstance(rows.value, list):
+        rows.fail("a list of rows")
+    for k, row in enumerate(rows.value):
+        if type(row) is not list or len(row) != len(names):
+            Field(row, rows.source, f"{rows.path}[{k}]").fail(f"a list of {len(names)} values")
+    return dict(zip(names, map(list, zip(*rows.value, strict=True)), strict=True)) if rows.value else {}
+
+
+def _long_columns(observations: Field) -> dict[str, list[Any]]:
+    names = _names(observations)
+    places = read_columns(observations["places"], frozenset(("point",)))
+    measured = [name for name in names if name not in places and name != "view"]
+    packed = "numbers" in observations
+    if packed and observations["numbers"].text() != "packed":
+        observations["numbers"].fail("packed, or not there")
+    if set(places) - {"point"} != set(PLACE) or "view" not in names:
+        observations["places"].fail("the columns X, Y, Z and point, if the points have names")
+    columns: dict[str, list[Any]] = {name: [] for name in names}
+    for entry in observations["views"].items():
+        view, where, *texts = entry.items() if len(entry.value) == len(measured) + 2 else [entry] * 2
+        if len(texts) != len(measured):
+            entry.fail(f"a list of {len(measured) + 2} texts")
+        rows = read_ranges(where, len(places["X"]))
+        columns["view"] += [view.text()] * len(rows)
+        for name, values in places.items():
+            columns[name] += [values[row] for row in rows]
+        for name, text in zip(measured, texts, strict=True):
+            numbers = read_packed(text) if packed else read_numbers([text])
+            if len(numbers) != len(rows):
+                text.fail(f"{len(rows)} numbers")
+            columns[name] += numbers
+    return columns if columns["view"] else {}
+
+
+def _labels(labels: list[Any], observations: Field, name: str) -> list[str]:
+    if set(map(type, labels)) <= {str}:
+        return labels
+    return [
+        Field(label, observations.source, f"{observations.path}.rows[{k}], {name},").text()
+        for k, label in enumerate(labels)
+    ]

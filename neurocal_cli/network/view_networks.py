@@ -1,0 +1,147 @@
+"""Stage 1: each view's network learns its product W V from random weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.adjustment.solution import TrainingRecord
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.network.network import Patterns, residual_jacobian
+from neurocal_cli.network.options import MOST_POINTS, Options
+from neurocal_cli.network.starts import learn
+from neurocal_cli.network.trainers import Task
+
+# Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
+_NO_CONDITION = 1e-13
+_SMALL = 1500  # number of patterns below which subsampling saves no time (tests/benchmarks/test_speed.py)
+
+
+@frozen_dataclass(eq=False)
+class Group:
+    """Views of one kind, flat or solid, with their trained networks."""
+
+    views: NDArray[np.intp]  # (K,) indices
+    flat: bool
+    product: Array  # (K, 3, I) W V; for flat views in the coordinates of the view's own plane
+    bound: Array  # (K,) squared pixel error of the free networks, a lower bound for that of any camera
+    patterns: Patterns | None = None  # on which they were trained, at most `MOST_POINTS` of each view
+
+
+def begin_flat(problem: Problem) -> NDArray[np.bool_]:
+    """(V,) which views' networks treat their target as a plane.
+
+    With other views or given intrinsics, a nearly flat target is best treated as flat at first; bundle
+    adjustment uses all its coordinates.
+    """
+    views = problem.views
+    helped = views.n_views > 1 or problem.type == 3
+    return views.nearly_flat if helped else views.exactly_flat
+
+
+def train_networks(
+    problem: Problem, options: Options, rng: np.random.Generator, which: NDArray[np.bool_]
+) -> tuple[list[Group], TrainingRecord]:
+    """Train the networks of some views (V,) from random weights, flat and solid targets separately."""
+    options.progress("training the networks", 0.0)
+    flat = begin_flat(problem)
+    groups, record = [], TrainingRecord.empty(problem.views.n_views)
+    for kind in (True, False):
+        members = np.flatnonzero(which & (flat == kind))
+        if members.size:
+            group, record = _train_group(problem, options, rng, members, kind, record)
+            groups.append(group)
+    options.progress("training the networks", 1.0)
+    return groups, record
+
+
+def _train_group(
+    problem: Problem,
+    options: Options,
+    rng: np.random.Generator,
+    members: NDArray[np.intp],
+    flat: bool,
+    record: TrainingRecord,
+) -> tuple[Group, TrainingRecord]:
+    views = problem.views
+    every = views.patterns(members, flat, MOST_POINTS)
+    small = every.weights.size <= _SMALL
+    some = every if small else views.patterns(members, flat, options.start_points[0 if flat else 1], rng)
+    W = _given_weights(problem)
+    learnt = learn(some, options.trainer, rng, options.starts, options.agreement, W=W)
+    iterations = learnt.iterations
+    if options.finish is not None and not small:
+        free = np.ones((3, 3), dtype=bool), np.ones((3, every.n_inputs), dtype=bool)
+        trained = options.finish(Task(every, learnt.W, learnt.V, *free))
+        learnt = replace(learnt, W=trained.W, V=trained.V, rms=every.rms(trained.loss))
+        iterations += int(trained.iterations.sum())
+    record = record.with_starts(members, learnt.agreed, int(learnt.starts.sum()), iterations)
+    record = replace(
+        record,
+        squares=record.squares + float((learnt.rms**2 * views.counts[members]).sum()),
+        curve=learnt.curve if members[0] == 0 else record.curve,
+    )
+    bound = _pixel_error(problem, members, flat, learnt.product, every)
+    return Group(members, flat, learnt.product, bound, every), record
+
+
+def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
+    """Refuse a single view whose points lie nearly all in one plane: raise DegenerateGeometryError.
+
+    Any number of points of a plane gives 8 conditions on the product W V, and each point off the plane 2
+    more, up to 11. With no more conditions than unknowns, other cameras fit equally well.
+    """
+    if problem.views.n_views > 1 or groups[0].flat:
+        return
+    patterns = problem.views.patterns(np.array([0]), False, MOST_POINTS)
+    product = groups[0].product
+    _, J = residual_jacobian(np.eye(3)[None], product / np.linalg.norm(product), patterns)
+    J = J.reshape(-1, 12)
+    values = np.linalg.eigvalsh(J.T @ J)
+    conditions = int((values > _NO_CONDITION * values[-1]).sum())
+    unknowns = int(problem.free.sum()) + 6
+    if conditions < 11 and conditions <= unknowns:
+        raise DegenerateGeometryError(
+            f"view {problem.views.names[0]!r}: nearly all points lie in one plane, which gives {conditions} "
+            f"conditions for {unknowns} unknowns; give more points off the plane, or known parameters "
+            "(--type 2, --no-skew)"
+        )
+
+
+def _given_weights(problem: Problem) -> Array | None:
+    """W as far as the problem type gives it, nan elsewhere; for trainers that move W and V themselves."""
+    if problem.type == 1:
+        return None
+    if problem.type == 3:
+        return intrinsic_matrix(problem.normalised_entries)
+    W = np.full((3, 3), np.nan)
+    W[:2, 2] = problem.normalised_entries[3:]
+    return W
+
+
+def _pixel_error(
+    problem: Problem, members: NDArray[np.intp], flat: bool, product: Array, every: Patterns
+) -> Array:
+    """Squared pixel error of each view's free network over all its points; (K,)."""
+    counts = problem.views.counts[members]
+    if counts.max() <= every.weights.shape[1]:
+        return _squared_error(product, every)
+    # The patterns of a large view are a subsample, but the bound must cover all of its points.
+    total = np.empty(len(members))
+    for k, count in enumerate(counts):
+        whole = problem.views.patterns(members[k : k + 1], flat, int(count))
+        total[k] = _squared_error(product[k : k + 1], whole)[0]
+    return total
+
+
+def _squared_error(product: Array, patterns: Patterns) -> Array:
+    o = patterns.inputs @ np.swapaxes(product, 1, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = ((o[..., :2] / o[..., 2:] - patterns.targets[..., :2]) ** 2).sum(-1)
+    return np.where(patterns.weights > 0, patterns.weights * error, 0.0).sum(axis=1)

@@ -1,0 +1,238 @@
+"""Chessboard targets: where the vertices and the mid-points of their edges lie in the world.
+
+A plane has cols x rows inner vertices. Vertex (c, r) is ``origin + c square x_axis + r square y_axis``.
+The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway from (c, r) to
+(c + 1, r), ``v:c:r`` halfway from (c, r) to (c, r + 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.distances import Distance, Scale, fitted_scale, grid_place
+
+Triple = tuple[float, float, float]
+
+_AXIS_TOLERANCE = 1e-6
+_FEWEST_MEASURED = 4  # places that determine a plane's bend
+_MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error would need gigabytes
+
+
+@frozen_dataclass
+class Plane:
+    """One flat chessboard; an InputError about a value out of range begins with its name.
+
+    `name` is the prefix of the point ids, and may be empty for the only plane of a board. Points that are not
+    `measured` are at their nominal positions.
+    """
+
+    name: str
+    cols: int  # inner vertices along x_axis
+    rows: int  # and along y_axis
+    square: float  # side of a square [world unit]
+    origin: Triple = (0.0, 0.0, 0.0)  # vertex (0, 0) [world unit]
+    x_axis: Triple = (1.0, 0.0, 0.0)
+    y_axis: Triple = (0.0, 1.0, 0.0)  # unit vectors, perpendicular to each other
+    measured: tuple[tuple[float, ...], ...] = ()  # c, r [squares] and X, Y, Z of points
+
+    def __post_init__(self) -> None:
+        name = self.name
+        if not isinstance(name, str):
+            raise InputError(f"name must be text, found {name!r}")
+        if name != name.strip() or not name.isprintable() or "/" in name:
+            raise InputError(
+                f"name must be printable, without '/' and outer blanks, found {name!r}; rename it"
+            )
+        for count in ("cols", "rows"):
+            object.__setattr__(self, count, _count(count, getattr(self, count)))
+        square = _numbers("square", self.square, ())
+        if square <= 0:
+            raise InputError(f"square must be a positive length, found {square:g}")
+        object.__setattr__(self, "square", float(square))
+        for vector in ("origin", "x_axis", "y_axis"):
+            value = _numbers(vector, getattr(self, vector), (3,))
+            object.__setattr__(self, vector, tuple(value.tolist()))
+        self._check_axes()
+        rows = tuple(tuple(_numbers("points", row, (5,)).tolist()) for row in self.measured)
+        if rows and len({row[:2] for row in rows}) < max(len(rows), _FEWEST_MEASURED):
+            raise InputError(
+                f"points must name {_FEWEST_MEASURED} or more different places (c, r); correct them"
+            )
+        object.__setattr__(self, "measured", rows)
+
+    @property
+    def prefix(self) -> str:
+        """What the ids of the plane's points begin with: ``name/``, or nothing without a name."""
+        return f"{self.name}/" if self.name else ""
+
+    @property
+    def normal(self) -> Array:
+        """(3,) array: x_axis x y_axis."""
+        return np.cross(self.x_axis, self.y_axis)
+
+    def at(self, grid: ArrayLike) -> Array:
+        """World coordinates (..., 3) of places (..., 2) along the axes, in squares from the first vertex."""
+        lengths = self.square * np.asarray(grid, dtype=float)
+        return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
+
+    def truly_at(self, grid: ArrayLike) -> Array:
+        """True world coordinates (N, 3) of places (N, 2) [squares]: measured, else by a thin-plate spline."""
+        world = self.at(grid)
+        if not self.measured:
+            return world
+        known = np.array(self.measured)
+        return world + smooth_between(known[:, :2], known[:, 2:] - self.at(known[:, :2]), np.asarray(grid))
+
+    def rescaled(self, factor: float) -> Plane:
+        """The same plane with all lengths multiplied by a factor, around the world's origin."""
+        if factor == 1.0:
+            return self
+        x, y, z = (factor * value for value in self.origin)
+        measured = tuple((c, r, *(factor * value for value in place)) for c, r, *place in self.measured)
+        return replace(self, square=factor * self.square, origin=(x, y, z), measured=measured)
+
+    def vertices(self) -> Array:
+        """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""
+        c, r = np.meshgrid(np.arange(self.cols), np.arange(self.rows))
+        return self.at(np.stack([c, r], axis=-1))
+
+    def vertex_ids(self) -> tuple[str, ...]:
+        """Ids of the vertices, ``[plane/]c:r``, row by row."""
+        return tuple(f"{self.prefix}{c}:{r}" for r in range(self.rows) for c in range(self.cols))
+
+    def midpoint_grid(self) -> Array:
+        """Grid coordinates (N, 2) [squares] of the mid-points, all of ``h`` row by row and then all of ``v``.
+
+        (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``; N = (cols - 1) rows + cols (rows - 1).
+        """
+        c, r = np.meshgrid(np.arange(self.cols - 1) + 0.5, np.arange(self.rows))
+        along_x = np.stack([c, r], axis=-1).reshape(-1, 2)
+        c, r = np.meshgrid(np.arange(self.cols), np.arange(self.rows - 1) + 0.5)
+        return np.concatenate([along_x, np.stack([c, r], axis=-1).reshape(-1, 2)])
+
+    def midpoint_ids(self) -> tuple[str, ...]:
+        """Ids of the mid-points in the order of `midpoint_grid`."""
+        along_x = [f"{self.prefix}h:{c}:{r}" for r in range(self.rows) for c in range(self.cols - 1)]
+        along_y = [f"{self.prefix}v:{c}:{r}" for r in range(self.rows - 1) for c in range(self.cols)]
+        return (*along_x, *along_y)
+
+    def midpoints(self) -> tuple[tuple[str, ...], Array]:
+        """Ids (N) and world coordinates (N, 3) [world unit] of the mid-points; see `midpoint_grid`."""
+        return self.midpoint_ids(), self.at(self.midpoint_grid())
+
+    def _check_axes(self) -> None:
+        x, y = np.array(self.x_axis), np.array(self.y_axis)
+        for name, axis in (("x_axis", x), ("y_axis", y)):
+            length = float(np.linalg.norm(axis))
+            if abs(length - 1) > _AXIS_TOLERANCE:
+                raise InputError(f"{name} must have the length 1, found {length:.9g}; divide it by that")
+        if abs(float(x @ y)) > _AXIS_TOLERANCE:
+            raise InputError(
+                f"x_axis and y_axis must be perpendicular, found the cosine {float(x @ y):.3g} between them"
+            )
+
+
+@frozen_dataclass
+class Board:
+    """A calibration target of one or several flat chessboards.
+
+    Parameters
+    ----------
+    planes : Planes, at least one
+        Several of them need names, all different.
+    unit : str
+        Of all lengths.
+    distances : tuple of Distance
+        Measured on the board; they determine its scale.
+
+    Raises
+    ------
+    InputError
+        No plane, names that are missing or the same, a distance to another board.
+    """
+
+    planes: tuple[Plane, ...]
+    unit: str = "mm"
+    distances: tuple[Distance, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "planes", tuple(self.planes))
+        if not self.planes:
+            raise InputError("a board needs at least one plane")
+        names = [plane.name for plane in self.planes]
+        if len(names) > 1 and "" in names:
+            raise InputError("a board of several planes needs a name for each of them")
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise InputError(f"two planes have the name {doubled[0]!r}; rename one")
+        for one in self.distances:
+            for label in (one.start, one.end):
+                self.place(label)
+
+    @classmethod
+    def single(cls, cols: int, rows: int, square: float, unit: str = "mm") -> Board:
+        """Board of one plane without a name, at the world's origin."""
+        return cls((Plane("", cols, rows, square),), unit)
+
+    def place(self, label: str) -> Array:
+        """True world coordinates (3,) of a vertex ``[plane/]c:r``; c and r may be any numbers.
+
+        Raises
+        ------
+        InputError
+            No such place.
+        """
+        name, c, r = grid_place(label)
+        plane = self.planes[0] if not name and len(self.planes) == 1 else self.plane(name)
+        return np.asarray(plane.truly_at(np.array([[c, r]]))[0])
+
+    @property
+    def scale(self) -> Scale:
+        """The scale from the measured distances."""
+        return fitted_scale(self.place, self.distances)
+
+    def as_measured(self) -> Board:
+        """The board scaled to its measured distances."""
+        factor = self.scale.factor
+        return replace(self, planes=tuple(plane.rescaled(factor) for plane in self.planes))
+
+    def plane(self, name: str) -> Plane:
+        """The plane with a name; an InputError if there is none."""
+        named = {plane.name: plane for plane in self.planes}
+        if name not in named:
+            raise InputError(f"the board has no plane {name!r}; it has {list(named)}")
+        return named[name]
+
+
+def smooth_between(places: Array, values: Array, at: Array) -> Array:
+    """The thin-plate spline through values (n, 3) at places (n, 2), elsewhere (N, 2)."""
+    from scipy.interpolate import RBFInterpolator
+
+    return np.asarray(RBFInterpolator(places, values)(at))
+
+
+def _count(name: str, value: object) -> int:
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or not 2 <= int(value) <= _MOST_VERTICES:  # type: ignore[call-overload]
+        raise InputError(
+            f"{name} counts inner vertices and must be a whole number from 2 to {_MOST_VERTICES}, "
+            f"found {value!r}"
+        )
+    return int(value)  # type: ignore[call-overload]
+
+
+def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    words = "a finite number" if shape == () else f"{shape[0]} finite numbers"
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be {words}, found {value!r}") from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{name} must be {words}, found {value!r}")
+    return array

@@ -1,0 +1,326 @@
+"""`Correspondences`, the input of a calibration: known world points and their pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import checked_size, real_array
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.distances import Distance
+
+UNDISTORTED = ("plane", "cylinder", "equirectangular")
+"""Shapes that undistorted pixels are projected on."""
+
+_ONLY_VIEW = "view"  # name of the single view if the points name none
+_LARGEST = 1e100  # largest coordinate, so that squares do not overflow
+_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z, as a share of the target's size
+
+
+@frozen_dataclass(eq=False)
+class Correspondences:
+    """World points and their pixels, grouped by view.
+
+    Parameters
+    ----------
+    world : (N, 3) array
+        X, Y, Z in the world's unit.
+    pixels : (N, 2) array [px]
+        u, v; the centre of the top-left pixel is (0, 0).
+    view : (N,) labels, optional
+        The image that each row belongs to; None: all rows are one view.
+    image_size : (width, height), optional [px]
+    image_center : (u0, v0), optional [px]
+        The image centre as given with the data, for type 2.
+    point : (N,) labels, optional
+        An id that is the same for the same physical point in all images, and occurs once in each.
+    covariance : (N, 3) array, optional [px^2]
+        Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
+        noise level itself is estimated from the residuals.
+    across : (N, 2) array, optional
+        Direction in the image in which each point was measured, of any length; (0, 0) for points measured in
+        both directions. In the other direction the position was interpolated from other points of the view,
+        such as that of a mid-point along its edge. None: all were measured in both.
+    unit : str
+        Of the world coordinates.
+    source : str
+        Name of the file or source, for messages.
+    lines : (N,) int array, optional
+        Line of each row in its file, for messages.
+    sources : dict of str by view, optional
+        The file of each view where several files were read, for messages.
+    world_std : (N, 3) array, optional [world unit]
+        Standard deviation of each world point's X, Y and Z, as a survey states it; 0 means exact. It must be
+        the same for a world point in all views. All zero is None.
+    distances : tuple of Distance
+        Distances measured on the points' board; they determine its scale.
+    undistorted : str
+        The shape, one of `UNDISTORTED`, that the pixels were projected on when they were undistorted. Empty:
+        they are those of the image, as far as is known.
+
+    Attributes
+    ----------
+    view_names : tuple of str
+        In order of first appearance.
+    view_index : (N,) int array
+        Position of each row's view in `view_names`.
+
+    Raises
+    ------
+    InputError
+        Shapes do not match, there are no rows, a number is not real and finite (or beyond 1e100), a view has
+        a point twice, or a covariance is not positive definite.
+    """
+
+    world: Array
+    pixels: Array
+    view: NDArray[Any] | Sequence[Any] | None = None
+    image_size: tuple[int, int] | None = None
+    image_center: tuple[float, float] | None = None
+    point: NDArray[Any] | Sequence[Any] | None = None
+    covariance: Array | None = None
+    across: Array | None = None
+    unit: str = "mm"
+    source: str = "points"
+    lines: NDArray[np.int64] | None = None
+    sources: Mapping[str, str] | None = None
+    world_std: Array | None = None
+    distances: tuple[Distance, ...] = ()
+    undistorted: str = ""
+    view_names: tuple[str, ...] = field(init=False)
+    view_index: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        world = _matrix("world", self.world, 3)
+        pixels = _matrix("pixels", self.pixels, 2)
+        n = len(world)
+        if len(pixels) != n:
+            raise InputError(
+                f"{self.source}: {n} world points but {len(pixels)} pixels; give one pixel a point"
+            )
+        if n == 0:
+            raise InputError(f"{self.source}: there are no points; give at least one row of X,Y,Z,u,v")
+        self._set(world=_frozen(world), pixels=_frozen(pixels))
+        for name in ("view", "point", "lines"):
+            labels = getattr(self, name)
+            if labels is not None:
+                if not isinstance(labels, np.ndarray) or labels.flags.writeable:
+                    labels = np.array(labels)  # a copy: it is made read-only
+                if labels.shape != (n,):
+                    raise InputError(f"{self.source}: {name} needs one entry for each of the {n} points")
+                self._set(**{name: _frozen(labels)})
+        self._check_finite()
+        names, index = _factorise(self.view, n)
+        self._set(view_names=names, view_index=_frozen(index))
+        if self.point is not None:
+            self._check_ids(np.asarray(self.point))
+        if self.covariance is not None:
+            self._check_covariance(_matrix("covariance", self.covariance, 3))
+        if self.distances and self.point is None:
+            raise InputError(
+                f"{self.source}: distances are between points with ids; add the column point, or leave the "
+                "distances out"
+            )
+        if self.world_std is not None:
+            self._check_world_std(_matrix("world_std", self.world_std, 3))
+        if self.across is not None:
+            self._check_across(_matrix("across", self.across, 2))
+        if self.image_size is not None:
+            self._set(image_size=checked_size(self.image_size))
+        if self.image_center is not None:
+            centre = real_array("image_center", self.image_center)
+            if centre.shape != (2,) or not np.isfinite(centre).all():
+                raise InputError(f"{self.source}: image_center must be two finite numbers")
+            self._set(image_center=tuple(centre.tolist()))
+        if self.undistorted and self.undistorted not in UNDISTORTED:
+            raise InputError(f"{self.source}: undistorted must be one of {', '.join(UNDISTORTED)}, or empty")
+
+    @classmethod
+    def none(
+        cls, image_size: tuple[int, int] | None = None, unit: str = "mm", undistorted: str = ""
+    ) -> Correspondences:
+        """Empty correspondences, for a camera without points of its own."""
+        known: dict[str, Any] = {"image_size": image_size, "unit": unit, "undistorted": undistorted}
+        empty = cls(np.zeros((1, 3)), np.zeros((1, 2)), **known)
+        empty._set(world=_frozen(np.zeros((0, 3))), pixels=_frozen(np.zeros((0, 2))))
+        empty._set(view_names=(), view_index=_frozen(np.zeros(0, dtype=np.int64)))
+        return empty
+
+    def __len__(self) -> int:
+        return len(self.world)
+
+    @property
+    def n_points(self) -> int:
+        """Number of rows."""
+        return len(self.world)
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.view_names)
+
+    def place(self, row: int) -> str:
+        """Origin of a row, as ``file:line`` or ``points, row 7``."""
+        if self.lines is not None:
+            source = self.source
+            if self.sources is not None and self.view is not None:
+                source = self.sources.get(str(self.view[row]), source)
+            return f"{source}:{int(self.lines[row])}"
+        return f"{self.source}, row {row + 1}"
+
+    def of_few_views(self, most: int) -> Correspondences:
+        """The points of at most `most` views, evenly spaced among all."""
+        if self.n_views <= most:
+            return self
+        return self.select(np.isin(self.view_index, np.linspace(0, self.n_views - 1, most).round()))
+
+    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
+        """The same data restricted to some rows (a mask, indices or a slice)."""
+
+        def pick(values: Any) -> Any:
+            return None if values is None else np.asarray(values)[rows]
+
+        by_row = ("world", "pixels", "view", "point", "covariance", "world_std", "across", "lines")
+        return replace(self, **{name: pick(getattr(self, name)) for name in by_row})
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _refuse_row(self, good: NDArray[np.bool_], problem: str) -> None:
+        """Refuse the first row that is not good."""
+        if not good.all():
+            raise InputError(f"{self.place(int(np.argmin(good)))}: {problem}; correct or remove the row")
+
+    def _check_finite(self) -> None:
+        for name, values in (("X,Y,Z", self.world), ("u,v", self.pixels)):
+            if values.min() >= -_LARGEST and values.max() <= _LARGEST:  # False for nan, 20 times faster
+                continue
+            good = np.abs(values).max(axis=1) <= _LARGEST  # False for nan as well
+            found = ", ".join(f"{x:g}" for x in values[np.argmin(good)])
+            self._refuse_row(good, f"{name} must be finite numbers of a sensible size, found {found}")
+        if 0 < max(-self.world.min(), self.world.max()) < 1 / _LARGEST:
+            raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
+
+    def _check_ids(self, ids: NDArray[Any]) -> None:
+        repeat = _first_repeat(self.view_index, ids)
+        if repeat is None:
+            return
+        row, earlier = repeat
+        where = f"in row {earlier + 1}" if self.lines is None else f"on line {self.lines[earlier]}"
+        view = "" if self.view is None else f" in the view {self.view_names[self.view_index[row]][:60]!r}"
+        raise InputError(
+            f"{self.place(row)}: the point {str(ids[row])[:60]!r} is already {where}{view}; remove one of "
+            "the rows"
+        )
+
+    def _check_covariance(self, covariance: Array) -> None:
+        self._check_length("covariance", covariance)
+        suu, suv, svv = covariance.T
+        with np.errstate(over="ignore", invalid="ignore"):
+            good = (suu > 0) & (svv > 0) & (suu * svv > suv * suv) & (suu * svv < np.inf)
+        self._refuse_row(
+            np.asarray(good), "the pixel's covariance (sigma, or suu,suv,svv) must be positive definite"
+        )
+        self._set(covariance=_frozen(covariance))
+
+    def _check_world_std(self, std: Array) -> None:
+        good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
+        problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
+        self._set_rows("world_std", std, good, problem)
+
+    def _check_across(self, across: Array) -> None:
+        good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
+        problem = "the direction nu,nv in which the point was measured must be two finite numbers"
+        self._set_rows("across", across, good, problem)
+
+    def _check_length(self, name: str, values: Array) -> None:
+        if len(values) != len(self.world):
+            raise InputError(f"{self.source}: {name} needs one row for each of the {len(self.world)} points")
+
+    def _set_rows(self, name: str, values: Array, good: NDArray[np.bool_], problem: str) -> None:
+        """Set values of all points, unless all are zero."""
+        self._check_length(name, values)
+        self._refuse_row(good, problem)
+        self._set(**{name: _frozen(values) if values.any() else None})
+
+
+def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
+    array = real_array(name, values)
+    # Copy the array, unless nobody else can write to it: it may have a million rows.
+    if not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None:
+        array = array.copy()
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise InputError(f"{name} must have the shape (N, {columns}), found {array.shape}")
+    return array
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array
+
+
+def _factorise(
+    labels: NDArray[Any] | Sequence[Any] | None, n: int
+) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+    """Names in order of first appearance and each row's position among them.
+
+    Rows of a view are mostly consecutive, so only the first row of each run is sorted.
+    """
+    if labels is None:
+        return (_ONLY_VIEW,), np.zeros(n, dtype=np.int64)
+    labels = np.asarray(labels)
+    starts = np.flatnonzero(np.concatenate([[True], labels[1:] != labels[:-1]]))
+    try:
+        distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
+    except TypeError as error:
+        raise InputError("the views' labels must be all text or all numbers") from error
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    run_lengths = np.diff(np.concatenate([starts, [n]]))
+    return tuple(str(distinct[k]) for k in order), np.repeat(rank[inverse.ravel()], run_lengths)
+
+
+def _first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the first row whose id occurred in its view before, and that earlier row, if there is one."""
+    ids = ids.astype(str, copy=False)
+    hashes = _hashes(view, ids)
+    ordered = np.sort(hashes)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(repeated) == 0:  # nearly always; comparing a million labels directly would take seconds
+        return None
+    seen: dict[tuple[int, str], int] = {}
+    for row in np.flatnonzero(np.isin(hashes, repeated)).tolist():
+        earlier = seen.setdefault((int(view[row]), str(ids[row])), row)
+        if earlier != row:
+            return row, earlier
+    return None
+
+
+def first_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
+    """Find the first row whose id had another place before, and the first row of that id, if there is one."""
+    hashes = _hashes(np.zeros(len(ids), dtype=np.int64), ids.astype(str, copy=False))
+    _, first, point = np.unique(hashes, return_index=True, return_inverse=True)
+    earlier = first[point.reshape(-1)]
+    moved = np.abs(world - world[earlier]).max(axis=1) > _SAME_PLACE * np.ptp(world, axis=0).max()
+    if not moved.any():
+        return None
+    row = int(np.argmax(moved))
+    return row, int(earlier[row])
+
+
+def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:
+    """Hash each row to 64 bits, with FNV-1a over the view and the characters of the id."""
+    hashes = np.uint64(0xCBF29CE484222325) ^ view.astype(np.uint64)
+    characters = np.ascontiguousarray(ids).view(np.uint32).reshape(len(ids), -1)
+    for k in range(characters.shape[1]):
+        hashes *= np.uint64(0x100000001B3)
+        hashes ^= characters[:, k]
+    return hashes

@@ -1,0 +1,179 @@
+"""A board on a sheet of paper: squares, folds, rulers and a line of text, in millimetres.
+
+The square between vertices (0, 0) and (1, 1) is black. That is where detection, like OpenCV, begins to count.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.unfolding import Laid, unfolded
+
+# Width and height [mm], upright.
+PAPERS = {
+    "A0": (841.0, 1189.0),
+    "A1": (594.0, 841.0),
+    "A2": (420.0, 594.0),
+    "A3": (297.0, 420.0),
+    "A4": (210.0, 297.0),
+    "A5": (148.0, 210.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}
+_MILLIMETRES = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0, "inch": 25.4, "in": 25.4}
+
+_EDGE = 5.0  # that printers leave white [mm]
+_QUIET = 5.0  # white around the pattern, to rulers and edge [mm]
+_RULER = 9.0  # room for a ruler with its numbers [mm]
+_TICK = 10.0  # between the marks of a ruler [mm]
+_LONGEST = 200.0  # ruler [mm]
+_COLS, _ROWS = 9, 6  # of the board that is made without being asked for: one count is odd, one even
+
+
+@frozen_dataclass(eq=False)
+class Line:
+    """A thin line; ends (2,) in mm."""
+
+    start: Array
+    end: Array
+    width: float = 0.2
+    dashed: bool = False
+
+
+@frozen_dataclass(eq=False)
+class Text:
+    """A text whose base line begins, or whose middle is, at a place (2,) in mm."""
+
+    place: Array
+    content: str
+    size: float = 3.0
+    middle: bool = False
+
+
+@frozen_dataclass(eq=False)
+class Sheet:
+    """What is printed, in mm; the origin is the paper's top-left corner, y is downwards."""
+
+    width: float
+    height: float
+    squares: Array  # (N, 4, 2) corners of the black squares and parts of squares
+    lines: tuple[Line, ...]
+    texts: tuple[Text, ...]
+    laid: tuple[Laid, ...]  # the planes in the board's unit, before they were scaled and moved
+    scale: float  # mm of a unit of the board
+    origin: Array  # (2,) where the origin of `laid` is on the paper
+
+
+def millimetres(unit: str) -> float:
+    """Millimetres of one unit."""
+    if unit not in _MILLIMETRES:
+        raise InputError(f"the unit {unit[:20]!r} is no known length; use one of {', '.join(_MILLIMETRES)}")
+    return _MILLIMETRES[unit]
+
+
+def paper_size(name: str) -> tuple[float, float]:
+    """Width and height of a paper by its name, or of ``420x297`` [mm]; UsageError if there is none."""
+    for known, size in PAPERS.items():
+        if name.lower() == known.lower():
+            return size
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", name)
+    if match and all(20 <= float(side) <= 5000 for side in match.groups()):
+        return float(match[1]), float(match[2])
+    raise UsageError(
+        f"the paper {name[:20]!r} is not known; use {', '.join(PAPERS)}, or its size in mm such as 420x297"
+    )
+
+
+def default_board(paper: tuple[float, float]) -> Board:
+    """A board of 9 x 6 inner vertices, which looks different turned, with the largest squares in whole mm."""
+    room = _room(max(paper), min(paper))
+    square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
+    if square < 5:
+        raise InputError("the paper is too small for a board of 9 x 6 inner vertices; give a larger one")
+    return Board.single(_COLS, _ROWS, square, "mm")
+
+
+def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
+    """Lay a board out on paper (width, height) [mm], upright or lying; an InputError if neither fits."""
+    scale = millimetres(board.unit)
+    laid, folds = unfolded(board)
+    outlines = scale * np.concatenate([one.outline for one in laid])
+    low, high = outlines.min(axis=0), outlines.max(axis=0)
+    size = high - low
+    for width, height in (paper, paper[::-1]):
+        room = _room(width, height)
+        if (size <= np.array(room) + 1e-6).all():
+            break
+    else:
+        room = _room(max(paper), min(paper))
+        raise InputError(
+            f"the board is {max(size):.4g} x {min(size):.4g} mm with its border, and {room[0]:.4g} x "
+            f"{room[1]:.4g} mm of the paper can be printed on; give a larger --paper or a smaller --square"
+        )
+    corner = np.array([_EDGE + _RULER + _QUIET, _EDGE + _QUIET]) + 0.5 * (np.array(room) - size)
+    origin = corner - low
+    lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
+    rulers, numbers = _rulers(corner, size, height)
+    squares = scale * np.concatenate([_black(one) for one in laid]) + origin
+    sizes = [
+        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
+        f"{plane.square:g} {board.unit}"
+        for plane in board.planes
+    ]
+    caption = f"{', '.join(sizes)}. Print at 100 %, then measure the rulers."
+    text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), caption, 2.8)
+    return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
+
+
+def _room(width: float, height: float) -> tuple[float, float]:
+    """Space for the pattern: without the edges, the quiet zone, the rulers, and the text at the bottom."""
+    return width - 2 * (_EDGE + _QUIET) - _RULER, height - 2 * (_EDGE + _QUIET) - _RULER - 4.0
+
+
+def _black(laid: Laid) -> Array:
+    """(N, 4, 2) corners of the black squares of a plane, those at the border cut to its reach."""
+    low, high = laid.bounds
+    c, r = np.meshgrid(np.arange(-1, laid.plane.cols), np.arange(-1, laid.plane.rows))
+    black = (c + r) % 2 == 0
+    first = np.column_stack([c[black], r[black]]).astype(float)
+    start, end = np.maximum(first, low), np.minimum(first + 1, high)
+    kept = ((end - start) > 1e-9).all(axis=1)
+    (a, b), (x, y) = start[kept].T, end[kept].T
+    return laid.at(np.column_stack([a, b, x, b, x, y, a, y]).reshape(-1, 4, 2))
+
+
+def _beside(start: Array, end: Array) -> list[Line]:
+    """Dashes of a fold: 4 mm at either end, beside the pattern, where they change none of its edges."""
+    along = (end - start) / np.linalg.norm(end - start)
+    return [
+        Line(place + 0.7 * way, place + (_QUIET - 0.5) * way, dashed=True)
+        for place, way in ((start, -along), (end, along))
+    ]
+
+
+def _rulers(corner: Array, size: Array, height: float) -> tuple[list[Line], list[Text]]:
+    """A ruler below the pattern and one beside it, of whole centimetres, from 0."""
+    lines, texts = [], []
+    below = height - _EDGE - 4.0 - _RULER + 3.0
+    beside = _EDGE + 2.0
+    for axis, start in ((0, np.array([corner[0], below])), (1, np.array([beside, corner[1]]))):
+        length = _TICK * np.floor(min(_LONGEST, float(size[axis])) / _TICK)
+        along, across = np.eye(2)[axis], np.eye(2)[1 - axis]
+        lines.append(Line(start, start + length * along))
+        for mark in np.arange(0.0, length + 1, _TICK):
+            tall = 2.5 if mark % (5 * _TICK) == 0 else 1.5
+            place = start + mark * along
+            lines.append(Line(place, place + tall * across))
+            if mark % (5 * _TICK) == 0:
+                shift = np.array([0.0, 5.5]) if axis == 0 else np.array([3.2, 0.9])
+                last = axis == 0 and mark + 5 * _TICK > length
+                shown = f"{mark:.0f}{' mm' if last else ''}"
+                texts.append(Text(place + shift, shown, 2.5, middle=axis == 0))
+    return lines, texts

@@ -1,0 +1,296 @@
+"""`Target`, the estimated shape of a target: the true positions of its points besides the given ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, distinct_rows, nearest_similarity, rotation_vector
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
+from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.points import Correspondences
+
+if TYPE_CHECKING:
+    from neurocal_cli.observations.bends import Bends
+    from neurocal_cli.observations.board import Board, Plane
+
+TARGETS = ("auto", "given", "flat", "free")
+
+_DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
+
+
+@frozen_dataclass(eq=False)
+class Target:
+    """Points of a target, given and estimated.
+
+    Images determine the shape only up to a similarity transformation. Therefore the estimated points are
+    rotated and moved as a whole to be nearest to the given ones, and scaled so that each plane by itself is
+    nearest to its given size. Stated standard deviations weight the distances from the given points, and
+    `sizes` then holds the factor by which they were scaled.
+    """
+
+    given: Array  # (n, 3) [world unit]
+    found: Array  # (n, 3) [world unit]
+    std: Array  # (n, 3) [world unit] of the estimated points, along the world's axes
+    plane: NDArray[np.intp]  # (n,) index of the plane of the target to which each point belongs
+    sizes: Mapping[str, float]  # [world unit] prior std of each part of the offsets, see `board.prior`
+    flat: bool  # whether the points were kept in their plane
+    evidence: float  # gain in log evidence (marginal likelihood) over the given target
+    point: NDArray[np.str_] | None = None  # (n,) ids
+    stated: Array | None = None  # (n, 3) [world unit] stds of the given points, if a survey states them
+    bends: Bends | None = None  # of each view, for a board that bends differently each time
+
+    @property
+    def offsets(self) -> Array:
+        """(n, 3) found minus given [world unit]."""
+        return self.found - self.given
+
+    @property
+    def only_bends(self) -> bool:
+        """Whether the points stay as given except for the bends of single views."""
+        return self.bends is not None and not self.offsets.any()
+
+    def places(self, world: Array) -> NDArray[np.intp]:
+        """(N,) index of the target point with the same given coordinates as each world point; -1: none."""
+        return _places(self.given, world)
+
+    def rows_of(self, world: Array) -> NDArray[np.intp]:
+        """(N,) index of the target point with the same estimated coordinates; -1: none."""
+        return _places(self.found, world)
+
+    def applied(self, points: Correspondences) -> Correspondences:
+        """Points of this target moved to their estimated coordinates, without the bends of single views."""
+        return _moved(points, self.places(points.world), self.found)
+
+    def seen(self, points: Correspondences) -> Correspondences:
+        """Points of this target moved to their estimated coordinates, with the bend of each view."""
+        found = self.applied(points)
+        if self.bends is None:
+            return found
+        bent = (self.places(points.world) >= 0)[:, None] * self._bend(self.bends, found)
+        return replace(found, world=found.world + bent)
+
+    def straightened(self, points: Correspondences) -> Correspondences:
+        """Estimated points with the bend of each view removed."""
+        if self.bends is None:
+            return points
+        world = points.world - self._bend(self.bends, points)
+        return replace(points, world=np.where((self.rows_of(world) >= 0)[:, None], world, points.world))
+
+    def as_given(self, points: Correspondences) -> Correspondences:
+        """Points moved back to their given coordinates: the inverse of `seen`."""
+        return _moved(points, self.rows_of(self.straightened(points).world), self.given)
+
+    def _bend(self, bends: Bends, points: Correspondences) -> Array:
+        """(N, 3) offsets of points by the bends of their views [world unit]."""
+        by_view = bends.of_views(points.view_names)[points.view_index]
+        return np.asarray((self._shapes(points.world) @ by_view[..., None])[..., 0])
+
+    def _shapes(self, world: Array) -> Array:
+        """(N, 3, 3) offsets of points for a unit coefficient of each shape of a bend."""
+        from neurocal_cli.observations.bends import surface_of
+
+        return surface_of(self.given).offsets(world)
+
+    def bend_of_views(self) -> float:
+        """Rms height of the bends of single views, over points and views [world unit]; 0 without bends."""
+        if self.bends is None:
+            return 0.0
+        heights = self._shapes(self.found) @ self.bends.coefficients.T  # (n, 3, V)
+        return float(np.sqrt((heights**2).sum(axis=1).mean()))
+
+    def joined(self, other: Target) -> Target:
+        """Merge two separately estimated targets: the mean for points of both."""
+        place = self.places(other.given)
+        both, new = np.flatnonzero(place >= 0), np.flatnonzero(place < 0)
+        found, std = self.found.copy(), self.std.copy()
+        found[place[both]] = 0.5 * (self.found[place[both]] + other.found[both])
+        std[place[both]] = 0.5 * np.hypot(self.std[place[both]], other.std[both])
+
+        def both_of(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if a is None or b is None else np.concatenate([a, b[new]])
+
+        given, point = np.concatenate([self.given, other.given[new]]), both_of(self.point, other.point)
+        stated = both_of(self.stated, other.stated)
+        return replace(
+            self,
+            given=given,
+            found=np.concatenate([found, other.found[new]]),
+            std=np.concatenate([std, other.std[new]]),
+            plane=planes_of(given, point) if stated is None else np.zeros(len(given), dtype=np.intp),
+            point=point,
+            stated=stated,
+        )
+
+    def bend(self) -> float:
+        """Height between the highest and lowest point over the mean plane, of the worst plane [world]."""
+        worst = 0.0
+        for found, _ in self._planes():
+            rows = np.column_stack([np.ones(len(found)), found[:, :2]])
+            height = found[:, 2] - rows @ np.linalg.lstsq(rows, found[:, 2], rcond=None)[0]
+            worst = max(worst, float(np.ptp(height)))
+        return worst
+
+    def stretch(self) -> float:
+        """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""
+        scales = (np.linalg.svd(linear, compute_uv=False) for linear in self._linear())
+        return max(float(along / across - 1) for along, across in scales)
+
+    def sides(self) -> tuple[float, float]:
+        """Elongation of a side over the other one, and angle [rad] off a right angle, of the worst planes."""
+        linear = np.array(list(self._linear()))
+        one, two = np.linalg.norm(linear, axis=2).T
+        cosine = (linear[:, 0] * linear[:, 1]).sum(axis=1) / (one * two)
+        return float(np.maximum(one / two, two / one).max() - 1), float(np.abs(np.arcsin(cosine)).max())
+
+    def unequal(self) -> float:
+        """Largest relative deviation of a plane's found over given size from the mean of the planes."""
+        scales = np.sqrt(np.abs(np.linalg.det(np.array(list(self._linear())))))
+        return float(np.abs(scales / scales.mean() - 1.0).max())
+
+    def displaced(self) -> tuple[float, float]:
+        """Largest shift [world unit] and rotation [rad] of a plane of a folded target; 0 for one plane."""
+        if not self.plane.any():
+            return 0.0, 0.0
+        parts = [(self.given[self.plane == k], self.found[self.plane == k]) for k in np.unique(self.plane)]
+        shifts = [np.linalg.norm(found.mean(axis=0) - given.mean(axis=0)) for given, found in parts]
+        turns = [np.linalg.norm(rotation_vector(nearest_similarity(*part)[1])) for part in parts]
+        return float(max(shifts)), float(max(turns))
+
+    def _linear(self) -> Iterator[Array]:
+        """(2, 2) what becomes of unit vectors along the principal axes of each given plane, as rows."""
+        for found, given in self._planes():
+            rows = np.column_stack([np.ones(len(given)), given[:, :2]])
+            yield np.asarray(np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:], dtype=float)
+
+    def _planes(self) -> Iterator[tuple[Array, Array]]:
+        """Found and given points of each plane about their centres, along the given ones' principal axes."""
+        for plane in range(int(self.plane.max()) + 1):
+            found, given = self.found[self.plane == plane], self.given[self.plane == plane]
+            centred = given - given.mean(axis=0)
+            axes = np.linalg.svd(centred, full_matrices=False)[2].T
+            yield (found - found.mean(axis=0)) @ axes, centred @ axes
+
+
+def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
+    """Convert a target that is a chessboard to a `Board` with its estimated points and measured distances.
+
+    Raises InputError if the points have no ids of a chessboard.
+    """
+    if target.point is None:
+        raise InputError(
+            "the points have no ids of a board; calibrate from points found by `neurocal detect`"
+        )
+    from neurocal_cli.observations.board import Board
+
+    planes: dict[str, list[tuple[tuple[float, float], Array, Array]]] = {}
+    for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
+        name, place = _place(str(label))
+        planes.setdefault(name, []).append((place, given, found))
+    return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit, distances)
+
+
+def scale_of(points: Correspondences) -> Scale:
+    """The scale of the points according to the distances measured on their board.
+
+    Raises InputError if the points or distances do not belong to a chessboard.
+    """
+    if not points.distances:
+        return NO_SCALE
+    world, _, ids = distinct_points([points])
+    return scale_of_points(world, ids, points.distances)
+
+
+def scale_of_points(world: Array, ids: NDArray[np.str_] | None, distances: tuple[Distance, ...]) -> Scale:
+    """The same for the distinct points (n, 3) of a target with their ids."""
+    if not distances or ids is None:
+        return NO_SCALE
+    from neurocal_cli.observations.board import smooth_between
+
+    names = [_place(str(label)) for label in ids.tolist()]
+    planes = np.array([name for name, _ in names])
+    grid = np.array([place for _, place in names])
+
+    def place(label: str) -> Array:
+        name, c, r = grid_place(label)
+        rows = planes == name if name else np.ones(len(planes), dtype=bool)
+        if not rows.any():
+            raise InputError(f"a distance was measured on the plane {name!r}, which has no points; remove it")
+        known, at = np.column_stack([np.ones(rows.sum()), grid[rows]]), np.array([1.0, c, r])
+        flat = np.linalg.lstsq(known, world[rows], rcond=None)[0]
+        return at @ flat + smooth_between(grid[rows], world[rows] - known @ flat, at[None, 1:])[0]
+
+    return fitted_scale(place, distances)
+
+
+def _place(label: str) -> tuple[str, tuple[float, float]]:
+    """Plane and grid place of an id ``[plane/]c:r``, ``[plane/]h:c:r`` or ``[plane/]v:c:r``."""
+    name, _, place = label.rpartition("/")
+    *kind, c, r = place.split(":") if place.count(":") in (1, 2) else ("?", "", "")
+    half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
+    # -1 names the edges between the board's rim and the first vertices.
+    if half is None or not (c.removeprefix("-").isdecimal() and r.removeprefix("-").isdecimal()):
+        raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
+    return name, (int(c) + half[0], int(r) + half[1])
+
+
+def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
+    from neurocal_cli.observations.board import Plane
+
+    grid = np.array([place for place, _, _ in rows])
+    given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
+    sides = np.linalg.norm(unknowns[1:], axis=1)
+    square = float(sides.mean())
+    # Given points may be those of an estimated board, whose sides are neither equal nor perpendicular. The
+    # nearest perpendicular axes are the polar factor.
+    U, _, Vt = np.linalg.svd(unknowns[1:] / sides[:, None], full_matrices=False)
+    x_axis, y_axis = U @ Vt
+    cols, rows_ = (_size(places) for places in grid.T)
+    origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
+    measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
+    return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
+
+
+def _size(places: Array) -> int:
+    """Number of vertices in a row, from grid coordinates of points; half coordinates may be at the rim."""
+    whole = places[places == np.rint(places)]
+    return int(whole.max() if len(whole) else np.ceil(places.max())) + 1
+
+
+def distinct_points(
+    some: Sequence[Correspondences],
+) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
+    """The distinct world points (n, 3), the index of each row's point (N,), and the ids, if all have one."""
+    world = np.concatenate([points.world for points in some])
+    first, label = distinct_rows(_whole(world, world))
+    ids = None
+    if all(points.point is not None for points in some):
+        ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
+    return world[first], label, ids
+
+
+def _moved(points: Correspondences, place: NDArray[np.intp], to: Array) -> Correspondences:
+    """Points moved to other coordinates (n, 3), of which `place` (N,) are the indices; -1: not moved."""
+    world = np.where((place >= 0)[:, None], to[place], points.world)
+    return points if (place < 0).all() else replace(points, world=world)
+
+
+def _places(known: Array, world: Array) -> NDArray[np.intp]:
+    first, own = distinct_rows(_whole(world, known))
+    label = distinct_rows(_whole(np.concatenate([known, world[first]]), known))[1]
+    place = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.intp)
+    place[label[: len(known)]] = np.arange(len(known))
+    return place[label[len(known) :]][own]
+
+
+def _whole(world: Array, known: Array) -> Array:
+    """World coordinates in units of the resolution to which those of the same known point agree."""
+    size = float(np.ptp(known, axis=0).max()) if len(known) else 1.0
+    return np.round(world / (float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0))

@@ -1,0 +1,130 @@
+"""Compare all methods on a user's points: errors, time, parameters; for two cameras the paper's Table 2."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.evaluation import StereoEvaluation, evaluate_stereo
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.pinhole import in_cameras
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.network.options import Progress
+from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.simulation.by_method import calibrate_with
+
+_FOLDS = 5
+
+
+@frozen_dataclass(eq=False)
+class Compared:
+    """Result of a method for the points of one camera."""
+
+    calibration: Calibration | None  # None if the method has no solution
+    held_out_px: float = np.nan  # five-fold cross-validation error (rms); nan if a fold has no solution
+    seconds: float = np.nan  # time of the calibration
+    problem: str = ""  # reason why there is no solution
+
+
+@frozen_dataclass(eq=False)
+class Comparison:
+    """Result of `compare`."""
+
+    points: tuple[Correspondences, ...]  # of one or two cameras, the same for all methods
+    cameras: tuple[dict[str, Compared], ...]  # by the method
+    # For two cameras, each calibrated alone as in the paper's section 5.2, by the method.
+    stereo: dict[str, StereoEvaluation] | None
+    notes: tuple[str, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.points[0].unit
+
+
+def compare(
+    points: Sequence[Correspondences],
+    methods: Sequence[str],
+    distortion: str = "auto",
+    skew: bool = True,
+    outliers: str = "reject",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Calibrate one or two cameras, whose views are paired by name, by every method of `METHODS`.
+
+    With the distortion "auto", all methods use the model selected by the network's calibration. With the
+    outliers "reject", points that the network's calibration rejects are left out for all methods. Raises
+    NeurocalError if the network's calibration has no solution.
+    """
+    report = progress or (lambda stage, share: None)
+    notes: list[str] = []
+    kept: list[Correspondences] = []
+    cameras: list[dict[str, Compared]] = []
+    steps = 1 + len(methods)  # for each camera
+    for done, one in enumerate(points):
+        first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed, target="given")
+        if first.n_rejected:
+            notes.append(f"{one.source}: {first.n_rejected} outliers are left out for all methods")
+        kept.append(first.points)
+        rows: dict[str, Compared] = {}
+        for step, method in enumerate(methods, start=1):
+            report(method, (done * steps + step) / (len(points) * steps))
+            rows[method] = _compared(method, first.points, first.distortion_model, skew, seed)
+        cameras.append(rows)
+    stereo = _stereo(cameras, methods, notes) if len(cameras) == 2 else None
+    return Comparison(tuple(kept), tuple(cameras), stereo, tuple(notes))
+
+
+def _compared(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> Compared:
+    start = time.perf_counter()
+    try:
+        found = calibrate_with(method, points, model, skew, seed)
+    except NeurocalError as error:
+        return Compared(None, problem=str(error))
+    seconds = time.perf_counter() - start
+    return Compared(found, _held_out(method, points, model, skew, seed), seconds)
+
+
+def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> float:
+    """Rms error [px] of held-out points, to which neither the camera nor the view's pose was fitted."""
+    rng = np.random.default_rng(seed)
+    # A fold is every fifth point of each view, in a random order of its points.
+    order = np.lexsort((rng.random(len(points)), points.view_index))
+    fold = np.empty(len(points), dtype=np.intp)
+    fold[order] = np.arange(len(points)) % _FOLDS
+    squares = 0.0
+    for k in range(_FOLDS):
+        try:
+            found = calibrate_with(method, points.select(fold != k), model, skew, seed)
+        except NeurocalError:
+            return np.nan
+        rest = points.select(fold == k)
+        squares += float((_residuals(found, rest) ** 2).sum())
+    return float(np.sqrt(squares / len(points)))
+
+
+def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
+    """(N, 2) predicted minus observed pixels."""
+    poses = [calibration.views[name].pose for name in points.view_names]
+    inside = in_cameras(poses, points.world, points.view_index)
+    return calibration.camera.project(inside)[0] - points.pixels
+
+
+def _stereo(
+    cameras: list[dict[str, Compared]], methods: Sequence[str], notes: list[str]
+) -> dict[str, StereoEvaluation]:
+    found = {}
+    for method in methods:
+        left, right = (camera[method].calibration for camera in cameras)
+        if left is None or right is None:
+            continue
+        try:
+            found[method] = evaluate_stereo(left, right)
+        except NeurocalError as error:
+            notes.append(f"{method}: {error}")
+    return found
