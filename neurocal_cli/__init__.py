@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.camera.remapping import undistort_image
-    from neurocal_cli.camera.undistortion import undistort_points
     from neurocal_cli.detection.detect import detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.rig_yaml import read_rig
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
+    from neurocal_cli.observations.undistorted_points import undistort_points
 
 __version__ = "0.1.0"
 
@@ -75,7 +75,7 @@ _HOMES = {
     "read_rig": "files.rig_yaml",
     "triangulate": "calibration.rig.triangulation",
     "undistort_image": "camera.remapping",
-    "undistort_points": "camera.undistortion",
+    "undistort_points": "observations.undistorted_points",
     "write_calibration": "files.result_files",
     "write_lens": "files.lens_yaml",
     "write_points": "files.points_csv",

@@ -59,3 +59,8 @@ def check_seed(seed: object) -> None:
     """Refuse a seed that NumPy's generators do not take, with a UsageError."""
     if not isinstance(seed, Integral) or int(seed) < 0:  # NumPy's integers are Integral, too
         raise UsageError("seed must be a whole number of at least 0")
+
+
+def plural(count: int, noun: str) -> str:
+    """A number with its noun."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -22,7 +22,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.network import backprop_blocks as blocks
 from neurocal_cli.network.backprop import BackpropOptions, _Run, train_backprop
 from neurocal_cli.network.network import (
-    Patterns,
     e_2d,
     e_orth,
     e_orth_gradient,
@@ -31,6 +30,7 @@ from neurocal_cli.network.network import (
     random_weights,
     residual_jacobian,
 )
+from neurocal_cli.network.patterns import Patterns
 from neurocal_cli.network.trainers import Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)

@@ -14,8 +14,7 @@ from support.distorted import LENSES
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
-from neurocal_cli.calibration.calibration import camera_of
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import MODELS, Distortion, distort
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import Intrinsics, Pose

@@ -12,12 +12,13 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.adjustment.point_batches import batches_of
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks, residuals
+from neurocal_cli.adjustment.reprojection import normal_blocks, residuals
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.files.result_files import write_calibration
 

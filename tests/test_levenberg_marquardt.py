@@ -10,7 +10,8 @@ from support.gradients import gradients
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.errors import InputError
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.network.network import Patterns, e_2d, optimal_gamma, output, random_weights
+from neurocal_cli.network.network import e_2d, optimal_gamma, output, random_weights
+from neurocal_cli.network.patterns import Patterns
 from neurocal_cli.network.trainers import Task
 
 ALL_W = np.ones((3, 3), dtype=bool)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.network.network import Patterns
+from neurocal_cli.network.patterns import Patterns
 from neurocal_cli.network.starts import Agreement, Learnt, learn
 from neurocal_cli.network.trainers import Task, Trained
 

@@ -13,11 +13,12 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences
 from neurocal_cli.adjustment.covariance import covariance
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.state import CameraState
 
 
 def parameters(cal: Calibration) -> Array:

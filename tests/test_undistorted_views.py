@@ -18,10 +18,11 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistorted_view import PANORAMAS, SHAPES, Panorama, field_of_view, undistorted_view
-from neurocal_cli.camera.undistortion import shown, sources, undistort_pixels
+from neurocal_cli.camera.undistortion import sources, undistort_pixels
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_info import camera_info_lines
 from neurocal_cli.files.points_csv import read_points, write_points
+from neurocal_cli.observations.undistorted_points import shown
 
 MODELS = list(WIDE_LENSES)
 

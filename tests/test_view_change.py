@@ -12,11 +12,11 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.view_change import in_sequence, view_change
+from neurocal_cli.camera.state import CameraState
 
 Make = Callable[[int, np.random.Generator], Correspondences]
 

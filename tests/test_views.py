@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.network.patterns import patterns_of
 from neurocal_cli.observations.points import Correspondences
 
 COUNTS = (30, 7, 12)
@@ -140,7 +141,7 @@ def test_patterns_are_each_views_own_points_from_all_its_stretches(most: int, ra
     views = arrange(points)
     chosen = np.array([2, 0])
     rng = np.random.default_rng(0) if random else None
-    patterns = views.patterns(chosen, False, most, rng)
+    patterns = patterns_of(views, chosen, False, most, rng)
     width = min(most, int(views.counts[chosen].max()))
     assert patterns.weights.shape == (2, width)
     for k, view in enumerate(chosen):
@@ -162,7 +163,7 @@ def test_flat_patterns_are_coordinates_in_the_plane() -> None:
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(-1, 1, (20, 2)), np.zeros(20)]) @ euler_to_rotation(0.5, 0.4, 1.0).T
     views = arrange(Correspondences(plane, rng.uniform(0, 9, (20, 2))))
-    inputs = views.patterns(np.array([0]), True, 100).inputs[0]
+    inputs = patterns_of(views, np.array([0]), True, 100).inputs[0]
     assert inputs.shape == (20, 3)
     back = np.column_stack([inputs[:, :2], np.zeros(20)]) @ views.basis[0].T
     np.testing.assert_allclose(back, views.local, atol=1e-14)

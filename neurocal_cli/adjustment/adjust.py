@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import damped_step
 from neurocal_cli.adjustment.point_batches import PointBatches
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.schur_complement import schur_step
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, orthonormalised
+from neurocal_cli.camera.state import CameraState
 
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
 # tests/test_adjust.py holds the minimum against SciPy's.

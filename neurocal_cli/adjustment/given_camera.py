@@ -13,11 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurocal_cli.adjustment.normal_equations import solve_scaled
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
+from neurocal_cli.camera.state import CameraState
 
 
 def entry_covariance(

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.covariance import Covariance
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
 # Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal

@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import inverse_or_nan
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import in_cameras
+from neurocal_cli.camera.state import CameraState
+from neurocal_cli.observations.points import Correspondences
 
 # For each group of coefficients that are present or absent together: the power of the radius, and the prior
 # std of their term as a share of the radius in the farthest corner of the image. At the farthest points of
@@ -175,21 +174,17 @@ def open_coefficients(
     return OpenCoefficients(richer, reported, everything, prior)
 
 
-def open_of_calibration(
-    calibration: Calibration, free: NDArray[np.bool_], k: Array | None = None
+def open_at_points(
+    state: CameraState, points: Correspondences, free: NDArray[np.bool_], tried: tuple[str, ...]
 ) -> OpenCoefficients | None:
-    """Open coefficients of a calibrated camera's distortion model; None if there are none.
+    """Open coefficients of a camera in pixels and world units, known from its points; None if there are none.
 
-    The calibration must have its points and poses. `free` (5 + K,) tells which of A's entries and the
-    coefficients were estimated. `k` (K,) are coefficients of the same model, if they differ from those of the
-    calibration.
+    The poses of the state are in the order of the points' views. `free` (5 + K,) tells which of A's entries
+    and the coefficients were estimated, `tried` among which models this one was selected.
     """
-    points, camera = calibration.points, calibration.camera
-    poses = [calibration.views[name].pose for name in points.view_names]
-    reach = _farthest(in_cameras(poses, points.world, points.view_index))
-    corner = corner_radius(np.array(camera.entries), np.zeros(2), 1.0, points.image_size)
-    k = camera.distortion.coefficients if k is None else k
-    return open_coefficients(camera.distortion.model, k, free, tuple(calibration.lens_choice), reach, corner)
+    seen = (state.R[points.view_index] @ points.world[..., None])[..., 0] + state.t[points.view_index]
+    corner = corner_radius(state.entries[0], np.zeros(2), 1.0, points.image_size)
+    return open_coefficients(state.model, state.k, free, tried, _farthest(seen), corner)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")

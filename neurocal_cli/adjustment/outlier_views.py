@@ -13,12 +13,13 @@ from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.adjustment.normal_equations import solve_scaled
-from neurocal_cli.adjustment.reprojection import POSE, CameraState
+from neurocal_cli.adjustment.reprojection import POSE
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.median import median
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
 # none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted, Penalty, adjust
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
@@ -22,6 +21,7 @@ from neurocal_cli.camera.geometry import Array, rotation_to_axis
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES, image_points, undistorted_pixels
 from neurocal_cli.camera.rich_lens import FIRST_NODE
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 

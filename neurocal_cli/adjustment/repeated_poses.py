@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import folds_of
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.projection import project_points
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
 # thousand random views are called the same.

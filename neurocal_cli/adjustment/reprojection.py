@@ -7,20 +7,17 @@ and the residual, in this order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import field, replace
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.point_batches import PointBatches, products
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.camera.directions import WITH_XI
-from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, rotation_step
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import project_points, project_with_jacobian
+from neurocal_cli.camera.state import CameraState
 
 POSE = slice(5, 11)  # omega, tau
 _OMEGA, _TAU = slice(5, 8), slice(8, 11)
@@ -30,71 +27,6 @@ _COEFFICIENTS = 11  # first column of the coefficients of the distortion
 def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
     """Columns (5 + K,) of the parameters that all views share: the entries of A, then the coefficients."""
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
-
-
-@frozen_dataclass(eq=False)
-class CameraState:
-    """Camera and poses, the unknowns of an adjustment, in normalised units or in pixels and world units."""
-
-    # A11, A12, A22, A13, A23: (1, 5) of the camera that all views share, or (V, 5) of each view's own camera.
-    entries: Array
-    R: Array  # (V, 3, 3)
-    t: Array  # (V, 3)
-    model: str = "none"  # distortion model, one of `distortion.MODELS`
-    # Coefficients of the model: (K,) the same for all views, or (V, K) each view's own.
-    k: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def distortion(self) -> Distortion:
-        """The distortion that all views share."""
-        return Distortion(self.model, self.k)
-
-    def with_model(self, model: str) -> CameraState:
-        """The same camera with a model that begins with the same coefficients; new ones are 0."""
-        k = np.zeros(len(coefficient_names(model)))
-        kept = min(len(k), len(self.k))
-        k[:kept] = self.k[:kept]
-        return replace(self, model=model, k=k)
-
-    def of_view(self, view: int) -> CameraState:
-        """The state of one view alone."""
-        own = slice(view, view + 1)
-        entries = self.entries if len(self.entries) == 1 else self.entries[own]
-        k = self.k if self.k.ndim == 1 else self.k[view]
-        return replace(self, entries=entries, R=self.R[own], t=self.t[own], k=k)
-
-    def of_views(self, which: NDArray[np.intp]) -> CameraState:
-        """The state of some views, which share one camera."""
-        return replace(self, R=self.R[which], t=self.t[which])
-
-    def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
-        """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
-        by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
-        if self.model in WITH_XI:
-            by_entries = by_entries + self._along_valley(by_entries, by_k)
-        return CameraState(
-            self.entries + by_entries,
-            rotation_step(by_pose[:, :3]) @ self.R,
-            self.t + by_pose[:, 3:],
-            self.model,
-            self.k + (by_k[0] if self.k.ndim == 1 else by_k),
-        )
-
-    def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
-        """Second-order correction of a step along the valley in which xi and alpha compensate.
-
-        The points determine the scale in the image centre, alpha / (1 + xi).
-        """
-        bend = np.zeros_like(by_entries)
-        xi, by_xi = self.k[..., :1], by_k[:, :1]
-        bend[:, :3] = by_xi / (1 + xi) * (by_entries[:, :3] - self.entries[:, :3] * by_xi / (1 + xi))
-        return bend
-
-    def camera_of(self, view: NDArray[np.intp]) -> tuple[Sequence[Any] | Array, Sequence[Any] | Array]:
-        """A's entries and the coefficients for the points of some batches, given each batch's view."""
-        # For one camera, Python numbers are faster than NumPy scalars or columns of one.
-        entries = self.entries[view].T[..., None] if len(self.entries) > 1 else self.entries[0].tolist()
-        return entries, self.k.tolist() if self.k.ndim == 1 else self.k[view].T[..., None]
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import CameraState, residuals
+from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.measured_directions import measured_part, single, unit
 
 _SOME_SAY = 0.5  # least weight along edges with which residuals in that direction are used

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 # Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens

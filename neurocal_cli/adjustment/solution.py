@@ -14,14 +14,14 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.covariance import Covariance, covariance
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.units import in_pixels
-from neurocal_cli.calibration.calibration import StraightLines
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import StraightLines
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.target import Target
 
 if TYPE_CHECKING:

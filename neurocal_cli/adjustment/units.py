@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 
 
 def in_pixels(problem: Problem, state: CameraState) -> CameraState:

@@ -12,7 +12,6 @@ from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, similarity
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.network import Patterns
 from neurocal_cli.observations.measured_directions import LEAST, equations, loosened
 from neurocal_cli.observations.points import Correspondences
 
@@ -139,29 +138,6 @@ class Views:
     def batches(self) -> PointBatches:
         """All points, in batches for bundle adjustment."""
         return batches_of(self.local, self.pixels, self.whitening, self.index, self.n_views)
-
-    def patterns(
-        self, views: NDArray[np.intp], flat: bool, most: int, rng: np.random.Generator | None = None
-    ) -> Patterns:
-        """Training patterns of some views' networks, at most `most` of each view.
-
-        If a view has more points, one is drawn from each of `most` equal stretches of its rows, at random or,
-        without a generator, the middle one. Views with fewer points than the others are padded with weight 0.
-        """
-        n = self.counts[views]
-        width = min(int(n.max()), most)
-        slot = np.arange(width)
-        inside = 0.5 if rng is None else rng.random((len(views), width))
-        stretch = np.maximum(n / width, 1.0)[:, None]
-        rank = np.minimum((slot + inside * (stretch > 1)) * stretch, n[:, None] - 1).astype(np.intp)
-        rows = self.first[views][:, None] + rank
-        local = self.local[rows]
-        if flat:
-            local = (local @ self.basis[views])[:, :, :2]
-        ones = np.ones((*rows.shape, 1))
-        weights = np.where(slot < n[:, None], self.weights[rows], 0.0)
-        targets = np.concatenate([self.pixels[rows], ones], axis=2) if self.rays is None else self.rays[rows]
-        return Patterns(np.concatenate([local, ones], axis=2), targets, weights)
 
 
 def arrange(points: Correspondences) -> Views:

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.open_coefficients import open_of_calibration
+from neurocal_cli.adjustment.open_coefficients import open_at_points
 from neurocal_cli.calibration.calibration import Calibration, free_entries
 from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
 from neurocal_cli.camera.camera import Camera
@@ -112,7 +112,8 @@ class _Known:
         rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
         sigma = max(rms / np.sqrt(2.0), _LEAST_SIGMA)
         beforehand = np.zeros(int(free.sum()))
-        if (opened := open_of_calibration(calibration, free)) is not None:
+        state, tried = calibration.state(points.view_names), tuple(calibration.lens_choice)
+        if (opened := open_at_points(state, points, free, tried)) is not None:
             camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
             beforehand = np.zeros(int(free.sum()))
             prior = opened.prior

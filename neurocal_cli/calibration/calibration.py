@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import field
 from enum import Enum
 from functools import cached_property
@@ -10,14 +10,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
-from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.distortion import Distortion, StraightLines, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.rich_lens import NODES
-from neurocal_cli.errors import UsageError
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -50,17 +50,6 @@ class NetworkRecord:
     rmse_before: float  # reprojection error (3) before bundle adjustment
     rmse_after: float
     curve: tuple[float, ...] = ()  # learning curve: loss along the training of the best start
-
-
-@frozen_dataclass
-class StraightLines:
-    """Record of a distortion that was estimated from straight lines alone."""
-
-    n_lines: int  # counted in each view that shows them
-    n_points: int  # on these lines
-    centre: tuple[float, float]  # (u, v) [px] of the distortion
-    rms_before: float  # px; distance of the points from straight lines before undistortion
-    rms_after: float  # px; the same after it
 
 
 @frozen_dataclass(eq=False)
@@ -227,6 +216,12 @@ class Calibration:
         """Unit of the world coordinates."""
         return self.points.unit
 
+    def state(self, names: Sequence[str]) -> CameraState:
+        """The camera and its poses of the named views, in pixels and world units."""
+        poses, camera = [self.views[name].pose for name in names], self.camera
+        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+        return CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
+
     @property
     def rotations(self) -> dict[str, Array]:
         """(3, 3) rotation of each view."""
@@ -257,22 +252,6 @@ def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
     from_lines = calibration.straight_lines is not None
     names = coefficient_names(calibration.distortion_model) if from_lines else NODES
     return free_entries(calibration, names)
-
-
-def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
-    """Convert any of the accepted types to a `Camera`; a matrix has no distortion.
-
-    Raises UsageError for another type, and InputError for a matrix that is no camera matrix.
-    """
-    if isinstance(given, Camera):
-        return given
-    if isinstance(given, Calibration):
-        return given.camera
-    if isinstance(given, Intrinsics):
-        return Camera(given)
-    if isinstance(given, (np.ndarray, list, tuple)):
-        return Camera(Intrinsics.from_matrix(np.asarray(given)))
-    raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")
 
 
 def undistorted_before(points: Correspondences, given: Camera | Calibration) -> str:

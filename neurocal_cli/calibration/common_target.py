@@ -11,7 +11,6 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.problem import Problem, problem_for
-from neurocal_cli.adjustment.stored_state import stored_state
 from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.lens_and_target import (
@@ -120,5 +119,5 @@ def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
         distortion=calibration.camera.distortion,
     ).with_seen_pixels()
     problem = replace(problem, fixed=problem.fixed | calibration.fixed)
-    state = stored_state(calibration, problem.views.names)
+    state = calibration.state(problem.views.names)
     return problem, problem.adjust(normalised(state, problem.views))

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibration import Calibration, camera_of, undistorted_before
+from neurocal_cli.calibration.calibration import Calibration, undistorted_before
 from neurocal_cli.calibration.verdict.given_points import GivenPoints
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose

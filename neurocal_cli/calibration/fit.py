@@ -11,7 +11,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.restart import restarted
 from neurocal_cli.adjustment.reweighting import reweighted
 from neurocal_cli.adjustment.solution import Solution
@@ -24,6 +24,7 @@ from neurocal_cli.calibration.lens_choice.given_model import (
 )
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.network.neuro import solve

@@ -20,7 +20,6 @@ from neurocal_cli.adjustment.parameter_uncertainty import (
 )
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.solution import Solution, TargetPosterior
-from neurocal_cli.adjustment.stored_state import stored_state
 from neurocal_cli.adjustment.units import normalised, translations
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -114,7 +113,7 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
     if not names or not np.isfinite(covariance).all():
         return found
     views = arrange(found.points)
-    state = stored_state(found, views.names)
+    state = found.state(views.names)
     entries = entry_covariance(found.intrinsics, state.model, names, covariance, views.pixel_scale)
     block = covariance_by_camera(views, normalised(state, views), entries)
     added = pose_std(state.R, (state.R @ views.centre[..., None])[..., 0], views.scale, block)

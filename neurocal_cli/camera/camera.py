@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size, real_array
 from neurocal_cli.camera.monotonic import is_monotonic, largest_angle, undistort, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, UsageError
 
 
 @frozen_dataclass(eq=False)
@@ -253,3 +254,27 @@ def _coordinates(name: str, values: Array, count: int) -> Array:
     if array.shape[-1:] != (count,):
         raise InputError(f"{name} must have the shape (..., {count}), found {array.shape}")
     return np.moveaxis(array, -1, 0)
+
+
+class Calibrated(Protocol):
+    """What has a camera, such as a `Calibration`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera without poses."""
+
+
+def camera_of(given: Camera | Calibrated | Intrinsics | Array) -> Camera:
+    """Convert any of the accepted types to a `Camera`; a matrix has no distortion.
+
+    Raises UsageError for another type, and InputError for a matrix that is no camera matrix.
+    """
+    if isinstance(given, Camera):
+        return given
+    if isinstance(given, Intrinsics):
+        return Camera(given)
+    if isinstance(given, (np.ndarray, list, tuple)):
+        return Camera(Intrinsics.from_matrix(np.asarray(given)))
+    if isinstance(camera := getattr(given, "camera", None), Camera):
+        return camera
+    raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")

@@ -119,3 +119,14 @@ def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Di
         seen = project_directions(model, k, x, y, np.ones_like(x))
         return (seen.x, seen.y), (*seen.by_x[:2], *seen.by_y[:2]), seen.by_coefficient
     return distorted_with_jacobian(k, x, y)
+
+
+@frozen_dataclass
+class StraightLines:
+    """Record of a distortion that was estimated from straight lines alone."""
+
+    n_lines: int  # counted in each view that shows them
+    n_points: int  # on these lines
+    centre: tuple[float, float]  # (u, v) [px] of the distortion
+    rms_before: float  # px; distance of the points from straight lines before undistortion
+    rms_after: float  # px; the same after it

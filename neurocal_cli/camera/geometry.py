@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+UNDISTORTED = ("plane", "cylinder", "equirectangular")
+"""Shapes that undistorted pixels are projected on."""
+
 # Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.
 _GIMBAL_COSINE = 1e-12
 _SINGULAR = 1e-9  # below it only the combination is taken to vary with a rotation

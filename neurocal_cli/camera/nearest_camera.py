@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
@@ -19,6 +18,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError
 
 _GRID = 25  # grid pixels along each side of the image

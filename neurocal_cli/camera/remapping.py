@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibration import Calibration, camera_of
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.undistorted_view import Undistorted
 from neurocal_cli.camera.undistortion import chosen_view, sources
@@ -111,7 +110,7 @@ class Remapping:
 
 def undistort_image(
     image: NDArray[np.uint8] | NDArray[np.uint16],
-    camera: Camera | Calibration,
+    camera: Camera | Calibrated,
     alpha: float | None = None,
     interpolation: str = "cubic",
     to: str = "plane",

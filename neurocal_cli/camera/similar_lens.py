@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import coefficient_names, radial_part
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.polynomial import sensor_rotation
 from neurocal_cli.camera.projection import ENTRIES, project_points
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models converge from these starts.
 _ANGLES = 60

@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import UNDISTORTED, Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.points import UNDISTORTED
 
 SHAPES = UNDISTORTED
 PANORAMAS = SHAPES[1:]

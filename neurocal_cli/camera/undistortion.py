@@ -1,4 +1,4 @@
-"""Undistortion of points, and the source pixels of undistorted images.
+"""Undistorted pixels, and the source pixels of undistorted images.
 
 A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere
 (`undistorted_view`). On a plane, with A' without distortion, that is
@@ -10,12 +10,8 @@ A' is A itself, skew included, unless alpha is given (`new_matrix`) or the lens 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
@@ -24,8 +20,6 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.projection import image_points_with_jacobian, project_points
 from neurocal_cli.camera.undistorted_view import Undistorted, plane_like, undistorted_view
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.measured_directions import unit
-from neurocal_cli.observations.points import Correspondences
 
 # With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
 _BORDER = 401  # samples along each side of the image
@@ -98,7 +92,7 @@ def _directions(new: Undistorted, u: Array, v: Array) -> tuple[Array, Array, Arr
     return x, y, np.ones_like(x)
 
 
-def _distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R: Array | None) -> Array:
+def distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R: Array | None) -> Array:
     """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
     u, v = pixels.T
     rays = np.column_stack(_directions(new, u, v))
@@ -179,35 +173,6 @@ def _outer(camera: Camera, corner: Array) -> tuple[Array, Array]:
     return points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
 
 
-def undistort_points(
-    points: Correspondences,
-    camera: Camera | Calibration,
-    alpha: float | None = None,
-    to: str = "plane",
-    fov: float | None = None,
-) -> Correspondences:
-    """Undistort points.
-
-    Parameters
-    ----------
-    points : Correspondences
-        Their covariances and the image centre, where given, are transformed as well.
-    camera : Camera or Calibration
-    alpha : float, optional
-        See `new_matrix`; None keeps the camera's own matrix. For a plane without `fov`.
-    to : {"plane", "cylinder", "equirectangular"}
-    fov : float, optional [degrees]
-        Field of view from left to right; see `undistorted_view`.
-
-    Raises
-    ------
-    InputError
-        A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
-    """
-    camera = camera_of(camera)
-    return map_points(points, camera, chosen_view(camera, alpha, to, fov, points.image_size))
-
-
 def chosen_view(
     camera: Camera,
     alpha: float | None,
@@ -226,55 +191,3 @@ def chosen_view(
         raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
     size = _known("a field of view", size or camera.image_size)
     return undistorted_view(camera, size, to, fov, new_size)
-
-
-def shown(
-    points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
-) -> NDArray[np.bool_]:
-    """Which points are not beyond the edge of what a plane can show; those that no camera sees count too."""
-    rays = camera.unproject(points.pixels)
-    return ~np.isfinite(rays[:, 0]) | new.project(rays if R is None else rays @ R.T)[1]
-
-
-def map_points(
-    points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
-) -> Correspondences:
-    """Convert points to the pixels of another camera with the same centre, without distortion.
-
-    Their covariances and the image centre, where given, are transformed as well. If the camera has
-    distortion, `undistorted` of the result names the shape. R (3, 3) is from the camera's frame to that of
-    the new one, where it is turned as well. Raises InputError for a pixel that the distortion does not
-    reach, or that a plane cannot show, named by its file and line.
-    """
-    pixels = undistort_pixels(camera, new, points.pixels, R)
-    lost = ~np.isfinite(pixels[:, 0])
-    if lost.any():
-        row = int(np.argmax(lost))
-        u, v = points.pixels[row]
-        if np.isfinite(camera.unproject(points.pixels[row])).all():
-            raise InputError(
-                f"{points.place(row)}: the ray of the pixel ({u:g}, {v:g}) is 90 degrees or more from the "
-                "axis, which no plane shows; choose a cylinder, or remove the row"
-            )
-        raise InputError(
-            f"{points.place(row)}: the distortion maps nothing to the pixel ({u:g}, {v:g}); correct "
-            "or remove the row, and check that the camera belongs to these points"
-        )
-    size = points.image_size and new.image_size
-    undistorted = replace(points, pixels=pixels, image_size=size)
-    if not camera.distortion.is_identity:
-        undistorted = replace(undistorted, undistorted="plane" if isinstance(new, Camera) else new.shape)
-    if points.covariance is not None:
-        # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
-        M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels, R))
-        C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
-        undistorted = replace(undistorted, covariance=C)
-    if points.across is not None:
-        # Only n . m is measured of a pixel m, and so n^T M^-1 m' of the undistorted pixel m'.
-        n = (points.across[:, None, :] @ _distorted_by_undistorted(camera, new, pixels, R))[:, 0]
-        undistorted = replace(undistorted, across=unit(n))
-    if points.image_center is not None:
-        u0, v0 = undistort_pixels(camera, new, np.array([points.image_center]), R)[0].tolist()
-        undistorted = replace(undistorted, image_center=(u0, v0) if np.isfinite(u0 + v0) else None)
-    return undistorted

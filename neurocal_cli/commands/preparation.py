@@ -96,7 +96,7 @@ def calibration_or_camera(
     name: str, points: Correspondences | None, besides: str = ""
 ) -> tuple[Calibration | Camera, Correspondences | None]:
     """Read a calibration or, for points, any camera; if it is neither, the error says why no calibration."""
-    from neurocal_cli.calibration.calibration import camera_of
+    from neurocal_cli.camera.camera import camera_of
     from neurocal_cli.files.calibration_tree import read_calibration
 
     try:

@@ -139,8 +139,8 @@ class Undistorting:
         return content
 
     def _points(self, path: str) -> str:
-        from neurocal_cli.camera.undistortion import map_points, shown
         from neurocal_cli.files.points_csv import format_points, read_points
+        from neurocal_cli.observations.undistorted_points import map_points, shown
 
         notes: list[str] = []
         points = read_points(path, notes=notes)

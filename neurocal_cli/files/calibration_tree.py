@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
-from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StraightLines
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
+from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError

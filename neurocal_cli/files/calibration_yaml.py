@@ -16,8 +16,8 @@ from itertools import chain
 import numpy as np
 
 from neurocal_cli import __version__
-from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StraightLines
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
+from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.files import calibration_blocks as blocks

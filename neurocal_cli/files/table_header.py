@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import UNDISTORTED
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.failures import one_line, value_failures
 from neurocal_cli.files.tree_fields import is_number
 from neurocal_cli.observations.distances import Distance
-from neurocal_cli.observations.points import UNDISTORTED
 
 # 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.network.network import Patterns, e_2d, e_orth, optimal_gamma, output
+from neurocal_cli.network.network import e_2d, e_orth, optimal_gamma, output
+from neurocal_cli.network.patterns import Patterns
 from neurocal_cli.network.trainers import Task, Trained
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in

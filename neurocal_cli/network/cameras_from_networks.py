@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.network.orthogonality import pose_from_product, shared_intrinsics
 from neurocal_cli.network.view_networks import Group
 

@@ -22,7 +22,8 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.median import median
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.network.network import Patterns, random_weights
+from neurocal_cli.network.network import random_weights
+from neurocal_cli.network.patterns import Patterns, patterns_of
 from neurocal_cli.network.trainers import Task
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
@@ -114,7 +115,7 @@ class _Search:
 
     def __init__(self, views: Views, members: NDArray[np.intp], flat: bool, rng: np.random.Generator) -> None:
         self.views, self.members, self.flat, self.rng = views, members, flat, rng
-        self.patterns = views.patterns(members, flat, _MOST_SEEN, rng)
+        self.patterns = patterns_of(views, members, flat, _MOST_SEEN, rng)
         self.real = self.patterns.weights > 0
         K, n = self.real.shape
         self.product = np.zeros((K, 3, self.patterns.n_inputs))

@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.camera.geometry import nearest_rotation
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.network.options import MOST_POINTS, Options
+from neurocal_cli.network.patterns import patterns_of
 from neurocal_cli.network.trainers import Task
 
 
@@ -31,7 +32,7 @@ def train_constrained(problem: Problem, options: Options, state: CameraState) ->
     V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
     free_W = np.zeros((3, 3), dtype=bool)
     free_W[ENTRIES] = problem.free
-    patterns = views.patterns(np.array([0]), False, MOST_POINTS)
+    patterns = patterns_of(views, np.array([0]), False, MOST_POINTS)
     task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
     trained = options.constrained(task, 1.0 / depth**2)
     entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])

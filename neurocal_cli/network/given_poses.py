@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.adjustment.units import translations_normalised
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.network import Patterns
 from neurocal_cli.network.options import MOST_POINTS, Options
+from neurocal_cli.network.patterns import Patterns, patterns_of
 from neurocal_cli.network.starts import learn
 
 # With a wide lens: least depth of a training point as a share of its distance (60 degrees from the axis), and
@@ -36,7 +36,7 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     wide = problem.distortion.wide
     if not wide:
         _check_in_front(views, R, t)
-    rows = views.patterns(np.arange(views.n_views), False, MOST_POINTS, rng)
+    rows = patterns_of(views, np.arange(views.n_views), False, MOST_POINTS, rng)
     # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
     hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
     # Each view has its own scale, which gamma absorbs. Gamma starts at 1, so depths should be about 1, "with

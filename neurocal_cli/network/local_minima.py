@@ -18,8 +18,9 @@ from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import solve_or_nan
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, squared_errors
+from neurocal_cli.adjustment.reprojection import squared_errors
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.view_networks import Group
 

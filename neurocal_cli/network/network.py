@@ -18,33 +18,10 @@ Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-
-
-@frozen_dataclass(eq=False)
-class Patterns:
-    """Training data of a stack of G networks."""
-
-    inputs: Array  # (G, N, I) normalised world points, with the last input 1; shared if G is 1
-    targets: Array  # (G, N, 3) normalised pixels (u, v, 1)
-    weights: Array  # (G, N) weight w_i of each pattern; 0 for padding
-
-    @property
-    def n_inputs(self) -> int:
-        """I: 4 for points in space, 3 for points of a plane."""
-        return self.inputs.shape[2]
-
-    def take(self, networks: NDArray[np.intp]) -> Patterns:
-        """Patterns of some of the networks."""
-        return Patterns(self.inputs[networks], self.targets[networks], self.weights[networks])
-
-    def rms(self, loss: Array) -> Array:
-        """Root mean square error of each network whose E_2D is `loss`; (G,)."""
-        return np.sqrt(2 * loss / np.maximum(self.weights.sum(axis=1), 1e-300))
+from neurocal_cli.network.patterns import Patterns
 
 
 def random_weights(rng: np.random.Generator, networks: int, n_inputs: int) -> tuple[Array, Array]:

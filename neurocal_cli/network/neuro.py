@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.cameras_from_networks import cameras_from_products, candidate_intrinsics
 from neurocal_cli.network.constrained_training import train_constrained

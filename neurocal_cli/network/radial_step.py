@@ -19,11 +19,11 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.schur_complement import schur_step
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.network.view_networks import Group
 
 _RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.point_batches import PointBatches
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
-from neurocal_cli.network.network import Patterns
+from neurocal_cli.camera.state import CameraState
+from neurocal_cli.network.patterns import Patterns, patterns_of
 
 # Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64
@@ -45,7 +45,7 @@ def find_poses(
 
     `entries` (1, 5) are the normalised A11, A12, A22, A13, A23, and `starts` is the number for each view.
     """
-    patterns = views.patterns(which, flat=False, most=_MOST_POINTS, rng=rng)
+    patterns = patterns_of(views, which, flat=False, most=_MOST_POINTS, rng=rng)
     many = patterns.take(np.repeat(np.arange(len(which)), starts))
     R = nearest_rotation(rng.uniform(-1, 1, (len(many.weights), 3, 3)))
     state = CameraState(entries, R, _translation(entries, R, many))
@@ -67,7 +67,7 @@ def find_camera(
     `given` (5,) are the normalised entries where `free` (5,) is False. A new batch is started only after
     fewer than `starts` starts.
     """
-    patterns = views.patterns(np.array([0]), flat=False, most=_MOST_POINTS, rng=rng)
+    patterns = patterns_of(views, np.array([0]), flat=False, most=_MOST_POINTS, rng=rng)
     best, cost, agreed, iterations, used = None, np.inf, 0, 0, 0
     while used < starts and agreed < 2:
         many = patterns.take(np.zeros(_BATCH, dtype=np.intp))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.network.network import Patterns
+from neurocal_cli.network.patterns import Patterns
 
 
 @frozen_dataclass(eq=False)

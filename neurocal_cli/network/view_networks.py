@@ -13,8 +13,9 @@ from neurocal_cli.adjustment.solution import TrainingRecord
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.network import Patterns, residual_jacobian
+from neurocal_cli.network.network import residual_jacobian
 from neurocal_cli.network.options import MOST_POINTS, Options
+from neurocal_cli.network.patterns import Patterns, patterns_of
 from neurocal_cli.network.starts import learn
 from neurocal_cli.network.trainers import Task
 
@@ -70,9 +71,9 @@ def _train_group(
     record: TrainingRecord,
 ) -> tuple[Group, TrainingRecord]:
     views = problem.views
-    every = views.patterns(members, flat, MOST_POINTS)
+    every = patterns_of(views, members, flat, MOST_POINTS)
     small = every.weights.size <= _SMALL
-    some = every if small else views.patterns(members, flat, options.start_points[0 if flat else 1], rng)
+    some = every if small else patterns_of(views, members, flat, options.start_points[0 if flat else 1], rng)
     W = _given_weights(problem)
     learnt = learn(some, options.trainer, rng, options.starts, options.agreement, W=W)
     iterations = learnt.iterations
@@ -99,7 +100,7 @@ def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
     """
     if problem.views.n_views > 1 or groups[0].flat:
         return
-    patterns = problem.views.patterns(np.array([0]), False, MOST_POINTS)
+    patterns = patterns_of(problem.views, np.array([0]), False, MOST_POINTS)
     product = groups[0].product
     _, J = residual_jacobian(np.eye(3)[None], product / np.linalg.norm(product), patterns)
     J = J.reshape(-1, 12)
@@ -135,7 +136,7 @@ def _pixel_error(
     # The patterns of a large view are a subsample, but the bound must cover all of its points.
     total = np.empty(len(members))
     for k, count in enumerate(counts):
-        whole = problem.views.patterns(members[k : k + 1], flat, int(count))
+        whole = patterns_of(problem.views, members[k : k + 1], flat, int(count))
         total[k] = _squared_error(product[k : k + 1], whole)[0]
     return total
 

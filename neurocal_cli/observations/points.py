@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import UNDISTORTED, Array
 from neurocal_cli.camera.given_values import checked_size, real_array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.distances import Distance
-
-UNDISTORTED = ("plane", "cylinder", "equirectangular")
-"""Shapes that undistorted pixels are projected on."""
 
 _ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.parameter_uncertainty import parameter_covariance, pose_std
 from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.calibration.other_methods.calibrate_by import problem_for_method
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.processes import work_through
 from neurocal_cli.network.options import Progress

@@ -30,6 +30,7 @@ from neurocal_cli.files.processes import work_through
 from neurocal_cli.network.backprop import BackpropOptions, train_backprop
 from neurocal_cli.network.network import output, random_weights
 from neurocal_cli.network.options import Progress, options_for
+from neurocal_cli.network.patterns import patterns_of
 from neurocal_cli.network.starts import learn
 from neurocal_cli.network.trainers import Task
 from neurocal_cli.observations.points import Correspondences
@@ -143,7 +144,7 @@ def _calibrated(data: DataSet) -> tuple[float, float]:
 def _one_start(seed: int, number: int, rates: tuple[float, float]) -> tuple[float, float]:
     """Whether one random start converges, and its number of epochs."""
     views = arrange(data_set(seed, number).points)
-    patterns = views.patterns(np.array([0]), False, int(views.counts[0]))
+    patterns = patterns_of(views, np.array([0]), False, int(views.counts[0]))
     rng = np.random.default_rng((seed, number, 1))
     W, V = random_weights(rng, 1, 4)
     free = np.ones((3, 3), dtype=bool), np.ones((3, 4), dtype=bool)

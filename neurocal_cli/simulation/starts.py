@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem, problem_for
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.other_methods.nonlinear import descend, least_squares, nonlinear
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.processes import work_through
 from neurocal_cli.network.cameras_from_networks import cameras_from_products, candidate_intrinsics

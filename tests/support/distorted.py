@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration
@@ -18,6 +17,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import is_monotonic, monotonic_radius
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from support.plain_projection import project
 from support.scenes import Scene, random_flat_set

@@ -11,11 +11,12 @@ from neurocal_cli import calibrate
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.problem import Problem, problem_for
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from support.plain_projection import project
 

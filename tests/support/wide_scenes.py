@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.monotonic import largest_angle
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 SIZE = (1000, 800)

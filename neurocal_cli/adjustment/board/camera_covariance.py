@@ -18,13 +18,14 @@ from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, cova
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.adjustment.view_covariance import counting_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 

@@ -36,11 +36,11 @@ from neurocal_cli.adjustment.board.prior import SINGLE, prior_of
 from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.units import in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.median import median
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.bends import N_SHAPES, Bends, surface_of
 from neurocal_cli.observations.planes import planes_of
 from neurocal_cli.observations.target import Target, distinct_points, scale_of_points

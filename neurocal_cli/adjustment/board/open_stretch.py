@@ -20,10 +20,11 @@ from neurocal_cli.adjustment.leave_out import solve_or_nan
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
 from neurocal_cli.adjustment.point_batches import PointBatches
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, displaced_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, displaced_blocks
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.planes import is_flat
 
 # Prior odds of a stretch, and of a small and a large lean, by its size over STRETCH. Larger odds make clean

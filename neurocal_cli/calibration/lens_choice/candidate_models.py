@@ -16,7 +16,7 @@ from neurocal_cli.adjustment.open_coefficients import radius
 from neurocal_cli.adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle, normal_blocks
+from neurocal_cli.adjustment.reprojection import farthest_angle, normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.view_covariance import counting_views
 from neurocal_cli.adjustment.views import Views
@@ -33,6 +33,7 @@ from neurocal_cli.camera.distortion import (
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and

@@ -25,7 +25,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.observability import is_weak
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.adjustment.solution import Solution
@@ -33,6 +33,7 @@ from neurocal_cli.calibration.lens_choice.monotonic_fit import fit_monotonic, fo
 from neurocal_cli.calibration.lens_choice.simpler_model import undetermined_coefficients
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted, Penalty
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -37,6 +36,7 @@ from neurocal_cli.camera.monotonic import (
 )
 from neurocal_cli.camera.polynomial import untilted
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 # Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import damped_step, unit_diagonal
 from neurocal_cli.adjustment.views import noise_model
-from neurocal_cli.calibration.calibration import StraightLines
 from neurocal_cli.calibration.lens_choice.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
 from neurocal_cli.calibration.lens_choice.straightness import (
     DistortedLines,
@@ -29,7 +28,7 @@ from neurocal_cli.calibration.lens_choice.straightness import (
     distorted_lines,
     straightness_error,
 )
-from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.distortion import Distortion, StraightLines
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import undistort

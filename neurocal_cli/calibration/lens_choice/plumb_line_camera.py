@@ -33,7 +33,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, derivatives, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, derivatives, normal_blocks
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.calibration.lens_choice.straightness import CAMERA, DistortedLines, distorted_lines
@@ -41,6 +41,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names, distor
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import normalised_points
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.measured_directions import rounded
 from neurocal_cli.observations.points import Correspondences

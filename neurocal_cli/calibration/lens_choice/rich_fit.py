@@ -36,7 +36,7 @@ from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.open_coefficients import fisheye_sizes
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.reweighting import reweighted
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
@@ -44,6 +44,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
+from neurocal_cli.camera.state import CameraState
 
 _N = len(NODES)
 # Indices of k1 to k4 and the nodes among the coefficients; and the parts of these unknowns.

@@ -21,12 +21,13 @@ from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.normal_equations import ROUNDING, unit_diagonal
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.given_model import total_cost
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.similar_lens import similar_states
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors
 # as large as their standard deviations.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.state import CameraState
 
 
 @frozen_dataclass(eq=False)

@@ -30,15 +30,16 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.units import translations_normalised
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.other_methods.found import Found, as_seen
 from neurocal_cli.camera.absolute_conic import omega_of, product_of
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.network.cameras_from_networks import cameras_from_products
+from neurocal_cli.network.patterns import patterns_of
 from neurocal_cli.network.view_networks import Group, begin_flat
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
@@ -89,7 +90,7 @@ def whole_groups(problem: Problem, fewest: tuple[int, int]) -> list[tuple[NDArra
 
 def _products(views: Views, members: NDArray[np.intp], flat: bool) -> Array:
     """Product A D of each view in normalised coordinates, with the centroid in front; (K, 3, I)."""
-    patterns = views.patterns(members, flat, int(views.counts.max()))
+    patterns = patterns_of(views, members, flat, int(views.counts.max()))
     Z, uv, w = patterns.inputs, patterns.targets[..., :2], np.sqrt(patterns.weights)[..., None]
     K, _, n = Z.shape
     zero = np.zeros_like(Z)

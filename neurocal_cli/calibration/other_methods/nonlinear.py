@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState, residuals
+from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.other_methods.found import Found, as_seen
 from neurocal_cli.calibration.other_methods.linear import linear_state
 from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 _DENSE = 150  # greatest number of unknowns for which MINPACK is faster than a sparse trust region
 _TOLERANCE = 1e-12

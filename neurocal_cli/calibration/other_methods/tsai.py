@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.other_methods.found import Found, as_seen
 from neurocal_cli.calibration.other_methods.linear import smallest, whole_groups
@@ -38,7 +37,9 @@ from neurocal_cli.calibration.other_methods.nonlinear import Minimum, least_pixe
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.projection import normalised_points
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.network.patterns import patterns_of
 
 _FEWEST = 5, 7  # points of a flat and of a solid view; each gives one equation
 _DISTORTIONS = ("none", "k1")
@@ -123,7 +124,7 @@ class _Alignment:
 
 def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bool) -> _Alignment:
     """Stage 1: radial alignment of some views; x and y (N,) are the points relative to the centre."""
-    patterns = views.patterns(members, flat, int(views.counts.max()))
+    patterns = patterns_of(views, members, flat, int(views.counts.max()))
     M, w = patterns.inputs[..., :-1], np.sqrt(patterns.weights)[..., None]
     rank = np.minimum(np.arange(M.shape[1]), views.counts[members][:, None] - 1)
     place = views.first[members][:, None] + rank

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
 from neurocal_cli.adjustment.point_batches import PointBatches
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.schur_complement import SharedAndOwn
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.state import CameraState
 
 _Linearised = tuple["RigState", Array]  # a state and its normal matrices
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped

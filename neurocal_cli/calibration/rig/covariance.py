@@ -28,9 +28,15 @@ from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.leave_out import Quadratics
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
-from neurocal_cli.adjustment.open_coefficients import OpenPrior, open_of_calibration, spread_of_open
+from neurocal_cli.adjustment.open_coefficients import (
+    OpenCoefficients,
+    OpenPrior,
+    open_at_points,
+    spread_of_open,
+)
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.adjustment.schur_complement import eliminate
+from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
@@ -146,13 +152,18 @@ def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDAr
     return label if batches.whitening is None else np.where(batches.whitening[:, 0] == 0, -1, label)
 
 
+def _open_of(calibration: Calibration, k: Array, free: NDArray[np.bool_]) -> OpenCoefficients | None:
+    state = replace(calibration.state(calibration.points.view_names), k=k)
+    return open_at_points(state, calibration.points, free, tuple(calibration.lens_choice))
+
+
 def covariance_of_choice(fit: RigFit) -> Array | None:
     """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
     problem, before = fit.problem, fit.state
     own = [fit.free[place] for place in before.columns.cameras]
     # A camera that the common bundle adjustment did not change has no open coefficients either.
     opened = [
-        open_of_calibration(calibration, free, camera.k) if free.any() else None
+        _open_of(calibration, camera.k, free) if free.any() else None
         for calibration, free, camera in zip(problem.calibrations, own, before.cameras, strict=True)
     ]
     if opened == [None, None]:

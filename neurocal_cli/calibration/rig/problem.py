@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.point_batches import batches_of
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.reweighting import weighed
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
@@ -18,6 +18,7 @@ from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.median import median
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 
 # Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
 # test_without_noise_the_truth_comes_back checks such data.

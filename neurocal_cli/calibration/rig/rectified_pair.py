@@ -16,9 +16,9 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.undistortion import map_points, shown
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.undistorted_points import map_points, shown
 
 _ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
 _LINES = 16  # over the images

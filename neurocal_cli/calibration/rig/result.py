@@ -17,7 +17,7 @@ from neurocal_cli.adjustment.parameter_uncertainty import (
     with_scale,
 )
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, residuals
+from neurocal_cli.adjustment.reprojection import POSE, residuals
 from neurocal_cli.adjustment.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
@@ -29,6 +29,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import scale_of
 

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.calibration import Calibration, camera_of
+from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.two_view_points import PointBatch
 from neurocal_cli.calibration.rig.wide_points import WidePointBatch
-from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array

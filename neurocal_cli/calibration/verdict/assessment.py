@@ -23,7 +23,6 @@ from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.reweighting import weighed
-from neurocal_cli.adjustment.stored_state import stored_state
 from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import Views, arrange
@@ -107,7 +106,7 @@ def _views_behind(calibration: Calibration) -> int:
     For a wide lens: with points outside the domain of its model.
     """
     points, view = calibration.points, calibration.points.view_index
-    state = stored_state(calibration, points.view_names)
+    state = calibration.state(points.view_names)
     if calibration.camera.distortion.wide:
         seen = calibration.camera.sees((state.R[view] @ points.world[..., None])[..., 0] + state.t[view])
     else:
@@ -122,7 +121,7 @@ class _AtMinimum:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
         views = [calibration.views[name] for name in self.points.view_names]
-        self.camera, self.given = calibration.camera, stored_state(calibration, self.points.view_names)
+        self.camera, self.given = calibration.camera, calibration.state(self.points.view_names)
         self.views = self._arranged(self.points)
         self.free = estimated_parameters(calibration)
         if xi_is_flat(calibration.distortion_model, calibration.distortion):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 _CELLS = 6  # across and down

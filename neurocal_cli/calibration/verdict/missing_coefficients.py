@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.cross_validation import Minimum, reduced
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
-from neurocal_cli.adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 _STEPS = 60
 _ENOUGH = 60  # views: more are not needed

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.bend_evidence import least_by_precision
 from neurocal_cli.adjustment.board.posterior import log_evidence
 from neurocal_cli.adjustment.leave_out import Quadratics
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.view_change import directions
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_moving_centre.py (slow): of 30 sets of 15 views with focal lengths of 900 to 1500 px
 # shifts of 20 px are found in all, and of 10 px in nine of ten; none where a board bends from view to view.

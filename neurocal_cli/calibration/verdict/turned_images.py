@@ -21,13 +21,13 @@ from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import Quadratics
 from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.moving_centre import least_with_own_centres
 from neurocal_cli.calibration.verdict.view_groups import divided
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 # Repeated by tests/test_turned_images.py. Turned images of photographs explain 0.83 to 0.98 of what centres

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_view_change.py: on clean scenes there is less than one false alarm in a hundred, and
 # on real boards, whose views differ by more than noise, none.

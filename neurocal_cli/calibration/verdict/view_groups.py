@@ -17,10 +17,10 @@ from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import Quadratics
 from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks
-from neurocal_cli.adjustment.reprojection import CameraState
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
 
 # Cost per condition in units of the noise variance: least cost of a contradiction, and largest cost that may
 # remain. Of 200 clean sets of 5 to 40 views none exceeds the first: tests/test_view_groups.py repeats it.

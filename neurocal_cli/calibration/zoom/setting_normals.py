@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.schur_complement import eliminate
 from neurocal_cli.adjustment.units import translations, translations_normalised
 from neurocal_cli.adjustment.views import Views, arrange
@@ -26,6 +26,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.state import CameraState
 
 _POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 

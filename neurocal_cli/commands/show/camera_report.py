@@ -19,6 +19,7 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.commands.show.verdict_report import verdict_json, verdict_lines
+from neurocal_cli.errors import plural
 from neurocal_cli.observations.target import Target, scale_of
 
 if TYPE_CHECKING:
@@ -240,11 +241,6 @@ def _pixels(value: float) -> str:
 def printable(name: str) -> str:
     """The name as printable text on one line, with other characters escaped."""
     return name if name.isprintable() else ascii(name)[1:-1]
-
-
-def plural(count: int, noun: str) -> str:
-    """A number with its noun."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def parameter_rows(calibration: Calibration) -> list[list[str]]:

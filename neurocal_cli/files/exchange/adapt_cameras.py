@@ -12,8 +12,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.commands.show.camera_report import plural
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, plural
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 
 _NO_SKEW = 1e-3  # px; a smaller loss is not reported
