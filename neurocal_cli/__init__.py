@@ -20,11 +20,9 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.fit_rig import fit_rig
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.triangulation import triangulate
-    from neurocal_cli.calibration.zoom.camera_at import camera_at
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
-    from neurocal_cli.calibration.zoom.fit_cameras import fit_lens_cameras
-    from neurocal_cli.calibration.zoom.fit_points import fit_lens
-    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+    from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
+    from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.camera.remapping import undistort_image
@@ -56,14 +54,14 @@ _HOMES = {
     "Rig": "calibration.rig.rig",
     "calibrate": "calibration.calibrate",
     "calibrate_stereo": "calibration.rig.calibrate_stereo",
-    "camera_at": "calibration.zoom.camera_at",
+    "camera_at": "calibration.zoom.zoom_lens",
     "detect_points": "detection.detect",
     "evaluate_camera": "calibration.evaluation",
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
-    "fit_lens": "calibration.zoom.fit_points",
-    "fit_lens_cameras": "calibration.zoom.fit_cameras",
+    "fit_lens": "calibration.zoom.fit",
+    "fit_lens_cameras": "calibration.zoom.fit",
     "fit_rig": "calibration.rig.fit_rig",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_tree",

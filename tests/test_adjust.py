@@ -14,9 +14,9 @@ from support.distorted import BENT, SIGMA, bent_set
 from support.slow_cases import slow_but
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
 from neurocal_cli.adjustment.problem import intrinsic_matrix, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
+from neurocal_cli.adjustment.views import PointBatches, batches_of
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState

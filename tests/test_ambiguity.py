@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neurocal_cli.adjustment.ambiguity import Ambiguity
+from neurocal_cli.adjustment.solution import Ambiguity
 
 FREE = np.array([True, False, True, True, True, True, True])
 XI = 4  # its place among what is free

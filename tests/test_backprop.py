@@ -30,8 +30,7 @@ from neurocal_cli.network.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.network.patterns import Patterns
-from neurocal_cli.network.trainers import Task
+from neurocal_cli.network.training import Patterns, Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
 CENTRED = UPPER & (np.arange(3) < 2)

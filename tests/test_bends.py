@@ -14,7 +14,7 @@ from support.simulated_targets import draw, outcome
 from support.targets import board
 
 from neurocal_cli import calibrate
-from neurocal_cli.adjustment.board.uncertainty import covariance_basis
+from neurocal_cli.adjustment.board.camera_covariance import covariance_basis
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import _fit as fit_of
@@ -27,8 +27,8 @@ from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_calibration
-from neurocal_cli.observations.bends import Bends, surface_of
 from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.target import Bends, surface_of
 
 FLEXING = draw("flexing", 29)  # eight views
 

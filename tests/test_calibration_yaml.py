@@ -20,8 +20,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import calibration_lines, format_calibration
 from neurocal_cli.files.result_files import write_calibration
-from neurocal_cli.files.yaml_text import number, quoted, text
-from neurocal_cli.files.yaml_tree import parse_yaml
+from neurocal_cli.files.yaml_text import number, parse_yaml, quoted, text
 from neurocal_cli.observations.points import Correspondences
 
 # Without NUL, which NumPy drops at the end of a label.

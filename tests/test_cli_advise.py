@@ -25,7 +25,7 @@ from neurocal_cli.calibration.advice import (
     worst_std,
 )
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.commands.show.advice_report import advice_lines
+from neurocal_cli.commands.show.advice import advice_lines
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.result_files import lean_calibration
 

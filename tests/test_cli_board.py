@@ -20,8 +20,14 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
 from neurocal_cli.observations.board import Plane
-from neurocal_cli.observations.printed_sheet import PAPERS, Sheet, default_board, on_paper, paper_size
-from neurocal_cli.observations.unfolding import unfolded
+from neurocal_cli.observations.printed_sheet import (
+    PAPERS,
+    Sheet,
+    default_board,
+    on_paper,
+    paper_size,
+    unfolded,
+)
 
 MM = 72 / 25.4  # points
 CORNER = """\

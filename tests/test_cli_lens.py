@@ -14,8 +14,8 @@ from click.testing import Result
 from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
-from neurocal_cli.calibration.zoom.camera_at import camera_at
-from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.fit import fit_lens
+from neurocal_cli.calibration.zoom.zoom_lens import camera_at
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
@@ -324,7 +324,7 @@ def test_the_options_are_those_of_the_library() -> None:
 
     import click
 
-    from neurocal_cli.calibration.zoom.fit_points import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
+    from neurocal_cli.calibration.zoom.fit import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
     from neurocal_cli.commands.lens import fit
 
     library = inspect.signature(fit_lens).parameters

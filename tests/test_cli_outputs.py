@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.command_line import run
 
-from neurocal_cli.files.outputs import Outputs
+from neurocal_cli.files.writing import Outputs
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 

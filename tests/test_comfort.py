@@ -19,9 +19,9 @@ from support.command_line import run
 from neurocal_cli import Board, read_image
 from neurocal_cli.commands import streams
 from neurocal_cli.commands.detect import _another_board, _shown
+from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
-from neurocal_cli.detection.outcome import Outcome
 from neurocal_cli.files.image_headers import stated_sizes
 from neurocal_cli.files.image_paths import find_images, natural_order
 

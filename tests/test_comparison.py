@@ -13,8 +13,7 @@ from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
 from neurocal_cli.commands import options
-from neurocal_cli.simulation.by_method import METHODS, calibrate_with
-from neurocal_cli.simulation.comparison import compare
+from neurocal_cli.simulation.comparison import METHODS, calibrate_with, compare
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 CORNER = """

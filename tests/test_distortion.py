@@ -11,8 +11,8 @@ from support.scenes import Scene, board_midpoints, random_flat_set, table_1
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
-from neurocal_cli.adjustment.point_batches import batches_of
 from neurocal_cli.adjustment.reprojection import normal_blocks, residuals
+from neurocal_cli.adjustment.views import batches_of
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion

@@ -11,12 +11,12 @@ from support.folded import Folded, folded, random_corner
 from support.rigs import corner
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.adjustment.board.gauge import gauge_of, nearest_to_given
+from neurocal_cli.adjustment.board.prior import gauge_of, nearest_to_given
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.commands.show.camera_report import target_json, target_lines
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.observations.planes import is_flat, planes_of
+from neurocal_cli.observations.board import is_flat, planes_of
 
 INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 slow = pytest.mark.slow

@@ -14,11 +14,16 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
-from neurocal_cli.detection.identity.ends import DIRECTIONS, End, board_ends
-from neurocal_cli.detection.identity.identify import identify
-from neurocal_cli.detection.identity.linear_camera import fit_camera, rigid_motion
+from neurocal_cli.detection.identity.identify import fit_camera, identify, rigid_motion
 from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError
-from neurocal_cli.detection.identity.placement import Placement, placements, trimmed
+from neurocal_cli.detection.identity.placement import (
+    DIRECTIONS,
+    End,
+    Placement,
+    board_ends,
+    placements,
+    trimmed,
+)
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import Rendered, Scene, Sides, Target, ground_truth
 

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
-from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, inverse_scaled, solve_scaled
-from neurocal_cli.adjustment.schur_complement import eliminate, schur_covariance, schur_step
+from neurocal_cli.adjustment.normal_equations import (
+    ROUNDING,
+    damped_step,
+    eliminate,
+    inverse_scaled,
+    schur_covariance,
+    schur_step,
+    solve_scaled,
+)
 from neurocal_cli.camera.geometry import Array
 
 Residuals = Callable[[Array], tuple[Array, Array]]  # p (n,) -> r (m,) and dr/dp (m, n)

@@ -19,7 +19,7 @@ from neurocal_cli.network.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.network.patterns import Patterns
+from neurocal_cli.network.training import Patterns
 
 NETWORKS, POINTS = 3, 7
 RELATIVE = 1e-6

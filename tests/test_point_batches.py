@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.adjustment.views import PointBatches, batches_of
 from neurocal_cli.camera.geometry import Array
 
 counts_of = st.lists(

@@ -10,12 +10,11 @@ from support.rigs import random_rig, sides
 
 from neurocal_cli import Pose, Rig
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
-from neurocal_cli.calibration.rig.rectification import rectify
-from neurocal_cli.calibration.rig.rectified_pair import rectified_pair
+from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.files.rig_yaml import format_ros_pair
-from neurocal_cli.files.yaml_tree import parse_yaml
+from neurocal_cli.files.yaml_text import parse_yaml
 
 POSES = {
     "side by side": Pose.from_euler(0.02, 0.05, -0.01, np.array([-80.0, 3.0, 5.0])),

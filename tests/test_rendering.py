@@ -34,9 +34,8 @@ from neurocal_cli.simulation.rendering import (
     ground_truth,
     render,
 )
-from neurocal_cli.simulation.rendering.blur import Blur
 from neurocal_cli.simulation.rendering.layers import half_plane
-from neurocal_cli.simulation.rendering.render import digitised, image_light
+from neurocal_cli.simulation.rendering.render import Blur, digitised, image_light
 
 SMALL = Camera(Intrinsics(250.0, 252.0, 81.0, 58.0), image_size=(160, 120))
 PLANE = Plane("", 5, 4, 10.0)

@@ -10,9 +10,9 @@ from support.scenes import random_flat_set
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.adjustment.cross_validation import FOLDS
+from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import point_residuals
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.camera.state import CameraState
 

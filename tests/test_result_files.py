@@ -28,7 +28,7 @@ from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_result
 from neurocal_cli.files.rig_yaml import format_rig
-from neurocal_cli.files.yaml_tree import parse_yaml
+from neurocal_cli.files.yaml_text import parse_yaml
 
 
 @pytest.fixture(scope="module")

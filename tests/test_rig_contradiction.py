@@ -10,11 +10,10 @@ from support.rigs import RigScene, random_rig
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
 from neurocal_cli import Correspondences, calibrate, fit_rig
-from neurocal_cli.calibration.rig.adjust import RigProblem, adjust_rig
+from neurocal_cli.calibration.rig.adjust import RigProblem, adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.contradiction import Contradiction, contradiction, odd_pairs
 from neurocal_cli.calibration.rig.covariance import not_smaller
 from neurocal_cli.calibration.rig.pairing import pair_views
-from neurocal_cli.calibration.rig.problem import rig_problem
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.sound_pairs import find_consensus

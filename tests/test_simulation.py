@@ -14,18 +14,17 @@ from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.other_methods.nonlinear import nonlinear
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.comparison_report import text_of
-from neurocal_cli.commands.show.simulation_plots import draw_rates
-from neurocal_cli.commands.show.simulation_report import (
+from neurocal_cli.commands.show.methods_report import (
     noise_json,
     rates_json,
     rates_tables,
     simulation_tables,
+    text_of,
 )
+from neurocal_cli.commands.show.simulation_plots import draw_rates
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.observations.board import Board
 from neurocal_cli.simulation.noise import NoiseStudy, cramer_rao, study_noise
-from neurocal_cli.simulation.pictures import pictures, visible_points
 from neurocal_cli.simulation.rates import data_set, study_rates
 from neurocal_cli.simulation.scenes import (
     PAPER_BOARD,
@@ -33,9 +32,11 @@ from neurocal_cli.simulation.scenes import (
     PAPER_POSE,
     calibrated_scene,
     paper_scene,
+    pictures,
     random_poses,
     scene_of,
     true_calibration,
+    visible_points,
 )
 from neurocal_cli.simulation.starts import can_start, single_start, study_starts
 

@@ -7,9 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.network.patterns import Patterns
 from neurocal_cli.network.starts import Agreement, Learnt, learn
-from neurocal_cli.network.trainers import Task, Trained
+from neurocal_cli.network.training import Patterns, Task, Trained
 
 K, N = 3, 8
 

@@ -5,9 +5,8 @@ import pytest
 from support.rigs import RigScene, all_residuals, random_rig
 
 from neurocal_cli import calibrate
-from neurocal_cli.calibration.rig.adjust import RigProblem, RigState, adjust_rig
+from neurocal_cli.calibration.rig.adjust import RigProblem, RigState, adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.pairing import pair_views
-from neurocal_cli.calibration.rig.problem import rig_problem
 from neurocal_cli.calibration.rig.sound_pairs import find_consensus
 from neurocal_cli.camera.geometry import Array
 

@@ -27,8 +27,7 @@ from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.files.result_files import write_calibration
 from neurocal_cli.files.rig_yaml import read_rig
-from neurocal_cli.observations.board import Plane
-from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.board import Plane, planes_of
 from neurocal_cli.observations.target import board_of
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"

@@ -13,7 +13,6 @@ from neurocal_cli import Camera, Intrinsics, calibrate
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board import find as find_module
 from neurocal_cli.adjustment.board import posterior as posterior_module
-from neurocal_cli.adjustment.board.coordinates import coordinates_of
 from neurocal_cli.adjustment.board.find import LEAST_GAIN, evidence_as_given, find_target, sight_of
 from neurocal_cli.adjustment.board.information import Information, folded_information, information_of, joined
 from neurocal_cli.adjustment.board.posterior import (
@@ -22,11 +21,10 @@ from neurocal_cli.adjustment.board.posterior import (
     posterior,
     prior_covariance,
 )
-from neurocal_cli.adjustment.board.prior import Prior, prior_of
+from neurocal_cli.adjustment.board.prior import Prior, coordinates_of, prior_of
 from neurocal_cli.adjustment.board.system import PointsFirst, PosesFirst
-from neurocal_cli.adjustment.problem import Problem, problem_for
+from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
-from neurocal_cli.adjustment.units import in_pixels, normalised
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.lens_choice.lens_and_target import named_lens_is_too_simple
@@ -34,7 +32,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import nearest_similarity, rotation_step
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import options_for
-from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.board import planes_of
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import distinct_points
 

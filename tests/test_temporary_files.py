@@ -9,14 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from neurocal_cli.files.outputs import remove_stale, temporary_name
-from neurocal_cli.files.writing import write_whole
+from neurocal_cli.files.writing import remove_stale, temporary_name, write_whole
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="nothing is removed elsewhere")
 
 
 def name_of_a_dead_process() -> str:
-    code = "from neurocal_cli.files.outputs import temporary_name; print(temporary_name())"
+    code = "from neurocal_cli.files.writing import temporary_name; print(temporary_name())"
     return subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.strip()

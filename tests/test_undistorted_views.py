@@ -20,7 +20,7 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistorted_view import PANORAMAS, SHAPES, Panorama, field_of_view, undistorted_view
 from neurocal_cli.camera.undistortion import sources, undistort_pixels
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_info import camera_info_lines
+from neurocal_cli.files.camera_tree import camera_info_lines
 from neurocal_cli.files.points_csv import read_points, write_points
 from neurocal_cli.observations.undistorted_points import shown
 

@@ -13,22 +13,23 @@ from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
 from neurocal_cli.calibration.evaluation import evaluate_camera
-from neurocal_cli.calibration.zoom.baseline_models import (
+from neurocal_cli.calibration.zoom.evaluation import (
+    _baseline_error,
+    _rms,
+    _squares,
     baselines_of,
+    evaluate_lens,
     grid_axes,
     monomials,
     powers_up_to,
     spline_matrix,
     thin_plate_matrix,
 )
-from neurocal_cli.calibration.zoom.camera_at import camera_at
-from neurocal_cli.calibration.zoom.committee import Budget, fit_committee
-from neurocal_cli.calibration.zoom.evaluation import _baseline_error, _rms, _squares, evaluate_lens
-from neurocal_cli.calibration.zoom.fit_cameras import LensCameras, fit_lens_cameras
-from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
 from neurocal_cli.calibration.zoom.judgement import judge_lens
+from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
 from neurocal_cli.calibration.zoom.settings import LensPoints
-from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.observations.points import Correspondences
 

@@ -10,28 +10,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.zoom_laws import grid, seen
 
-from neurocal_cli.calibration.zoom.committee import Budget, fit_committee
+from neurocal_cli.calibration.zoom.initialisation import (
+    calibrate_each,
+    common_tables,
+    first_constants,
+    local_covariance,
+)
 from neurocal_cli.calibration.zoom.joint_training import JointLearner, take_turns, train_joint
-from neurocal_cli.calibration.zoom.mlfn import Topology, respond, respond_with_jacobian
-from neurocal_cli.calibration.zoom.network_training import Schedule, train
+from neurocal_cli.calibration.zoom.mlfn import Schedule, Topology, respond, respond_with_jacobian, train
 from neurocal_cli.calibration.zoom.parameter_networks import (
     SCALES,
+    Budget,
     LensNets,
     ParameterNet,
+    fit_committee,
     from_scale,
     local_to_outputs,
     outputs_to_local,
     to_scale,
 )
 from neurocal_cli.calibration.zoom.quadratic_error import with_scatter
-from neurocal_cli.calibration.zoom.setting_normals import Constants, PixelData
-from neurocal_cli.calibration.zoom.settings import LensPoints, scaled_controls
-from neurocal_cli.calibration.zoom.static_calibration import (
-    calibrate_each,
-    common_tables,
-    first_constants,
-    local_covariance,
-)
+from neurocal_cli.calibration.zoom.settings import Constants, LensPoints, PixelData, scaled_controls
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.observations.points import Correspondences
 

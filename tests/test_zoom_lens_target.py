@@ -10,7 +10,7 @@ from support.targets import COLS, ROWS, board, offsets
 
 from neurocal_cli import Correspondences
 from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
-from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.fit import fit_lens
 from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.calibration.zoom.target import lens_target, on_target
 from neurocal_cli.calibration.zoom.zoom_lens import with_target_uncertain

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neurocal_cli import calibrate, read_points
-from neurocal_cli.commands.show.target_plot import draw_target
+from neurocal_cli.commands.show.camera_panels import draw_target
 
 HERE = Path(__file__).resolve().parent
 

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.adjustment.normal_equations import damped_step
-from neurocal_cli.adjustment.point_batches import PointBatches
+from neurocal_cli.adjustment.normal_equations import damped_step, schur_step
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
-from neurocal_cli.adjustment.schur_complement import schur_step
+from neurocal_cli.adjustment.views import PointBatches
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, orthonormalised
 from neurocal_cli.camera.state import CameraState

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
-from neurocal_cli.adjustment.point_batches import batches_of
+from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
-from neurocal_cli.adjustment.schur_complement import eliminate
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.views import Views, batches_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState

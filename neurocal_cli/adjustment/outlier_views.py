@@ -17,8 +17,7 @@ from neurocal_cli.adjustment.reprojection import POSE
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.state import CameraState
 
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,

@@ -12,8 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.point_batches import PointBatches, products
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.views import PointBatches, Views, products
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import project_points, project_with_jacobian

@@ -10,15 +10,14 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
-from neurocal_cli.adjustment.problem import Problem, problem_for
-from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.lens_and_target import (
     find_lens_and_target,
     named_lens_is_too_simple,
 )
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.board import planes_of
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, distinct_points
 

@@ -9,12 +9,11 @@ from functools import partial
 
 import numpy as np
 
+from neurocal_cli.adjustment.common_noise import reweighted
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.restart import restarted
-from neurocal_cli.adjustment.reweighting import reweighted
-from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.solution import Solution, restarted
 from neurocal_cli.calibration.lens_choice.given_model import (
     DENOMINATOR,
     check_distortion,

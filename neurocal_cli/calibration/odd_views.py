@@ -13,16 +13,15 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.adjustment.units import in_pixels, normalised
+from neurocal_cli.adjustment.problem import in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.network.cameras_from_networks import cameras_from_products
 from neurocal_cli.network.options import options_for
+from neurocal_cli.network.orthogonality import cameras_from_products
 from neurocal_cli.network.view_networks import train_networks
 from neurocal_cli.observations.points import Correspondences
 

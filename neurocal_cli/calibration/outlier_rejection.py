@@ -39,7 +39,7 @@ from neurocal_cli.network.consensus import (
 )
 from neurocal_cli.network.options import Options
 from neurocal_cli.network.radial_networks import middle_of_image
-from neurocal_cli.observations.planes import planes_of
+from neurocal_cli.observations.board import planes_of
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import distinct_points
 

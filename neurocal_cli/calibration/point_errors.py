@@ -14,8 +14,7 @@ from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.measured_directions import single, unit, variance_across
 from neurocal_cli.observations.points import Correspondences
 

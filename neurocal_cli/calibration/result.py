@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.board.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
-from neurocal_cli.adjustment.covariance import Covariance
-from neurocal_cli.adjustment.given_camera import covariance_by_camera, entry_covariance
-from neurocal_cli.adjustment.observability import refuse_undetermined
-from neurocal_cli.adjustment.outlier_views import seen_from_behind
-from neurocal_cli.adjustment.parameter_uncertainty import (
+from neurocal_cli.adjustment.covariance import (
+    Covariance,
+    covariance_by_camera,
+    entry_covariance,
     parameter_covariance,
     parameter_warnings,
     pose_std,
     with_scale,
 )
-from neurocal_cli.adjustment.problem import intrinsic_matrix
+from neurocal_cli.adjustment.observability import refuse_undetermined
+from neurocal_cli.adjustment.outlier_views import seen_from_behind
+from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
 from neurocal_cli.adjustment.solution import Solution, TargetPosterior
-from neurocal_cli.adjustment.units import normalised, translations
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
-from neurocal_cli.calibration.lens_choice.simpler_model import undetermined_coefficients
+from neurocal_cli.calibration.lens_choice.given_model import undetermined_coefficients
 from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose

@@ -14,11 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.cross_validation import held_out_views
-from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.problem import Problem, normalised
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.lens_choice.candidate_models import as_fisheye
 from neurocal_cli.calibration.lens_choice.model_selection import predicts_decidedly_better

@@ -10,6 +10,8 @@ Conventions
 * A point in front of the camera has positive depth.
 
 Arrays of rotations carry leading batch axes: ``(..., 3, 3)``.
+
+The median, where a command's start counts: `numpy.median` and `numpy.quantile` import numpy.ma, 10 ms.
 """
 
 from __future__ import annotations
@@ -202,3 +204,9 @@ def similarity(points: Array) -> tuple[Array, float]:
     centre = points.mean(axis=0)
     scale = float(np.abs(points - centre).max(initial=0.0))
     return centre, scale if scale > 0 else 1.0
+
+
+def median(values: Array) -> Array:
+    """Median along the first axis; of no values or with nan, not what NumPy makes of them."""
+    ordered = np.sort(values, axis=0)
+    return np.asarray((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)

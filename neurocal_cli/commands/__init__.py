@@ -74,7 +74,7 @@ class _LazyGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
-        from neurocal_cli.files.outputs import all_or_none
+        from neurocal_cli.files.writing import all_or_none
 
         with _one_line_errors(), all_or_none(finishing=(click.exceptions.Exit,)):
             return super().invoke(ctx)

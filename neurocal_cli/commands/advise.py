@@ -35,13 +35,13 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     options.check_plot(plot)
     preparation.check_outputs((plot,), (calibration,))
     from neurocal_cli.calibration.advice import advise as weigh
-    from neurocal_cli.commands.show.advice_report import advice_json, advice_lines
+    from neurocal_cli.commands.show.advice import advice_json, advice_lines
     from neurocal_cli.files.calibration_tree import read_calibration
 
     known = read_calibration(calibration)
     advice = weigh(known, count)
     if plot is not None:
-        from neurocal_cli.commands.show.advice_plot import draw_advice
+        from neurocal_cli.commands.show.advice import draw_advice
 
         write_plot(plot, draw_advice, advice, known)
     if as_json:

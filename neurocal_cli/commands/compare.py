@@ -86,7 +86,7 @@ def compare(
     if image_size is not None:
         given = [replace(one, image_size=image_size) for one in given]
 
-    from neurocal_cli.commands.show.comparison_report import comparison_json, comparison_report
+    from neurocal_cli.commands.show.methods_report import comparison_json, comparison_report
     from neurocal_cli.simulation.comparison import compare as compare_methods
 
     with ProgressBar() as progress:

@@ -30,9 +30,8 @@ from neurocal_cli.files.image_paths import find_images, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.detection.batch import DetectionOptions
+    from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.measuring import Points
-    from neurocal_cli.detection.outcome import Outcome
     from neurocal_cli.observations.board import Board
 
 _SECOND = 2  # images of another size that are no longer a single stray one
@@ -171,8 +170,7 @@ def _measured(board: Board | None) -> Board:
 def _wanted(
     board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None
 ) -> DetectionOptions:
-    from neurocal_cli.detection.batch import DetectionOptions
-    from neurocal_cli.detection.cache import DetectionCache
+    from neurocal_cli.detection.batch import DetectionCache, DetectionOptions
     from neurocal_cli.files.board_yaml import format_board
 
     kind = cast("Points", points)

@@ -85,8 +85,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     _tell(evaluation)
-    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
-    from neurocal_cli.commands.show.verdict_report import verdict_lines
+    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables, verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
@@ -200,12 +199,12 @@ def stereo(
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
+    from neurocal_cli.commands.show.camera_report import verdict_lines
     from neurocal_cli.commands.show.rig_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
     )
-    from neurocal_cli.commands.show.verdict_report import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:

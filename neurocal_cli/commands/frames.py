@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from neurocal_cli.detection.batch import DetectionOptions
+    from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.detect import Detection
-    from neurocal_cli.detection.outcome import Outcome
 
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
 
@@ -28,7 +27,7 @@ _PAUSE = 0.3  # seconds between two checks; a file that is still being copied gr
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
     """Replace videos by their best frames; also the folder of these, with a separator, for messages."""
-    from neurocal_cli.files.video import is_video
+    from neurocal_cli.files.images import is_video
 
     if not any(map(is_video, paths)):
         yield tuple(paths), ""
@@ -42,7 +41,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 
 def _frames(path: str, folder: str, most: int) -> list[str]:
     from neurocal_cli.detection.frames import choose_frames
-    from neurocal_cli.files.video import frame_rate, save_frame, video_frames
+    from neurocal_cli.files.images import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
     with ProgressBar() as progress:
@@ -140,7 +139,7 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
     found = detections(alike)
     from neurocal_cli.calibration.advice import advise
     from neurocal_cli.calibration.calibrate import calibrate
-    from neurocal_cli.commands.show.advice_report import advice_lines
+    from neurocal_cli.commands.show.advice import advice_lines
     from neurocal_cli.detection.detect import gather
 
     views = "1 view" if len(found) == 1 else f"{len(found)} views"

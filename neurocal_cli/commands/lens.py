@@ -135,8 +135,7 @@ def fit(
     preparation.check_summary(as_json, output)
     options.check_plot(plot, output)
     preparation.check_outputs((output, plot), points)
-    from neurocal_cli.calibration.zoom.fit_cameras import LensCameras, fit_lens_cameras
-    from neurocal_cli.calibration.zoom.fit_points import fit_lens
+    from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
     from neurocal_cli.files.lens_points import read_lens_data
     from neurocal_cli.files.lens_yaml import write_lens
@@ -205,7 +204,7 @@ def camera(
     options.check_camera_name(camera_name)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), (lens_file,))
-    from neurocal_cli.calibration.zoom.camera_at import camera_at
+    from neurocal_cli.calibration.zoom.zoom_lens import camera_at
     from neurocal_cli.files.lens_yaml import read_lens
     from neurocal_cli.files.result_files import write_calibration
 

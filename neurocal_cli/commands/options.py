@@ -53,7 +53,7 @@ COMMON_MODELS = f"auto {_USUAL} fisheye"
 """Those from which "auto" chooses by cross-validation."""
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
-"""Those of `simulation.by_method`, which a test compares."""
+"""Those of `simulation.comparison`, which a test compares."""
 
 
 class Argument(click.Argument):

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
-from neurocal_cli.files.outputs import held_back
-from neurocal_cli.files.writing import STDOUT_NAMES, check_places
+from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration

@@ -17,7 +17,7 @@ from neurocal_cli.files.image_paths import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.rectified_pair import RectifiedPair, RowError
+    from neurocal_cli.calibration.rig.rectification import RectifiedPair, RowError
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.remapping import Remapping
     from neurocal_cli.observations.points import Correspondences
@@ -99,7 +99,7 @@ def rectify(
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
     _check_folders(output, sides)
-    from neurocal_cli.calibration.rig.rectified_pair import rectified_pair
+    from neurocal_cli.calibration.rig.rectification import rectified_pair
 
     found = _read_rig(rig)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
@@ -180,7 +180,7 @@ class _Work:
 
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
-        from neurocal_cli.calibration.rig.rectified_pair import row_error_of_rig
+        from neurocal_cli.calibration.rig.rectification import row_error_of_rig
         from neurocal_cli.commands.show.camera_report import number_or_none
 
         self.summary["along"] = self.along
@@ -193,7 +193,7 @@ class _Work:
 
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
-        from neurocal_cli.calibration.rig.rectified_pair import row_error
+        from neurocal_cli.calibration.rig.rectification import row_error
         from neurocal_cli.commands.show.camera_report import number_or_none
         from neurocal_cli.files.points_csv import format_points
 
@@ -221,7 +221,7 @@ class _Work:
     def _rectified(self, side: int, path: str) -> Correspondences:
         """Read and rectify the points of one camera, 0 left or 1 right."""
         from neurocal_cli.calibration.calibration import undistorted_before
-        from neurocal_cli.calibration.rig.rectified_pair import rectify_points
+        from neurocal_cli.calibration.rig.rectification import rectify_points
         from neurocal_cli.files.points_csv import read_points
 
         notes: list[str] = []
@@ -245,7 +245,7 @@ class _Work:
         self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
 
     def _rectify_pair(self, pair: tuple[str, str]) -> None:
-        from neurocal_cli.calibration.rig.rectified_pair import pair_picture
+        from neurocal_cli.calibration.rig.rectification import pair_picture
         from neurocal_cli.files.images import encode_image, encode_png, read_picture
 
         pictures = []

@@ -175,8 +175,7 @@ def simulate(
     levels = sorted(set(sigma))
     if save is not None:
         _save(scene, save, levels, seed, images)
-    from neurocal_cli.commands.show.comparison_report import text_of
-    from neurocal_cli.commands.show.simulation_report import simulation_json, simulation_tables
+    from neurocal_cli.commands.show.methods_report import simulation_json, simulation_tables, text_of
     from neurocal_cli.simulation.noise import study_noise
 
     with ProgressBar() as progress:
@@ -239,8 +238,7 @@ def _starts(
 
 
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
-    from neurocal_cli.commands.show.comparison_report import text_of
-    from neurocal_cli.commands.show.simulation_report import rates_json, rates_tables
+    from neurocal_cli.commands.show.methods_report import rates_json, rates_tables, text_of
     from neurocal_cli.simulation.rates import study_rates
 
     with ProgressBar() as progress:
@@ -275,7 +273,7 @@ def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, im
         write_board(scene.board, os.path.join(folder, "board.yaml"))
     if images:
         from neurocal_cli.files.images import encode_png
-        from neurocal_cli.simulation.pictures import pictures, visible_points
+        from neurocal_cli.simulation.scenes import pictures, visible_points
 
         drawn = list(pictures(scene, seed))
         for one in drawn:

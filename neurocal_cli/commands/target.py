@@ -49,7 +49,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
             "another shape, calibrate with --target free"
         )
     if plot is not None:
-        from neurocal_cli.commands.show.target_plot import draw_target
+        from neurocal_cli.commands.show.camera_panels import draw_target
 
         write_plot(plot, draw_target, calibration.target, calibration.unit)
     board = board_of(calibration.target, calibration.unit, calibration.points.distances)

@@ -184,7 +184,7 @@ class _Tally:
 
     def _fault(self) -> str:
         """Why most points do not fit the rig, or what to check."""
-        from neurocal_cli.calibration.rig.match_faults import fault_of_matches
+        from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 
         assert self.first is not None
         left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]

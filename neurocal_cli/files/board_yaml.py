@@ -11,8 +11,7 @@ import numpy as np
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import flow, mapping, number, quoted, text
-from neurocal_cli.files.yaml_tree import parse_yaml, read_yaml
+from neurocal_cli.files.yaml_text import flow, mapping, number, parse_yaml, quoted, read_yaml, text
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.distances import Distance
 

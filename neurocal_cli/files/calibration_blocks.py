@@ -19,9 +19,8 @@ from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.text_columns import numbers_of, read_table, table_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import block, boolean, flows, indented, mapping, number, quoted, text
-from neurocal_cli.observations.bends import Bends
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import Target
+from neurocal_cli.observations.target import Bends, Target
 
 POSE_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 _NAME = "name"

@@ -21,7 +21,7 @@ from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.files import calibration_blocks as blocks
-from neurocal_cli.files.camera_info import camera_info_lines
+from neurocal_cli.files.camera_tree import camera_info_lines
 from neurocal_cli.files.observations_yaml import observation_lines
 from neurocal_cli.files.text_columns import column_lines, named_lines
 from neurocal_cli.files.yaml_text import (

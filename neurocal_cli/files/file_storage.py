@@ -14,8 +14,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.files import read_text
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import number, quoted
-from neurocal_cli.files.yaml_tree import parse_yaml, plain_value
+from neurocal_cli.files.yaml_text import number, parse_yaml, plain_value, quoted
 
 _DEEPEST = 40
 _PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousand characters

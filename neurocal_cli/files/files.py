@@ -13,7 +13,7 @@ from typing import IO
 
 from neurocal_cli.errors import FormatError, NeurocalError
 from neurocal_cli.files.failures import one_line, reading_failures
-from neurocal_cli.files.outputs import held_back
+from neurocal_cli.files.writing import held_back
 
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.zoom.fit_cameras import LensCameras
+from neurocal_cli.calibration.zoom.fit import LensCameras
 from neurocal_cli.calibration.zoom.settings import CONTROLS, LensPoints, describe
 from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.geometry import Array

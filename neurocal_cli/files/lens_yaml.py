@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli import __version__
 from neurocal_cli.calibration.zoom.mlfn import Topology
 from neurocal_cli.calibration.zoom.parameter_networks import SCALES, LensNets, ParameterNet
-from neurocal_cli.calibration.zoom.setting_normals import Constants, Normal, Tables
-from neurocal_cli.calibration.zoom.settings import CONTROLS
+from neurocal_cli.calibration.zoom.settings import CONTROLS, Constants, Normal, Tables
 from neurocal_cli.calibration.zoom.zoom_lens import Member, RejectedSetting, ZoomLens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -30,10 +29,10 @@ from neurocal_cli.files.yaml_text import (
     mapping,
     number,
     quoted,
+    read_yaml,
     text,
     words,
 )
-from neurocal_cli.files.yaml_tree import read_yaml
 
 _FORMAT = 2
 _BLOCK = "neurocal_lens"

@@ -67,7 +67,7 @@ def write_result(
     else:
         text = format_calibration(result, by_rows)
     if by_rows:
-        from neurocal_cli.files.yaml_tree import parse_yaml
+        from neurocal_cli.files.yaml_text import parse_yaml
 
         text = _lines(parse_yaml(text, "the calibration"), 3) + "\n"
     write_whole(path, text)

@@ -26,8 +26,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.network.network import e_2d, e_orth, optimal_gamma, output
-from neurocal_cli.network.patterns import Patterns
-from neurocal_cli.network.trainers import Task, Trained
+from neurocal_cli.network.training import Patterns, Task, Trained
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
 # tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later

@@ -21,7 +21,7 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.network.patterns import Patterns
+from neurocal_cli.network.training import Patterns
 
 
 def random_weights(rng: np.random.Generator, networks: int, n_inputs: int) -> tuple[Array, Array]:

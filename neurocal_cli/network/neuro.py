@@ -9,6 +9,14 @@
 
 No stage needs an initial guess. Views with too few points for a free network, and cameras that a free network
 does not determine, start from random cameras instead (`random_cameras`).
+
+The paper's constrained training, eq. (14), between stages 2 and 3 for trainers that support it.
+
+It starts from an upper triangular W and an orthonormal V, into which the free network's product has been
+split; from random weights it would stall. Training follows eq. (15), with W's structural zeros and given
+weights fixed and beta E_orth added to the error.
+
+Type 4: V is given, so all views together train a single layer, W, with known inputs.
 """
 
 from __future__ import annotations
@@ -21,14 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted
-from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix, translations_normalised
 from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution, TrainingRecord
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.geometry import Array, nearest_rotation
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.cameras_from_networks import cameras_from_products, candidate_intrinsics
-from neurocal_cli.network.constrained_training import train_constrained
 from neurocal_cli.network.local_minima import (
     better_by_view,
     reaches_bound,
@@ -37,12 +45,40 @@ from neurocal_cli.network.local_minima import (
     try_mirrored,
     try_start,
 )
-from neurocal_cli.network.options import Options
+from neurocal_cli.network.options import MOST_POINTS, Options
+from neurocal_cli.network.orthogonality import cameras_from_products, candidate_intrinsics
 from neurocal_cli.network.radial_step import radial_step
+from neurocal_cli.network.starts import learn
+from neurocal_cli.network.training import Patterns, Task, patterns_of
 from neurocal_cli.network.view_networks import Group, begin_flat, refuse_few_conditions, train_networks
 
 if TYPE_CHECKING:
     from neurocal_cli.network.random_cameras import Found
+
+
+def train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:
+    """Train one view's network on E_tot from a camera; a flat board's V cannot be constrained.
+
+    Returns the state and the number of iterations. The state is unchanged if the trainer does not support
+    this, or if the result is no valid camera.
+    """
+    views = problem.views
+    if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
+        return state, 0
+    depth = float(state.t[0, 2])
+    # V is scaled so that depths, and so every gamma, are about 1; the constant a of E_orth compensates.
+    V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
+    free_W = np.zeros((3, 3), dtype=bool)
+    free_W[ENTRIES] = problem.free
+    patterns = patterns_of(views, np.array([0]), False, MOST_POINTS)
+    task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
+    trained = options.constrained(task, 1.0 / depth**2)
+    entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])
+    t = trained.V[:, :, 3] * depth
+    moved = CameraState(entries[None], R, t)
+    usable = np.isfinite(entries).all() and entries[[0, 2]].min() > 0 and t[0, 2] > 0
+    return moved if usable else state, int(trained.iterations.sum())
+
 
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
@@ -61,8 +97,6 @@ def solve(problem: Problem, options: Options) -> Solution:
     """
     rng = np.random.default_rng(options.seed)
     if problem.type == 4:
-        from neurocal_cli.network.given_poses import solve_given_poses
-
         return solve_given_poses(problem, options, rng)
     search = _Search(problem, options, rng)
     # A free product needs 4 points of a plane or 6 in space.
@@ -209,3 +243,74 @@ class _Search:
         R[members], t[members] = found.state.R, found.state.t
         record = record.with_starts(members, found.agreed, found.starts, found.iterations)
         return replace(state, R=R, t=t), record
+
+
+# With a wide lens: least depth of a training point as a share of its distance (60 degrees from the axis), and
+# fewest training points.
+_LEAST_DEPTH, _FEWEST = 0.5, 12
+
+
+def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generator) -> Solution:
+    """Train the five weights of W, then minimise the reprojection error.
+
+    Raises DegenerateGeometryError if a given pose puts points behind the camera, or if the pixels fit only a
+    mirrored camera.
+    """
+    views = problem.views
+    assert problem.poses is not None  # type 4
+    poses = [problem.poses[name] for name in views.names]
+    R = np.stack([pose.R for pose in poses])
+    t = translations_normalised(views, R, np.stack([pose.t for pose in poses]))
+    wide = problem.distortion.wide
+    if not wide:
+        _check_in_front(views, R, t)
+    rows = patterns_of(views, np.arange(views.n_views), False, MOST_POINTS, rng)
+    # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
+    hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
+    # Each view has its own scale, which gamma absorbs. Gamma starts at 1, so depths should be about 1, "with
+    # appropriate scaling if necessary".
+    real = rows.weights > 0
+    depth = np.where(real, hidden[..., 2], np.nan)
+    if wide:  # the network is a pinhole, so it is trained on points well in front only
+        real &= depth > _LEAST_DEPTH * np.linalg.norm(hidden, axis=2)
+        if real.sum() < _FEWEST:
+            raise DegenerateGeometryError(
+                "the given poses put nearly all points beside or behind the camera; they must map world to "
+                "camera, Xc = R M + t, z forward"
+            )
+        depth = np.linalg.norm(hidden, axis=2)
+    hidden = hidden / np.nanmean(depth, axis=1)[:, None, None]
+    patterns = Patterns(hidden[real][None], rows.targets[real][None], rows.weights[real][None])
+    given = problem.normalised_entries
+    W = intrinsic_matrix(given)
+    row, column = ENTRIES
+    W[row[problem.free], column[problem.free]] = np.nan
+    learnt = learn(patterns, options.trainer, rng, options.starts, options.agreement, W=W, V=np.eye(3)[None])
+    entries = np.where(problem.free, learnt.W[0][ENTRIES], given)[None]
+    if (entries[0, [0, 2]] <= 0).any():
+        raise DegenerateGeometryError(
+            "only a mirrored camera could see these pixels from the given poses; check the poses (world to "
+            "camera, z forward), the axes of X,Y,Z (right-handed?) and of u,v (v downwards?), and the pairing"
+        )
+    state = CameraState(entries, R, t)
+    record = TrainingRecord(
+        np.repeat(learnt.agreed, views.n_views),
+        int(learnt.starts.sum()),
+        learnt.iterations,
+        squares=float(learnt.rms[0] ** 2 * len(views.index)),
+        before=float((point_residuals(views, state) ** 2).sum()),
+        curve=learnt.curve,
+    )
+    return Solution(problem, problem.adjust(state), record)
+
+
+def _check_in_front(views: Views, R: Array, t: Array) -> None:
+    """Refuse given poses that put any point behind the camera, also points that do not train the network."""
+    depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)
+    behind = np.minimum.reduceat(depth, views.first) + t[:, 2] <= 0
+    if behind.any():
+        raise DegenerateGeometryError(
+            f"the given pose of view {views.names[int(np.argmax(behind))]!r} puts points behind the camera; "
+            "it must map world to camera, Xc = R M + t, z forward, with t in the unit of X,Y,Z; a lens that "
+            "sees 90 degrees from its axis and more needs --distortion fisheye"
+        )

@@ -4,19 +4,26 @@ Each view's network has learnt a product B_k = W V_k up to scale. All views shar
 V_k is orthonormal, so the columns of W^-1 B_k must be perpendicular and of equal length. A view of a solid
 target gives five conditions, a view of a flat board two (Zhang 2000). Levenberg-Marquardt solves them for W's
 five entries from random values.
+
+Stage 2: the trained products become cameras, one W for all views and a pose for each.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt
+from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.camera.projection import ENTRIES
+from neurocal_cli.camera.state import CameraState
+from neurocal_cli.network.view_networks import Group
 
 # Bundle adjustment refines the result, so gains below 1e-4 of the loss are not worth a step. Starts are
 # random, so the actual gain counts; test_orthogonality.py checks the share of starts that converge.
@@ -213,3 +220,48 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
         third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
         M = np.concatenate([M, third], axis=2)
     return nearest_rotation(M), D[:, :, -1] / scale[:, None]
+
+
+# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
+# which depths keep all points in front of the first camera.
+_MOST_CANDIDATES = 4
+_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
+
+
+def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
+    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
+    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
+    for group in groups:
+        if group.flat:
+            flat = group.product[:, :, :2]
+        else:
+            solid = group.product[:, :, :3]
+    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
+    return shared.entries[:_MOST_CANDIDATES, None]
+
+
+def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:
+    """Poses of the trained views, given W's entries (1, 5); all points in front.
+
+    Views that are in no group get the identity.
+    """
+    views = problem.views
+    V = views.n_views
+    R, t = np.tile(np.eye(3), (V, 1, 1)), np.tile([0.0, 0.0, 2.0], (V, 1))
+    W = intrinsic_matrix(entries[0])
+    for group in groups:
+        rotation, t[group.views] = pose_from_product(W, group.product)
+        if group.flat:
+            rotation = rotation @ np.swapaxes(views.basis[group.views], 1, 2)
+        R[group.views] = rotation
+    return CameraState(entries, R, _in_front(views, R, t))
+
+
+def _in_front(views: Views, R: Array, t: Array) -> Array:
+    """Move views that an inexact W puts partly behind the camera away along their ray; the new t."""
+    # Local coordinates are at most 1, which gives a quick bound that nearly always suffices.
+    if (t[:, 2] > np.abs(R[:, 2]).sum(axis=1)).all():
+        return t
+    depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)
+    lowest = np.minimum.reduceat(depth, views.first)
+    return np.asarray(t * (np.maximum(t[:, 2], -_NEAREST * lowest) / t[:, 2])[:, None])

@@ -19,9 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.problem import Problem, normalised
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState

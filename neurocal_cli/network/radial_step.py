@@ -18,8 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.normal_equations import schur_step
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.schur_complement import schur_step
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

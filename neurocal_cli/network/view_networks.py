@@ -15,9 +15,8 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.network import residual_jacobian
 from neurocal_cli.network.options import MOST_POINTS, Options
-from neurocal_cli.network.patterns import Patterns, patterns_of
 from neurocal_cli.network.starts import learn
-from neurocal_cli.network.trainers import Task
+from neurocal_cli.network.training import Patterns, Task, patterns_of
 
 # Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
 _NO_CONDITION = 1e-13

@@ -13,11 +13,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import covariance
-from neurocal_cli.adjustment.parameter_uncertainty import parameter_covariance, pose_std
-from neurocal_cli.adjustment.problem import problem_for
+from neurocal_cli.adjustment.covariance import covariance, parameter_covariance, pose_std
+from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.adjustment.reprojection import normal_blocks
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.calibration.other_methods.calibrate_by import problem_for_method
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -27,7 +25,7 @@ from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.processes import work_through
 from neurocal_cli.network.options import Progress
-from neurocal_cli.simulation.by_method import calibrate_with
+from neurocal_cli.simulation.comparison import calibrate_with
 from neurocal_cli.simulation.scenes import SimulatedScene
 
 _BLOCK = 5  # trials per task, all with one sigma

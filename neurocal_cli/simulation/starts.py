@@ -34,10 +34,10 @@ from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.processes import work_through
-from neurocal_cli.network.cameras_from_networks import cameras_from_products, candidate_intrinsics
-from neurocal_cli.network.given_poses import solve_given_poses
 from neurocal_cli.network.network import random_weights
+from neurocal_cli.network.neuro import solve_given_poses
 from neurocal_cli.network.options import Progress, options_for
+from neurocal_cli.network.orthogonality import cameras_from_products, candidate_intrinsics
 from neurocal_cli.network.view_networks import begin_flat, train_networks
 from neurocal_cli.simulation.scenes import SimulatedScene
 

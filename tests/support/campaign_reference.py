@@ -8,8 +8,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.covariance import covariance
-from neurocal_cli.adjustment.problem import Problem, problem_for
-from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.candidate_models import fit_candidates
 from neurocal_cli.camera.distortion import Distortion

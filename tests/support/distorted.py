@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import adjust
-from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic

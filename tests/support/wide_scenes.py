@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.adjustment.units import normalised
+from neurocal_cli.adjustment.problem import normalised, problem_for
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, rotation_step

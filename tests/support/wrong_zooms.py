@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration.zoom.fit_points import fit_lens
+from neurocal_cli.calibration.zoom.fit import fit_lens
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.settings import LensPoints
 from neurocal_cli.camera.geometry import Array

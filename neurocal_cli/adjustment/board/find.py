@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.bend_evidence import bends_are_valid, most_probable_precision
-from neurocal_cli.adjustment.board.gauge import nearest_to_given
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
@@ -32,18 +31,22 @@ from neurocal_cli.adjustment.board.posterior import (
     posterior,
     posterior_of,
 )
-from neurocal_cli.adjustment.board.prior import SINGLE, prior_of
+from neurocal_cli.adjustment.board.prior import SINGLE, nearest_to_given, prior_of
 from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
-from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.units import in_pixels, normalised
+from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.bends import N_SHAPES, Bends, surface_of
-from neurocal_cli.observations.planes import planes_of
-from neurocal_cli.observations.target import Target, distinct_points, scale_of_points
+from neurocal_cli.observations.board import planes_of
+from neurocal_cli.observations.target import (
+    N_SHAPES,
+    Bends,
+    Target,
+    distinct_points,
+    scale_of_points,
+    surface_of,
+)
 
 _STEPS = 10
 # Unknowns of the dense system: with more than the first, only some views are used; with more than the second,

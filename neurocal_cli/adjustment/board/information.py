@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.point_batches import PointBatches, batches_of, products
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, derivatives
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.views import PointBatches, Views, batches_of, products
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.bends import N_SHAPES
+from neurocal_cli.observations.target import N_SHAPES
 
 
 @frozen_dataclass(eq=False)

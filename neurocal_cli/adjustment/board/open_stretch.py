@@ -19,13 +19,12 @@ from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import solve_or_nan
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
-from neurocal_cli.adjustment.point_batches import PointBatches
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, displaced_blocks
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.views import PointBatches, Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.observations.board import is_flat
 
 # Prior odds of a stretch, and of a small and a large lean, by its size over STRETCH. Larger odds make clean
 # data less certain. With these, the std of alpha from 3, 4, 5 and 8 views grows by 19, 5, 3 and 0.7 % in the

@@ -27,9 +27,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.board.gauge import Gauge
 from neurocal_cli.adjustment.board.information import Information
-from neurocal_cli.adjustment.board.prior import LEAN, NOTHING, STATED, STRETCH, Prior
+from neurocal_cli.adjustment.board.prior import LEAN, NOTHING, STATED, STRETCH, Gauge, Prior
 from neurocal_cli.adjustment.board.system import (
     JointCovariance,
     PointsFirst,

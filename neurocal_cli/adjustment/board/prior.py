@@ -16,6 +16,20 @@ Surveyed points have only the standard deviations that the survey states, indepe
 
 The smooth parts are Gaussian processes with the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a
 plane, represented by its largest eigenfunctions. A solid target warps in all directions alike.
+
+What images do not determine: where a target is, how it is turned, and how large it is.
+
+An estimated target is moved and rotated as a whole to be nearest to the given one. Its scale is such that its
+planes, each by itself, are on average as large as given: their squares are printed, but a folded target is
+set up by hand. If planes were 0.5 mm from their place, the size of the whole would be wrong by 0.2 %, ten
+times the standard deviation of a rig's baseline (tests/test_target.py).
+
+Coordinates of the offsets that are independent under the prior, whatever the sizes of its parts.
+
+Along its eigenfunctions, and along what is orthogonal to them, a smooth part has independent coordinates, and
+so have the single points, whose prior is the same in all directions. So the sum of both is independent as
+well: with the eigenvalue v of an eigenfunction, the variance of its coordinate is ``size_smooth^2 v +
+size_single^2``. Folds and stretches have coordinates of their own.
 """
 
 from __future__ import annotations
@@ -26,11 +40,58 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.gauge import Gauge, gauge_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.camera.geometry import Array, nearest_similarity
+from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
+
+
+@frozen_dataclass(eq=False)
+class Gauge:
+    """The shifts, rotations and the scale of a target of n points, as changes of their offsets."""
+
+    directions: Array  # (3 n, g) orthonormal
+    held: Array  # (3 n, g) their products with the offsets are held at 0; ``held^T directions = 1``
+
+    @classmethod
+    def none(cls, n: int) -> Gauge:
+        """The gauge of a target in a known place, of known size."""
+        return cls(np.zeros((3 * n, 0)), np.zeros((3 * n, 0)))
+
+
+def gauge_of(given: Array, plane: NDArray[np.intp], axes: Array) -> Gauge:
+    """The gauge of points (n, 3) on planes (n,), along the axes of each point (n, 3, 3)."""
+    centred = given - given.mean(axis=0)
+    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
+    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
+    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
+    along = np.swapaxes(axes, 1, 2)
+    directions = np.linalg.qr((along @ world).reshape(3 * len(given), 7))[0]
+    if not plane.any():
+        return Gauge(directions, directions)
+    # A scale changes no shift and no rotation, and the planes' own sizes are changed by the scale only.
+    held, own = directions.copy(), (along @ _around_planes(given, plane)[..., None]).ravel()
+    held[:, -1] = own / (own @ directions[:, -1])
+    return Gauge(directions, held)
+
+
+def nearest_to_given(found: Array, given: Array, plane: NDArray[np.intp]) -> tuple[float, Array, Array]:
+    """Scale s, rotation R (3, 3) and shift t (3,) with which found points x (n, 3) hold it: ``s R x + t``."""
+    s, R, t = nearest_similarity(found, given)
+    if not plane.any():
+        return s, R, t
+    parts = [(found[plane == k], given[plane == k]) for k in range(int(plane.max()) + 1)]
+    weights = [float(((own - own.mean(axis=0)) ** 2).sum()) for own, _ in parts]
+    s = float(np.average([nearest_similarity(*part)[0] for part in parts], weights=weights))
+    return s, R, given.mean(axis=0) - s * R @ found.mean(axis=0)
+
+
+def _around_planes(points: Array, plane: NDArray[np.intp]) -> Array:
+    """Points (n, 3) around the centre of their plane."""
+    sums = np.zeros((int(plane.max()) + 1, 3))
+    np.add.at(sums, plane, points)
+    return points - (sums / np.bincount(plane)[:, None])[plane]
+
 
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
@@ -221,3 +282,77 @@ def _smooth(places: Array) -> Array:
     values, vectors = np.linalg.eigh(kernel(nodes, nodes))
     used = values > _LEAST * values[-1]
     return np.asarray(kernel(places, nodes) @ (vectors[:, used] / np.sqrt(values[used])))
+
+
+_SMOOTH = ("bend", "warp")
+
+
+@frozen_dataclass(eq=False)
+class Coordinates:
+    """Independent coordinates (k,) of the offsets (n, 3): first the linear parts, then 3 n for all others."""
+
+    prior: Prior
+    linear: Array  # (3 n, k - 3 n) basis of the linear parts
+    groups: dict[str, NDArray[np.intp]]  # indices of the linear parts
+    vectors: Array | None  # (n, n) orthonormal eigenfunctions; None if there is no smooth part
+    units: Array  # (k, G) variances for parts of size 1, which add up
+
+    def offsets(self, coordinates: Array) -> Array:
+        """Offsets (..., n, 3) of coordinates (..., k)."""
+        first = self.linear.shape[1]
+        shape = (*coordinates.shape[:-1], -1, 3)
+        own = coordinates[..., first:].reshape(shape)
+        own = own if self.vectors is None else self.vectors @ own
+        return np.asarray(own + (coordinates[..., :first] @ self.linear.T).reshape(shape))
+
+    def of_rows(self, rows: Array) -> Array:
+        """Rows (k, ...) by the coordinates from those by the offsets (3 n, ...)."""
+        own = rows
+        if self.vectors is not None:
+            own = (self.vectors.T @ rows.reshape(len(self.vectors), -1)).reshape(rows.shape)
+        return np.concatenate([self.linear.T @ rows, own])
+
+    def variances(self, sizes: Mapping[str, float]) -> Array:
+        """(k,) variances for given sizes of the parts."""
+        return np.asarray(self.units @ self.prior.as_array(sizes) ** 2)
+
+    def precision(self, sizes: Mapping[str, float]) -> Array:
+        """(3 n, 3 n) inverse of the prior covariance of the offsets, by the formula of Woodbury."""
+        first, B, variances = self.linear.shape[1], self.linear, self.variances(sizes)
+        own = 1.0 / variances[first:]
+        if self.vectors is None:
+            found = np.diag(own)
+        else:
+            found = np.zeros((len(own), len(own)))
+            for axis in range(3):
+                found[axis::3, axis::3] = (self.vectors * own[axis::3]) @ self.vectors.T
+        by_linear = found @ B
+        inner = np.diag(1.0 / variances[:first]) + B.T @ by_linear
+        return np.asarray(found - by_linear @ np.linalg.solve(inner, by_linear.T))
+
+
+@lru_cache(maxsize=4)  # one calibration asks for them four times
+def coordinates_of(prior: Prior) -> Coordinates:
+    """The coordinates that are independent under a prior."""
+    n, m = len(prior.axes), prior.basis.shape[2]
+    groups: dict[str, NDArray[np.intp]] = {}
+    places: list[NDArray[np.intp]] = []
+    of_points = prior.units[m:].copy()
+    vectors, values = None, np.zeros(n)
+    for part, (name, columns) in enumerate(prior.groups.items()):
+        if name not in _SMOOTH:
+            first = sum(map(len, places))
+            groups[name] = np.arange(first, first + len(columns))
+            places.append(columns)
+            continue
+        functions = prior.basis[:, :, columns]
+        along = functions.any(axis=(0, 2))
+        if vectors is None:  # the same functions along all axes
+            axis = int(np.argmax(along))
+            modes = functions[:, axis, functions[:, axis].any(axis=0)] / prior.size
+            values, vectors = np.linalg.eigh(modes @ modes.T)
+            values[: n - modes.shape[1]] = 0.0
+        of_points[:, part] = (values[:, None] * along).ravel()
+    linear = np.concatenate([np.zeros(0, dtype=np.intp), *places])
+    units = np.concatenate([prior.units[linear], of_points])
+    return Coordinates(prior, prior.basis[:, :, linear].reshape(3 * n, -1), groups, vectors, units)

@@ -22,8 +22,7 @@ from neurocal_cli.adjustment.board.find import Found, at_world, sight_of
 from neurocal_cli.adjustment.board.information import Information, information_of
 from neurocal_cli.adjustment.board.posterior import evidence_of_given, known_sizes, quadratic_at
 from neurocal_cli.adjustment.board.prior import Prior, surveyed_prior
-from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.units import in_pixels
+from neurocal_cli.adjustment.problem import Problem, in_pixels
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences

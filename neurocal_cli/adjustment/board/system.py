@@ -16,10 +16,8 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.coordinates import coordinates_of
-from neurocal_cli.adjustment.board.gauge import Gauge
 from neurocal_cli.adjustment.board.information import Information
-from neurocal_cli.adjustment.board.prior import Parts, Prior
+from neurocal_cli.adjustment.board.prior import Gauge, Parts, Prior, coordinates_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 

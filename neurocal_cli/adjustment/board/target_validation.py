@@ -16,10 +16,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.coordinates import coordinates_of
 from neurocal_cli.adjustment.board.information import Information, joined
 from neurocal_cli.adjustment.board.posterior import camera_step, minimum_of
-from neurocal_cli.adjustment.board.prior import Prior
+from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
 from neurocal_cli.adjustment.board.system import WithoutPoses, points_first, sum_of
 from neurocal_cli.camera.geometry import Array
 

@@ -32,16 +32,14 @@ from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import without_each
 from neurocal_cli.adjustment.covariance import CovarianceBasis
-from neurocal_cli.adjustment.point_batches import products
+from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.reprojection import camera_columns
-from neurocal_cli.adjustment.schur_complement import eliminate
 from neurocal_cli.adjustment.solution import TargetPosterior
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.views import Views, products
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.observations.bends import N_SHAPES, surface_of
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import Target
+from neurocal_cli.observations.target import N_SHAPES, Target, surface_of
 
 # Poses that are left out one by one, each with a target of its own; with more that takes too long. From the
 # efficient scores alone the std of 28 photographs (fisheye_stereo, both cameras) are 11 to 13 % smaller.

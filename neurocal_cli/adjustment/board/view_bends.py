@@ -14,7 +14,7 @@ from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, Search
 from neurocal_cli.adjustment.board.information import of_views, without_points
 from neurocal_cli.adjustment.board.posterior import evidence_of_given
 from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.observations.planes import is_flat, planes_of
+from neurocal_cli.observations.board import is_flat, planes_of
 from neurocal_cli.observations.target import Target, distinct_points
 
 _FEWEST = 4  # fewest views

@@ -26,8 +26,7 @@ import numpy as np
 from neurocal_cli.adjustment.cross_validation import FOLDS, held_out_views
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
-from neurocal_cli.adjustment.restart import is_elsewhere, of_few_views
-from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.candidate_models import (
     FAR_BETTER,

@@ -16,13 +16,12 @@ from itertools import pairwise
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.ambiguity import Ambiguity
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.normal_equations import ROUNDING, unit_diagonal
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
-from neurocal_cli.adjustment.solution import Solution
+from neurocal_cli.adjustment.solution import Ambiguity, Solution
 from neurocal_cli.calibration.lens_choice.given_model import total_cost
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
 from neurocal_cli.camera.geometry import Array

@@ -8,16 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.common_noise import measured
+from neurocal_cli.adjustment.common_noise import measured, weighed
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.adjustment.residual_correlation import point_residuals
-from neurocal_cli.adjustment.reweighting import weighed
 from neurocal_cli.adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration.calibration import Calibration, Rejected, StopReason
 from neurocal_cli.calibration.lens_choice.given_model import check_distortion
-from neurocal_cli.calibration.other_methods.found import Found
-from neurocal_cli.calibration.other_methods.linear import linear
+from neurocal_cli.calibration.other_methods.linear import Found, linear
 from neurocal_cli.calibration.other_methods.nonlinear import nonlinear
 from neurocal_cli.calibration.other_methods.opencv import opencv, without_skew
 from neurocal_cli.calibration.other_methods.tsai import tsai, with_known_centre

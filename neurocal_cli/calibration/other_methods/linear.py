@@ -19,6 +19,8 @@ solid view this is the decomposition of Faugeras. A given centre and a given rig
 
 The squares are not those of pixel errors, so this is not the minimum of (3), and noise has more effect than
 necessary.
+
+Result of a baseline.
 """
 
 from __future__ import annotations
@@ -29,18 +31,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import check_points
-from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.units import translations_normalised
+from neurocal_cli.adjustment.problem import Problem, translations_normalised
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.other_methods.found import Found, as_seen
-from neurocal_cli.camera.absolute_conic import omega_of, product_of
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.network.cameras_from_networks import cameras_from_products
-from neurocal_cli.network.patterns import patterns_of
+from neurocal_cli.network.orthogonality import cameras_from_products
+from neurocal_cli.network.training import patterns_of
 from neurocal_cli.network.view_networks import Group, begin_flat
+
+
+@frozen_dataclass(eq=False)
+class Found:
+    """Result of a baseline."""
+
+    problem: Problem  # as solved; a method may take more parameters as given than the user
+    state: CameraState  # normalised
+    minimised: bool  # whether the reprojection error is at a minimum, as with least squares on (3)
+    iterations: int = 0
+    converged: bool = True  # False if an iteration ended early
+    remarks: tuple[str, ...] = ()  # for the user
+
+
+def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
+    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
+    distortion = problem.distortion
+    if distortion.model == "none" or problem.free_distortion:
+        return problem, state
+    return problem.as_seen(state)
+
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
 _SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.other_methods.found import Found, as_seen
-from neurocal_cli.calibration.other_methods.linear import linear_state
+from neurocal_cli.calibration.other_methods.linear import Found, as_seen, linear_state
 from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

@@ -12,9 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.observability import check_points
-from neurocal_cli.adjustment.problem import Problem
-from neurocal_cli.adjustment.units import normalised
-from neurocal_cli.calibration.other_methods.found import Found
+from neurocal_cli.adjustment.problem import Problem, normalised
+from neurocal_cli.calibration.other_methods.linear import Found
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState

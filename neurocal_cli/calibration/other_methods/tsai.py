@@ -31,15 +31,14 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.other_methods.found import Found, as_seen
-from neurocal_cli.calibration.other_methods.linear import smallest, whole_groups
+from neurocal_cli.calibration.other_methods.linear import Found, as_seen, smallest, whole_groups
 from neurocal_cli.calibration.other_methods.nonlinear import Minimum, least_pixel_error
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.network.patterns import patterns_of
+from neurocal_cli.network.training import patterns_of
 
 _FEWEST = 5, 7  # points of a flat and of a solid view; each gives one equation
 _DISTORTIONS = ("none", "k1")

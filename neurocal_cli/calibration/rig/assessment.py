@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.leave_out import Quadratics, folds_of
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.rig.adjust import rig_problem
 from neurocal_cli.calibration.rig.contradiction import FOCAL, Contradiction, contradiction
-from neurocal_cli.calibration.rig.covariance import rig_covariance
-from neurocal_cli.calibration.rig.given_cameras import covariance_by_given
+from neurocal_cli.calibration.rig.covariance import covariance_by_given, rig_covariance
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points
-from neurocal_cli.calibration.rig.problem import rig_problem
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses, relative_poses
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.sound_pairs import (
@@ -41,8 +40,7 @@ from neurocal_cli.calibration.verdict.findings import WORDS, Finding, Limit, ver
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, rotation_step
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median, rotation_step
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 
 # Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,

@@ -23,8 +23,7 @@ from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 
 # Kass and Raftery (1995) call a difference of 10 in the criterion very strong evidence.
 _VERY_STRONG = 10.0

@@ -12,6 +12,13 @@
 
 All views share the unknowns of both cameras and of the rig; poses and target points are eliminated. The
 derivatives by the rig's unknowns follow from those of each camera by the chain rule.
+
+Uncertainty of a rig that comes from the uncertainty of cameras that were given for it.
+
+The rig, a second camera and the poses follow an error d of the given cameras as they would follow these
+parameters if they were estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared unknowns
+x. With the covariance S of the given cameras, x has the additional covariance
+N_ff^-1 N_fd S N_df N_ff^-1, and x and d are correlated. It does not fall with the number of points.
 """
 
 from __future__ import annotations
@@ -26,8 +33,9 @@ from neurocal_cli.adjustment.board.open_stretch import spread_of_stretch, stretc
 from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
+from neurocal_cli.adjustment.covariance import entry_covariance
 from neurocal_cli.adjustment.leave_out import Quadratics
-from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import SchurCovariance, eliminate, solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.open_coefficients import (
     OpenCoefficients,
     OpenPrior,
@@ -35,13 +43,12 @@ from neurocal_cli.adjustment.open_coefficients import (
     spread_of_open,
 )
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.adjustment.schur_complement import eliminate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem
+from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
 _LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
@@ -232,3 +239,35 @@ def _with_stretches(fit: RigFit, by: Array) -> Array:
         T[:, -3:, D - 1 :] = np.eye(3)
         normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
     return normal
+
+
+def covariance_by_given(
+    problem: RigProblem, state: RigState, normal: Array, free: NDArray[np.bool_]
+) -> SchurCovariance | None:
+    """Covariance of all shared unknowns and of the poses that the given cameras cause, normalised.
+
+    `normal` (V, D, D) is that at the state, which is a minimum, and `free` (n_shared,) are the unknowns that
+    moved. None if no covariance is known.
+    """
+    columns = state.columns
+    given = np.zeros((columns.n_shared, columns.n_shared))
+    for camera, seen, place in zip(problem.calibrations, problem.observations, columns.cameras, strict=True):
+        if camera.given_names:
+            given[np.ix_(place, place)] = entry_covariance(
+                camera.intrinsics,
+                camera.distortion_model,
+                camera.given_names,
+                camera.given_covariance,
+                seen.pixel_scale,
+            )
+    if not given.any():
+        return None
+    whole, by_shared = eliminate(normal, np.arange(columns.n_shared), columns.pose)
+    whole = whole.sum(axis=0)
+    follow = np.eye(columns.n_shared)
+    follow[free] = -solve_scaled(whole[np.ix_(free, free)], whole[free])
+    follow[np.ix_(free, free)] = 0.0  # the free unknowns themselves have no error of their own here
+    shared = follow @ given @ follow.T
+    by_shared = -by_shared
+    cross = np.swapaxes(by_shared @ shared, 1, 2)
+    return SchurCovariance(shared, by_shared @ shared @ np.swapaxes(by_shared, 1, 2), cross, 1.0)

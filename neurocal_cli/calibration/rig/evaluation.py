@@ -30,8 +30,7 @@ from neurocal_cli.calibration.verdict.given_points import (
 )
 from neurocal_cli.calibration.verdict.odd_points import units_mixed
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, rotation_vector
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.observations.points import Correspondences

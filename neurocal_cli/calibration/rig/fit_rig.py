@@ -8,7 +8,7 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import on_one_target
-from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig
+from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, free_parameters, rig_problem
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.contradiction import contradiction
 from neurocal_cli.calibration.rig.covariance import (
@@ -18,7 +18,6 @@ from neurocal_cli.calibration.rig.covariance import (
     with_target_uncertainty,
 )
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
-from neurocal_cli.calibration.rig.problem import free_parameters, rig_problem
 from neurocal_cli.calibration.rig.relative_poses import relative_poses
 from neurocal_cli.calibration.rig.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.calibration.rig.rig import Rig

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.leave_out import Quadratics
-from neurocal_cli.adjustment.normal_equations import solve_scaled
+from neurocal_cli.adjustment.normal_equations import eliminate, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.adjustment.schur_complement import eliminate
 from neurocal_cli.calibration.rig.adjust import RigProblem, steps_through
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_vector

@@ -9,21 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import solve_scaled
-from neurocal_cli.adjustment.parameter_uncertainty import (
-    parameter_covariance,
-    parameter_warnings,
-    pose_std,
-    with_scale,
-)
+from neurocal_cli.adjustment.covariance import parameter_covariance, parameter_warnings, pose_std, with_scale
+from neurocal_cli.adjustment.normal_equations import SchurCovariance, schur_covariance, solve_scaled
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.reprojection import POSE, residuals
-from neurocal_cli.adjustment.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit
-from neurocal_cli.calibration.rig.covariance import covariance_of_choice, not_smaller
-from neurocal_cli.calibration.rig.given_cameras import covariance_by_given
+from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice, not_smaller
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian

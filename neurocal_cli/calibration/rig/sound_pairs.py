@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigProblem
+from neurocal_cli.calibration.rig.adjust import RigProblem, rig_problem
 from neurocal_cli.calibration.rig.contradiction import Contradiction, contradiction
 from neurocal_cli.calibration.rig.pairing import ViewPairs
-from neurocal_cli.calibration.rig.problem import rig_problem
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation, rotation_step
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, euler_to_rotation, median, nearest_rotation, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 

@@ -16,20 +16,19 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.board.camera_covariance import CameraSeen, camera_covariance
 from neurocal_cli.adjustment.chi_squared import chi_squared
+from neurocal_cli.adjustment.common_noise import weighed
+from neurocal_cli.adjustment.covariance import covariance_by_camera, entry_covariance
 from neurocal_cli.adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
-from neurocal_cli.adjustment.given_camera import covariance_by_camera, entry_covariance
 from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
+from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
-from neurocal_cli.adjustment.reweighting import weighed
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Calibration, Verdict, estimated_parameters, free_entries
 from neurocal_cli.calibration.verdict.board_shape import BoardShape, board_shape
-from neurocal_cli.calibration.verdict.coverage import cover
-from neurocal_cli.calibration.verdict.evidence import Evidence
+from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import pixel_spread, verdict_of
 from neurocal_cli.calibration.verdict.given_parameters import (
     Doubt,
@@ -53,8 +52,7 @@ from neurocal_cli.calibration.verdict.view_change import ViewChange, view_change
 from neurocal_cli.calibration.verdict.view_groups import ViewGroups, view_groups
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.points import Correspondences
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, displaced_blocks
-from neurocal_cli.adjustment.schur_complement import eliminate
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

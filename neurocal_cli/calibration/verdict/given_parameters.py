@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.covariance import covariance
-from neurocal_cli.adjustment.problem import Problem, problem_for
+from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
-from neurocal_cli.adjustment.units import normalised
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass

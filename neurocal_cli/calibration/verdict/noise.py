@@ -13,8 +13,7 @@ import numpy as np
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.common_noise import common_share, measured
 from neurocal_cli.calibration.verdict.findings import Finding, name_some, pixel_spread
-from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 

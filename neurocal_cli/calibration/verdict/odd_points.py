@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.findings import Finding, Limit, name_some
-from neurocal_cli.camera.geometry import Array, distinct_rows
-from neurocal_cli.camera.median import median
+from neurocal_cli.camera.geometry import Array, distinct_rows, median
 from neurocal_cli.observations.points import Correspondences
 
 _FEWEST = 20  # fewest points from which whole numbers are no chance

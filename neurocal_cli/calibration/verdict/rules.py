@@ -23,7 +23,7 @@ from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.observations.planes import is_flat
+from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,

@@ -28,10 +28,10 @@ import numpy as np
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.calibration.zoom.network_training import updated_precision
+from neurocal_cli.calibration.zoom.mlfn import updated_precision
 from neurocal_cli.calibration.zoom.parameter_networks import LensNets, outputs_to_local
 from neurocal_cli.calibration.zoom.quadratic_error import QuadraticError, inverse, with_scatter
-from neurocal_cli.calibration.zoom.setting_normals import Constants, PixelData
+from neurocal_cli.calibration.zoom.settings import Constants, PixelData
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 

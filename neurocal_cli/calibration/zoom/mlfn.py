@@ -17,6 +17,15 @@ would need many settings there. Plane and rational unit together are all such fu
 denominator stays -1 or 1, so that extrapolation does not reach the pole.
 
 B networks of one topology are computed together: weights are (B, P).
+
+Training of the networks of one parameter: least squares with Bayesian regularisation.
+
+    E = 1/2 sum_s (y(x_s) - d_s)^2 / (c_s + tau^2) + 1/2 sum_g a_g |w_g|^2
+
+Each kind of weights has a zero-mean prior. Its precision is estimated from the effective number of these
+weights, gamma_g = n_g - a_g tr_g A^-1 and a_g = gamma_g / |w_g|^2 (MacKay 1992; Foresee and Hagan 1997). c_s
+is the variance of a target. tau^2 is an additional scatter from setting to setting, which is 0 unless the
+errors are larger than c_s explains. The evidence compares starts and topologies.
 """
 
 from __future__ import annotations
@@ -26,6 +35,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
@@ -159,3 +169,179 @@ def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array,
         z = r[:, :, : 2 * D]
         y = y + 0.5 * ((z @ _products(topology, weights)) * z).sum(axis=2)
     return y, r, g
+
+
+# Precisions of priors in units of the targets' spread; see `updated_precision`. The training tests in
+# tests/test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
+_FLAT = 1e-4  # of free weights: a standard deviation of 100
+_MOST = 1e4
+_LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
+_ENOUGH_VALUES = 4
+# The descent has no criterion to stop: the priors are updated until the schedule ends.
+_OPTIONS = DescentOptions(
+    damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
+    tolerance=0.0, flat=0.0, max_iterations=1_000_000,
+)  # fmt: skip
+
+
+@frozen_dataclass
+class Schedule:
+    """Numbers of iterations."""
+
+    iterations: int = 300
+    warm: int = 40  # before the first update of the priors
+    settle: int = 160  # before the first update of the scatter
+    period: int = 4  # from one update of the priors to the next
+
+
+@frozen_dataclass(eq=False)
+class TrainedNets:
+    """A stack of trained networks of one topology."""
+
+    weights: Array  # (B, P)
+    precision: Array  # (B, G) of the prior of each kind of weights
+    scatter: Array  # (B,) tau^2, in squared units of the targets
+    evidence: Array  # (B,) log of the probability of the targets, up to a constant of all topologies
+
+
+def sparse_controls(x: Array) -> NDArray[np.bool_]:
+    """(D,) which controls have too few distinct values in the settings (S, D) for tanh units."""
+    return np.array([len(np.unique(column)) < _ENOUGH_VALUES for column in x.T])
+
+
+def updated_precision(
+    topology: Topology, precision: Array, leverage: Array, weights: Array, x: Array
+) -> Array:
+    """Precision of each prior (..., G) by MacKay's formula, half the way to it on a logarithmic scale.
+
+    `leverage` (..., P) is the diagonal of A^-1. Data do not shrink weights along directions that they do not
+    determine. The standard deviation of a prior is therefore at most 6. It is at most 1 for weights from a
+    control of three values, where a unit could turn between two of them without any effect on the data, and
+    for the weights a of the rational units, as tanh(a) saturates. It is exactly 1 for a where a control has
+    three values, as these leave the tilt open.
+    """
+    kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
+    least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
+    least[2 : 2 + D][sparse] = _LEAST_SPARSE
+    least[6 + D] = _LEAST_TILT
+    if sparse.any():
+        most[6 + D] = _LEAST_TILT
+    effective = np.maximum(kinds.sum(axis=1) - precision * (leverage @ kinds.T), 1e-3)
+    squares = np.maximum((weights * weights) @ kinds.T, 1e-12)
+    return np.sqrt(precision * np.clip(effective / squares, least, most))
+
+
+def prior_precision(topology: Topology, precision: Array) -> Array:
+    """Precision of each weight's prior, (..., G) -> (..., P)."""
+    group = topology.groups
+    return np.where(group < 0, _FLAT, np.asarray(precision)[..., np.maximum(group, 0)])
+
+
+def train(
+    topology: Topology,
+    x: Array,
+    targets: Array,
+    variance: Array,
+    weights: Array,
+    schedule: Schedule | None = None,
+) -> TrainedNets:
+    """Train a stack of networks, all at once, from initial weights (B, P).
+
+    The controls x (n, D) are scaled to about [-1, 1], the targets (n,) centred and scaled to a spread of
+    about 1. Their variances (n,) are 0 where unknown, so that the scatter is the noise.
+    """
+    learner = _NetworkStack(topology, x, targets, variance, weights)
+    schedule = schedule or Schedule()
+    descent = LevenbergMarquardt(learner, _OPTIONS, floor=-1.0)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for iteration in range(schedule.iterations):
+            if iteration >= schedule.warm and iteration % schedule.period == 0:
+                learner.update_priors(allow_scatter=iteration >= schedule.settle)
+                descent.renew()
+            descent.step()
+    return learner.result()
+
+
+_Trial = tuple[Array, Array, Array, Array]  # weights, outputs, their derivatives, the cost
+
+
+class _NetworkStack:
+    """Networks in training as a problem of `least_squares`: each network is a group of cost 2 E."""
+
+    def __init__(self, topology: Topology, x: Array, targets: Array, variance: Array, weights: Array) -> None:
+        self.topology, self.x, self.targets, self.variance = topology, x, targets, variance
+        self.w, self.diagonal = weights, range(topology.n_weights)
+        self.a = np.full((len(weights), topology.n_groups), 0.3)
+        # For targets without a variance, a thousandth of their spread until the noise is estimated.
+        self.tau2 = np.full(len(weights), 0.0 if variance.any() else 1e-6)
+        self.y, self.J = respond_with_jacobian(topology, weights, x)
+        self._weigh()
+
+    def _weigh(self) -> None:
+        """Apply new priors and scatter."""
+        self.prior = prior_precision(self.topology, self.a)
+        self.weight = 1 / (self.variance + self.tau2[:, None])
+        self.cost = self._cost(self.w, self.y)
+
+    def _cost(self, w: Array, y: Array) -> Array:
+        return (self.weight * (y - self.targets) ** 2).sum(axis=1) + (self.prior * w * w).sum(axis=1)
+
+    def _normal(self) -> Array:
+        A = (np.swapaxes(self.J, 1, 2) * self.weight[:, None]) @ self.J
+        A[:, self.diagonal, self.diagonal] += self.prior
+        return A
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Damped step of each network's weights, and the predicted gain."""
+        pull = (self.weight * (self.targets - self.y))[:, None] @ self.J
+        downhill = pull[:, 0] - self.prior * self.w
+        A = self._normal()
+        ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2)
+        A[:, self.diagonal, self.diagonal] += ridge
+        # Regular by the priors, so not scaled.
+        step = np.asarray(np.linalg.solve(A, downhill[..., None])[..., 0], dtype=float)
+        return step, (step * (downhill + ridge * step)).sum(axis=1)
+
+    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """The networks after a step; all weights are valid."""
+        w = self.w + step
+        y, J = respond_with_jacobian(self.topology, w, self.x)
+        cost = self._cost(w, y)
+        return (w, y, J, cost), cost, np.ones(len(w), dtype=bool)
+
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Accept the trial for networks that improved."""
+        w, y, J, cost = trial
+        self.w, self.y = np.where(better[:, None], w, self.w), np.where(better[:, None], y, self.y)
+        self.J = np.where(better[:, None, None], J, self.J)
+        self.cost = np.where(better, cost, self.cost)
+
+    def update_priors(self, allow_scatter: bool) -> None:
+        """Update the priors, half the way on a logarithmic scale, and the scatter."""
+        leverage = np.diagonal(np.linalg.inv(self._normal()), axis1=1, axis2=2)
+        self.a = updated_precision(self.topology, self.a, leverage, self.w, self.x)
+        if allow_scatter:
+            gamma = self.topology.n_weights - (self.prior * leverage).sum(axis=1)
+            self._update_scatter(np.maximum(len(self.x) - gamma, 0.05 * len(self.x)))
+        self._weigh()
+
+    def _update_scatter(self, freedom: Array) -> None:
+        """Update tau^2 so that the squared errors have their expected size; 0 if they are smaller."""
+        total = self.variance + self.tau2[:, None]
+        ratio = ((self.y - self.targets) ** 2 / total).sum(axis=1) / freedom
+        known = self.variance.any()
+        least = 1e-4 * float(np.median(self.variance)) if known else 1e-8
+        seed = np.where(self.tau2 > 0, self.tau2, np.median(self.variance) * np.maximum(ratio - 1, 0))
+        self.tau2 = seed * np.clip(ratio, 0.1, 10.0)
+        self.tau2 = np.where(self.tau2 < least, 0.0 if known else least, self.tau2)
+
+    def result(self) -> TrainedNets:
+        """The networks as they are, with the logarithm of their evidence (B,)."""
+        sign, volume = np.linalg.slogdet(self._normal())
+        volume = np.where(sign > 0, volume, np.inf)
+        log_prior = 0.5 * np.log(self.prior).sum(axis=1)
+        noise = np.log(self.variance + self.tau2[:, None]).sum(axis=1)
+        # Symmetric permutations of the weights are not counted, as idle units have none.
+        evidence = -0.5 * self.cost - 0.5 * volume + log_prior - 0.5 * noise
+        evidence = np.where(np.isfinite(evidence), evidence, -np.inf)
+        return TrainedNets(self.w, self.a, self.tau2, evidence)

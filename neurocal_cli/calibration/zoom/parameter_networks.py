@@ -3,19 +3,41 @@
 The outputs are centred and scaled. alpha_u is on a logarithmic, linear or reciprocal scale, whichever has the
 highest evidence. Instead of alpha_v there is log(alpha_v / alpha_u), as the pixels' shape hardly changes with
 the setting. u0, v0, t_z and the distortion coefficients are used as they are.
+
+Step 2: networks for each parameter alone, with several topologies and starts.
+
+The parameters are fitted in an order, like the polynomials of Willson (1994). t_z comes first, as it is the
+least certain. The others are then estimated with t_z held at the output of its networks. alpha_u, which is
+correlated with t_z, compensates for the remaining error of these networks, and its targets are precise.
+
+Evidence ranks networks of all topologies. The noise is far smaller than the variation of the parameters, so
+some of the best networks overfit: they pass through all settings and oscillate between them. The committee
+therefore consists of those of the best networks that agree most between the settings (`_agreeing`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.zoom.mlfn import Topology, respond, respond_with_jacobian
-from neurocal_cli.calibration.zoom.network_training import prior_precision
+from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.calibration.zoom.mlfn import (
+    Schedule,
+    Topology,
+    prior_precision,
+    respond,
+    respond_with_jacobian,
+    sparse_controls,
+    train,
+)
+from neurocal_cli.calibration.zoom.quadratic_error import inverse
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import UsageError
 
 SCALES = ("log", "linear", "inverse")
 
@@ -139,3 +161,156 @@ def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
     outputs[:, 1] = np.log(local[:, 1] / local[:, 0])
     by_local[:, 1, 0], by_local[:, 1, 1] = -1 / local[:, 0], 1 / local[:, 1]
     return outputs, by_local
+
+
+# Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
+# these choices, `Budget` and `Schedule` reach between settings.
+# (own, hidden): tanh units of the first layer for each control, units of the second.
+TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
+# Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
+_SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
+_WEIGHTS_PER_SETTING = 2.0
+_LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
+_AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
+_GRID = 13  # values of each control at which networks are compared
+
+
+@frozen_dataclass
+class Budget:
+    """Numbers of networks to train and to keep.
+
+    Raises
+    ------
+    UsageError
+        Topologies that are not pairs of whole numbers.
+    """
+
+    topologies: tuple[tuple[int, int], ...] | None = None  # None: those that suit the number of settings
+    starts: int = 12  # random starts of each topology
+    best: int = 20  # networks of the highest evidence that may be in the committee
+    members: int = 12  # size of the committee
+    schedule: Schedule = field(default_factory=Schedule)
+
+    def __post_init__(self) -> None:
+        if self.topologies is None:
+            return
+        pairs = np.array(self.topologies, dtype=object)
+        if pairs.shape[1:] != (2,) or not all(
+            isinstance(n, (int, np.integer)) and n >= 0 for n in pairs.flat
+        ):
+            raise UsageError(
+                "topologies must be pairs of whole numbers of at least 0, such as ((2, 0), (2, 2))"
+            )
+
+
+def fit_committee(
+    x: Array,
+    names: Sequence[str],
+    local: Array,
+    H: Array | None,
+    variance: float,
+    rng: np.random.Generator,
+    budget: Budget,
+    report: Callable[[float], None],
+) -> tuple[LensNets, ...]:
+    """Fit networks to tables of local parameters (S, L) at scaled controls (S, D), one parameter at a time.
+
+    Of the names, alpha_u, alpha_v, u0, v0 come first. H (S, L + Q, L + Q) are normal matrices at the tables,
+    which with the variance of the noise [px^2] give those of the targets; None where they are unknown.
+    `report` is called with the share that is done. The first of the members consists of the networks that
+    agree best with the others.
+    """
+    # A grid over the whole range of the controls.
+    probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=x.shape[1])))
+    L = len(names)
+    first = [j for j, name in enumerate(names) if name == "t_z"]
+    order = [*first, 2, 3, *range(4 + len(first), L), 0, 1]
+    values, held = local.copy(), np.zeros(L, dtype=bool)
+    chosen: dict[int, list[ParameterNet]] = {}
+    scale = "log"
+    for count, j in enumerate(order):
+        report(count / L)
+        values, spread = _given(local, values, H, variance, held)
+        targets, derivative = values[:, j], np.ones(len(x))
+        if j == 0:
+            scale, nets = _best_scale(x, values[:, 0], spread[:, 0], rng, budget)
+        else:
+            if j == 1:
+                targets, derivative = np.log(values[:, 1] / values[:, 0]), 1 / values[:, 1]
+            nets, _ = _fit(x, targets, spread[:, j] * derivative**2, rng, budget)
+        chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
+        if names[j] == "t_z":
+            values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
+            held[j] = True
+    return tuple(LensNets(scale, tuple(chosen[j][k] for j in range(L))) for k in range(budget.members))
+
+
+def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
+    """Topologies for settings (S, D): at most two weights a setting, as the priors make most of them idle."""
+    limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
+    choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
+    return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
+
+
+def _given(
+    local: Array, values: Array, H: Array | None, variance: float, held: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Tables with some parameters held at other values, and the variances of the rest; (S, L) both."""
+    if H is None:
+        return local, np.zeros_like(local)
+    free = np.flatnonzero(~held)
+    pull = -(H[:, free[:, None], np.flatnonzero(held)] @ (values - local)[:, held, None])
+    B = H[:, free[:, None], free]
+    values = values.copy()
+    values[:, free] = local[:, free] + solve_scaled(B, pull, ROUNDING)[..., 0]
+    spread = np.zeros_like(local)
+    spread[:, free] = variance * np.diagonal(inverse(B), axis1=1, axis2=2)
+    return values, spread
+
+
+def _best_scale(
+    x: Array, alpha: Array, variance: Array, rng: np.random.Generator, budget: Budget
+) -> tuple[str, list[ParameterNet]]:
+    """The scale of alpha_u with the highest evidence, and its networks."""
+    fits = {}
+    for scale in SCALES:
+        targets, derivative = to_scale(scale, alpha)
+        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget)
+        # The density of the targets as one of alpha.
+        fits[scale] = (evidence + float(np.log(np.abs(derivative)).sum()), nets)
+    best = max(fits, key=lambda name: fits[name][0])
+    scale = best if fits[best][0] > fits["log"][0] + _LOG_ODDS else "log"
+    return scale, fits[scale][1]
+
+
+def _fit(
+    x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget
+) -> tuple[list[ParameterNet], float]:
+    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets."""
+    centre, spread = float(targets.mean()), float(targets.std())
+    # Equal targets have no spread; their noise, or 1, replaces it.
+    spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
+    scaled = (targets - centre) / spread
+    nets, evidence = [], []
+    for own, hidden in budget.topologies or suitable_topologies(x):
+        topology = Topology(x.shape[1], own, hidden)
+        start = topology.random_weights(budget.starts if own + hidden else 1, rng)
+        trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
+        for w, a, tau2, e in zip(
+            trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
+        ):
+            nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
+            evidence.append(float(e))
+    order = np.argsort(-np.array(evidence), kind="stable")
+    return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
+
+
+def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:
+    """The `count` networks nearest to the median of all, the nearest first.
+
+    Networks far from it are never taken. Where there are too few networks, the nearer ones are repeated.
+    """
+    outputs = np.array([net.output(probe) for net in nets])
+    distance = ((outputs - np.median(outputs, axis=0)) ** 2).mean(axis=1)
+    order = np.argsort(distance, kind="stable")[: max(1, round(_AGREEING_SHARE * len(nets)))]
+    return [nets[order[k % len(order)]] for k in range(count)]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, solve_scaled
-from neurocal_cli.calibration.zoom.setting_normals import Normal
+from neurocal_cli.calibration.zoom.settings import Normal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 

@@ -13,13 +13,17 @@ import numpy as np
 
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.verdict.odd_points import view_of_another_unit
-from neurocal_cli.calibration.zoom.initialisation import CalibratedSettings, FitOptions, free_pose_variance
+from neurocal_cli.calibration.zoom.initialisation import (
+    CalibratedSettings,
+    FitOptions,
+    common_tables,
+    first_constants,
+    free_pose_variance,
+)
 from neurocal_cli.calibration.zoom.joint_training import Joint
 from neurocal_cli.calibration.zoom.parameter_networks import are_cameras
 from neurocal_cli.calibration.zoom.quadratic_error import inverse, with_scatter
-from neurocal_cli.calibration.zoom.setting_normals import Constants, Tables
-from neurocal_cli.calibration.zoom.settings import describe, far_value, middles
-from neurocal_cli.calibration.zoom.static_calibration import common_tables, first_constants
+from neurocal_cli.calibration.zoom.settings import Constants, Tables, describe, far_value, middles
 from neurocal_cli.calibration.zoom.zoom_lens import Member, ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError

@@ -1,14 +1,34 @@
-"""Known points and their images at many settings of one zoom lens."""
+"""Known points and their images at many settings of one zoom lens.
+
+Normal matrices of the reprojection error at each setting.
+
+The local parameters change with the setting: alpha_u, alpha_v, u0, v0, t_z and the distortion coefficients.
+All settings share the constants (the paper's zero-order terms): theta and, for a still camera, R, t_x, t_y.
+Where the target moves, each view has its own pose, which is eliminated (variable projection), and t_z is not
+a parameter.
+
+The points of a setting enter only through H = J^T J, g = J^T r and the sum of squares, over its local and
+the shared parameters. Residuals are in pixels.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.normal_equations import eliminate
+from neurocal_cli.adjustment.problem import translations, translations_normalised
+from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, cross_matrix, orthonormalised, rotation_step
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences
 
@@ -127,3 +147,174 @@ def far_value(controls: tuple[str, ...], settings: Array) -> str | None:
             if 0 < np.ptp(near) < np.abs(near - far).min():
                 return f"{name} {far:.10g} is far from the others, {near[0]:.10g} to {near[-1]:.10g}"
     return None
+
+
+_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
+
+
+@frozen_dataclass(eq=False)
+class Constants:
+    """Parameters that all settings share: theta, and the pose of a still camera or of each view."""
+
+    theta: float  # [rad]
+    R: Array  # (3, 3), or (V, 3, 3) for a moving camera
+    t: Array  # (2,) t_x and t_y, or (V, 3)
+
+    def moved(self, step: Array) -> Constants:
+        """After a step of the shared parameters: theta alone, or theta, omega, t_x, t_y."""
+        theta = self.theta + float(step[0])
+        if len(step) == 1:
+            return replace(self, theta=theta)
+        return Constants(theta, orthonormalised(rotation_step(step[1:4]) @ self.R), self.t + step[4:6])
+
+
+@frozen_dataclass(eq=False)
+class Normal:
+    """Second-order model of the reprojection error of each setting."""
+
+    H: Array  # (S, L + Q, L + Q) over the local parameters, then the shared ones
+    g: Array  # (S, L + Q) J^T r with r = observed - predicted
+    cost: Array  # (S,) sum of squared residuals [px^2]
+    sensible: bool  # whether all points are in front of the camera, where the distortion is monotonic
+
+    @property
+    def blocks(self) -> Array:
+        """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
+        g = self.g[..., None]
+        return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
+
+
+@frozen_dataclass(eq=False)
+class Tables:
+    """Local parameters at each setting and the constants that go with them."""
+
+    local: Array  # (S, L)
+    constants: Constants
+    normal: Normal  # linearised there; for known cameras: of the squared errors over the networks' scatter
+    converged: bool = True
+
+
+def local_names(with_t_z: bool, model: str) -> tuple[str, ...]:
+    """Names of the local parameters with a distortion model."""
+    return (*INTRINSIC_NAMES[:4], *(("t_z",) if with_t_z else ()), *coefficient_names(model))
+
+
+def coefficients_of(local: Array, model: str) -> Array:
+    """Distortion coefficients (..., K), which are the last of the local parameters (..., L)."""
+    return local[..., local.shape[-1] - len(coefficient_names(model)) :]
+
+
+@frozen_dataclass(eq=False)
+class PixelData:
+    """Points of all settings, ready for `linearise`."""
+
+    views: Views
+    setting: NDArray[np.int64]  # (V,)
+    n_settings: int
+    still: bool  # whether neither the camera nor the target moves
+    model: str  # of the distortion
+    free_theta: bool
+
+    @classmethod
+    def of(cls, lens: LensPoints, still: bool, model: str, free_theta: bool) -> PixelData:
+        """Arrange points."""
+        return cls(arrange(lens.points), lens.view_setting, lens.n_settings, still, model, free_theta)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the local parameters."""
+        return local_names(self.still, self.model)
+
+    @property
+    def n_shared(self) -> int:
+        """Q: theta, and omega, t_x, t_y of a still camera."""
+        return 6 if self.still else 1
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(S,) points of each setting."""
+        return np.bincount(self.setting, weights=self.views.counts, minlength=self.n_settings).astype(
+            np.int64
+        )
+
+    def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
+        """Linearise the reprojection error at local parameters (S, L) and constants.
+
+        The constants come back with the best poses where each view has its own.
+        """
+        state = self.state_of(local, constants)
+        if not self.still:
+            free = np.zeros(5 + state.k.shape[1], dtype=bool)
+            state = adjust(self.views.batches, state, free, True, _POSE_STEPS).state
+            constants = replace(constants, R=state.R, t=translations(self.views, state))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            N, sensible = normal_blocks(self.views.batches, state)
+            reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
+        summed = np.zeros((self.n_settings, *reduced.shape[1:]))
+        np.add.at(summed, self.setting, reduced)
+        L = summed.shape[1] - 1
+        if not self.free_theta:  # a unit diagonal holds it at 0
+            theta = len(self.names)
+            summed[:, theta, :] = summed[:, :, theta] = 0.0
+            summed[:, theta, theta] = 1.0
+        upper = np.triu(summed)  # exactly symmetric, like one read from a file
+        summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
+        good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
+        return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
+
+    def state_of(self, local: Array, constants: Constants) -> CameraState:
+        """Normalised cameras of all views."""
+        views, (a, b, u0, v0) = self.views, local[self.setting, :4].T
+        sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
+        A = np.column_stack([a, -a * cosine / sine, b / sine, u0, v0])
+        A[:, 3:] -= views.pixel_centre
+        if self.still:
+            R = np.broadcast_to(constants.R, (views.n_views, 3, 3))
+            t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[self.setting, 4]])
+        else:
+            R, t = constants.R, constants.t
+        centred = translations_normalised(views, R, t)
+        k = coefficients_of(local[self.setting], self.model)
+        return CameraState(A / views.pixel_scale, R, centred, self.model, k)
+
+    def camera_jacobian(self, local: Array, constants: Constants) -> Array:
+        """Derivatives (V, 5 + K, 5 + K) of A's normalised entries and the distortion coefficients.
+
+        They are by alpha_u, alpha_v, u0, v0, the coefficients and theta.
+        """
+        a, b = local[self.setting, :2].T
+        sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
+        K = len(coefficient_names(self.model))
+        J = np.zeros((len(a), 5 + K, 5 + K))
+        J[:, 0, 0], J[:, 1, 0], J[:, 2, 1] = 1.0, -cosine / sine, 1 / sine
+        J[:, 3, 2] = J[:, 4, 3] = 1.0
+        J[:, 1, -1], J[:, 2, -1] = a / sine**2, -b * cosine / sine**2
+        J /= self.views.pixel_scale
+        J[:, 5:, 4:-1] = np.eye(K)
+        return J
+
+    def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
+        """Normal matrices over local and shared parameters and the residual, for a still camera."""
+        views, V, K = self.views, len(N), N.shape[1] - 12
+        C = np.zeros((V, 12 + K, 12 + K))
+        scale = views.scale[:, None, None]
+        of_camera = np.delete(np.arange(6 + K), 4)  # all local parameters but t_z, and theta
+        C[:, camera_columns(K)[:, None], of_camera] = self.camera_jacobian(local, constants)
+        C[:, 10, 4] = 1 / views.scale
+        # The world turns about its origin, the points of a view about their centre, so t changes too.
+        centre = (constants.R @ views.centre[..., None])[..., 0]
+        C[:, 5:8, 6 + K : 9 + K] = np.eye(3)
+        C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
+        C[:, 8:10, 9 + K : 11 + K] = np.eye(2) / scale
+        C[:, -1, -1] = 1.0
+        return np.swapaxes(C, 1, 2) @ N @ C * self.views.pixel_scale**2
+
+    def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
+        """Normal matrices over local parameters, theta and the residual, with the poses eliminated."""
+        V, K = len(N), N.shape[1] - 12
+        keep = np.concatenate([camera_columns(K), [11 + K]])
+        U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))
+        C = np.zeros((V, 6 + K, 6 + K))
+        C[:, :-1, :-1] = self.camera_jacobian(local, constants)
+        C[:, -1, -1] = 1.0
+        return np.swapaxes(C, 1, 2) @ U @ C * self.views.pixel_scale**2

@@ -2,28 +2,68 @@
 
 Values are rounded by their standard deviation: it keeps two significant digits, and the value has the same
 number of decimals, so that no meaningless digit is shown.
+
+A verdict as plain text and as JSON.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Verdict, ViewResult
+from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.commands.show.verdict_report import verdict_json, verdict_lines
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.target import Target, scale_of
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.evaluation import CameraEvaluation
+
+
+# The main measures, in words.
+_FACTS: dict[str, Callable[[float], str]] = {
+    "held_out_px": "cross-validation error {:.3g} px".format,
+    "precision_px": "noise floor {:.3g} px".format,
+    "projection_px": lambda std: f"std of predicted pixels {two_digits(std)} px at most",
+    "depth_share": lambda std: f"std of triangulated depth {100 * std:.2g} % of the depth",
+    "coverage": lambda share: f"{100 * share:.0f} % of the image covered",
+}
+
+
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """Lines of the verdict: the word, the main measures, reasons and advice."""
+    lines = [f"verdict: {verdict.word}"]
+    if found := facts(verdict):
+        lines.append(f"  {found}")
+    lines += [f"  reason: {reason}" for reason in verdict.reasons]
+    lines += [f"  advice: {advice}" for advice in verdict.advice]
+    return lines
+
+
+def verdict_json(verdict: Verdict) -> dict[str, Any]:
+    """Convert a verdict to JSON values; numbers that are not finite become None."""
+    measures = {name: value if math.isfinite(value) else None for name, value in verdict.measures.items()}
+    return {
+        "word": verdict.word,
+        "reasons": list(verdict.reasons),
+        "advice": list(verdict.advice),
+        "measures": measures,
+    }
+
+
+def facts(verdict: Verdict) -> str:
+    """The main measures of a verdict in one line."""
+    m = verdict.measures
+    return ", ".join(text(m[name]) for name, text in _FACTS.items() if math.isfinite(m.get(name, math.nan)))
+
 
 _MOST_VIEWS = 20  # rows of a table that fit on a screen
 _TIED = 1.009  # ratio of cross-validation errors that the choice of the model takes for equal

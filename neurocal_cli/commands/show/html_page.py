@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from neurocal_cli import __version__
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.commands.show.verdict_report import facts
+from neurocal_cli.commands.show.camera_report import facts
 
 _LONG = 40  # characters; longer cells are texts
 

@@ -19,8 +19,9 @@ from neurocal_cli.commands.show.camera_report import (
     printable,
     rounded,
     target_lines,
+    verdict_json,
+    verdict_lines,
 )
-from neurocal_cli.commands.show.verdict_report import verdict_json, verdict_lines
 from neurocal_cli.errors import plural
 
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells

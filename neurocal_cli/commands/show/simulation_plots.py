@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.commands.show.figure import ACCENT, picture, style
-from neurocal_cli.commands.show.simulation_report import FIG_1
+from neurocal_cli.commands.show.methods_report import FIG_1
 from neurocal_cli.simulation.noise import NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.starts import StartStudy

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
-from neurocal_cli.calibration.zoom.static_calibration import local_covariance
+from neurocal_cli.calibration.zoom.initialisation import local_covariance
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES

@@ -14,8 +14,15 @@ from neurocal_cli.calibration.zoom.settings import CONTROLS
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.show.camera_report import align, number_or_none, rounded, target_json, target_lines
-from neurocal_cli.commands.show.verdict_report import verdict_json, verdict_lines
+from neurocal_cli.commands.show.camera_report import (
+    align,
+    number_or_none,
+    rounded,
+    target_json,
+    target_lines,
+    verdict_json,
+    verdict_lines,
+)
 
 _MOST_SETTINGS = 8
 _SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}

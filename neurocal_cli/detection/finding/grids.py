@@ -15,17 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.checks import edges_visible, has_block, is_smooth
-from neurocal_cli.detection.finding.folds import split_at_folds
-from neurocal_cli.detection.finding.from_links import lattice_from_links
-from neurocal_cli.detection.finding.grow import grow, remove_outliers
+from neurocal_cli.detection.finding.grow import edges_visible, grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
-from neurocal_cli.detection.finding.links import Links, find_links, find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.links import (
+    Links,
+    find_links,
+    find_seeds_2x3,
+    find_seeds_3x3,
+    lattice_from_links,
+)
 from neurocal_cli.detection.finding.overlaps import (
     any_overlap,
     drop_duplicates,
     merge_lattices,
+    split_at_folds,
     trim_overlaps,
 )
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch

@@ -1,4 +1,11 @@
-"""The grid of vertices of a board while it is being found on a level of the pyramid."""
+"""The grid of vertices of a board while it is being found on a level of the pyramid.
+
+Predict a vertex from its neighbours by local regression.
+
+The map is a quadratic polynomial of the grid coordinates, fitted to the vertices at most three squares away
+by weighted ridge regression. The ridge keeps second derivatives small, as they are under perspective and
+distortion, so few neighbours give a linear map.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +18,98 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
+from neurocal_cli.detection.finding.saddles import window
 from neurocal_cli.detection.medians import median
+
+# _REACH and _RIDGE are insensitive; tests/test_finding.py.
+_REACH = 3  # squares
+_WIDTH = 1.4  # squares; standard deviation of the Gaussian weights
+_RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
+
+_c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
+_BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
+_WEIGHT = np.exp(-0.5 * (_c**2 + _r**2) / _WIDTH**2) * (_c**2 + _r**2 > 0)
+# Weighted outer products of the basis, a row for each neighbour, and a column of ones that counts neighbours.
+_PRODUCTS = (_WEIGHT[:, None, None] * _BASIS[:, :, None] * _BASIS[:, None, :]).reshape(len(_c), -1)
+_PRODUCTS = np.concatenate([_PRODUCTS, np.ones((len(_c), 1))], axis=1)
+_RIGHT = _WEIGHT[:, None] * _BASIS
+_FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
+
+
+@frozen_dataclass(eq=False)
+class PredictedVertices:
+    """N predicted vertices."""
+
+    points: Array  # (N, 2) [px]
+    steps: Array  # (N, 2, 2) [px] to the next vertex along the point's row, and along its column
+    spread: Array  # (N,) standard deviation of the point for unit standard deviation of the vertices
+
+    def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
+        """Select some predictions."""
+        return PredictedVertices(self.points[which], self.steps[which], self.spread[which])
+
+    @property
+    def c(self) -> Array:
+        """(N, 2) steps along a row [px]."""
+        return self.steps[:, 0]
+
+    @property
+    def r(self) -> Array:
+        """(N, 2) steps along a column [px]."""
+        return self.steps[:, 1]
+
+    @cached_property
+    def area(self) -> Array:
+        """(N,) area of a square [px^2]; negative if mirrored."""
+        return np.asarray(self.c[:, 0] * self.r[:, 1] - self.c[:, 1] * self.r[:, 0])
+
+    @property
+    def width(self) -> Array:
+        """(N,) smaller distance between opposite sides of a square [px]."""
+        length = np.hypot(self.steps[..., 0], self.steps[..., 1])
+        longest = np.maximum(length[:, 0], length[:, 1])
+        return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
+
+    def around(self, shares: Array, points: Array) -> Array:
+        """Places (N, K, 2) around points (N, 2), at offsets (K, 2) in units of `c` and `r`."""
+        return np.asarray(points[:, None] + shares @ self.steps)
+
+    def in_squares(self, away: Array) -> Array:
+        """Convert pixel offsets (N, 2) to units of `c` and `r`."""
+        area = self.area
+        area = np.where(np.abs(area) > 1e-9, area, 1e-9)
+        out = np.empty(away.shape)
+        np.subtract(away[:, 0] * self.r[:, 1], away[:, 1] * self.r[:, 0], out=out[:, 0])
+        np.subtract(self.c[:, 0] * away[:, 1], self.c[:, 1] * away[:, 0], out=out[:, 1])
+        out /= area[:, None]
+        return out
+
+
+def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
+    """Predict vertices at rows and columns (N,), known or not, of an array (rows, cols, 2) [px]."""
+    rows, cols = pixels.shape[:2]
+    padded = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
+    inner = padded[:, _REACH:-_REACH, _REACH:-_REACH]
+    seen = ~np.isnan(pixels[..., 0])
+    np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
+    inner[2] = seen
+    width = padded.shape[2]
+    place = (row + _REACH) * width + col + _REACH
+    near = padded.reshape(3, -1).take(place[:, None] + window(_REACH, width), axis=1)
+    known = near[2]
+    sums = known @ _PRODUCTS
+    normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE
+    # Subtract the mean of the neighbours, to reduce rounding errors.
+    origin = near[:2] @ _ONES
+    origin /= np.maximum(sums[:, -1], 1.0)
+    offset = near[:2]
+    offset -= origin[:, :, None] * known
+    right = np.empty((len(row), 6, 3))
+    right[:, :, :2] = (offset @ _RIGHT).transpose(1, 2, 0)
+    right[:, :, 2] = _FIRST
+    solution = np.linalg.solve(normal, right)
+    return PredictedVertices(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))
+
 
 Index = NDArray[np.intp]
 

@@ -18,6 +18,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape, fit_batch
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
+    EdgeShifts,
     FieldBlur,
     PixelNoise,
     correlation,
@@ -37,9 +38,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
     usual_stride,
 )
 from neurocal_cli.detection.fitting.edge_profile import half_widths
-from neurocal_cli.detection.fitting.edge_shifts import EdgeShifts
-from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
-from neurocal_cli.detection.fitting.initial_fit import fit_initial
+from neurocal_cli.detection.fitting.initial_fit import fit_initial, is_reliable, is_typical
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
 from neurocal_cli.detection.fitting.shading import (
     Levels,

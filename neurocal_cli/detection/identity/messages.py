@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.identity.ends import End
+from neurocal_cli.detection.identity.placement import End
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.board import Board
 

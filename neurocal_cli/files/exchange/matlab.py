@@ -3,12 +3,20 @@
 MATLAB counts pixels from 1, so principal points are larger than ours by 1. Its matrices multiply row vectors
 from the right, so K, rotations and translations are transposed; the skew is ``IntrinsicMatrix(2, 1)``.
 Bouguet's ``Calib_Results.mat`` counts from 0, multiplies column vectors, and has the skew as ``alpha_c``.
+
+Read the variables of a MATLAB file of version 5 to 7: numbers, texts, cells and structs.
+
+``scipy.io.loadmat`` is not used, because damaged files crash it. The format is MathWorks' "MAT-File Format":
+each element has a type, a length and data, and matrices consist of further elements.
 """
 
 from __future__ import annotations
 
 import io
 import re
+import struct
+import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,9 +25,106 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
-from neurocal_cli.files.mat_file import read_variables
+
+_HEADER = 128  # bytes
+_MATRIX, _COMPRESSED = 14, 15
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_TEXT_TYPES = {2: "utf-8", 4: "utf-16", 16: "utf-8", 17: "utf-16", 1: "utf-8"}
+_CELL, _STRUCT, _CHAR = 1, 2, 4
+_NUMBERS = range(6, 16)  # double to uint64
+_DEEPEST = 12
+_MOST_BYTES = 500_000_000  # unpacked
+
+
+def read_variables(data: bytes, source: str) -> dict[str, Any]:
+    """Read arrays, strings, lists for cells and dicts for structs; objects of classes are left out."""
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise FormatError("is no .mat file of version 5 to 7; save it again with -v7", source)
+    try:
+        return dict(_variables(data[_HEADER:], order))
+    except (struct.error, ValueError, KeyError, IndexError, zlib.error, UnicodeError, OverflowError) as error:
+        raise FormatError("is a damaged .mat file; save it again with -v7", source) from error
+
+
+def _variables(data: bytes, order: str) -> Iterator[tuple[str, Any]]:
+    for kind, content in _elements(data, order, padded=False):
+        if kind == _COMPRESSED:
+            unpacker = zlib.decompressobj()
+            content = unpacker.decompress(content, _MOST_BYTES)
+            if unpacker.unconsumed_tail:
+                raise ValueError("too large")
+            ((kind, content),) = _elements(content, order)
+        if kind != _MATRIX:
+            raise ValueError("no matrix")
+        name, value = _matrix(content, order, _DEEPEST)
+        if value is not None:
+            yield name, value
+
+
+def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
+    """Iterate over types and contents of elements, which are padded to 8 bytes unless compressed."""
+    k = 0
+    while k < len(data):
+        (word,) = struct.unpack_from(f"{order}I", data, k)
+        if word >> 16:  # small element: type and length in one word, and the content in the next
+            kind, count, start, step = word & 0xFFFF, word >> 16, k + 4, 8
+            if count > 4:
+                raise ValueError("too long")
+        else:
+            (count,) = struct.unpack_from(f"{order}I", data, k + 4)
+            kind, start = word, k + 8
+            step = 8 + (count if kind == _COMPRESSED and not padded else -(-count // 8) * 8)
+        if start + count > len(data):
+            raise ValueError("cut off")
+        yield kind, data[start : start + count]
+        k += step
+
+
+def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
+    """Name and value of a matrix; the value is None for unsupported classes."""
+    if depth == 0:
+        raise ValueError("nested too deeply")
+    if not data:
+        return "", np.zeros((0, 0))
+    parts = list(_elements(data, order))
+    kind = struct.unpack(f"{order}II", parts[0][1])[0] & 0xFF
+    if kind not in (_CELL, _STRUCT, _CHAR, *_NUMBERS):
+        return "", None
+    shape = _values(parts[1], order).tolist()
+    count = int(np.prod(shape, dtype=object))
+    if len(shape) < 2 or min(shape) < 0 or count > _MOST_BYTES:
+        raise ValueError("no shape")
+    name = parts[2][1].decode("ascii")
+    if kind == _CHAR:
+        form, content = parts[3] if len(parts) > 3 else (1, b"")
+        encoding = _TEXT_TYPES[form]
+        if encoding == "utf-16":
+            encoding += "-le" if order == "<" else "-be"
+        return name, content.decode(encoding)
+    if kind == _CELL:
+        return name, [_matrix(content, order, depth - 1)[1] for _, content in parts[3 : 3 + count]]
+    if kind == _STRUCT:
+        length = int(_values(parts[3], order)[0])
+        if length <= 0:
+            raise ValueError("no names")
+        names = [
+            parts[4][1][k : k + length].split(b"\0")[0].decode("ascii")
+            for k in range(0, len(parts[4][1]), length)
+        ]
+        values = [_matrix(content, order, depth - 1)[1] for _, content in parts[5:]]
+        if count != 1 or len(values) != len(names):
+            return name, None  # an array of structs
+        return name, {key: value for key, value in zip(names, values, strict=True) if value is not None}
+    return name, _values(parts[3], order).astype(float).reshape(shape, order="F")
+
+
+def _values(part: tuple[int, bytes], order: str) -> np.ndarray[Any, Any]:
+    kind, content = part
+    return np.frombuffer(content, dtype=np.dtype(order + _TYPES[kind]))
+
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
 _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")

@@ -13,8 +13,7 @@ import numpy as np
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_info import format_camera_info
-from neurocal_cli.files.camera_tree import camera_from_tree, matrix_data
+from neurocal_cli.files.camera_tree import camera_from_tree, format_camera_info, matrix_data
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.neurocal import as_rig
 from neurocal_cli.files.tree_fields import Field
