@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.calibrate import calibrate
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.evaluation import evaluate_camera
-    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_rig
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
-    from neurocal_cli.calibration.rig.fit_rig import fit_rig
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.triangulation import triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
@@ -62,7 +61,7 @@ _HOMES = {
     "evaluate_stereo": "calibration.rig.evaluation",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
-    "fit_rig": "calibration.rig.fit_rig",
+    "fit_rig": "calibration.rig.calibrate_stereo",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_tree",
     "read_image": "files.images",

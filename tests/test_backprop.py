@@ -22,6 +22,8 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.network import backprop_blocks as blocks
 from neurocal_cli.network.backprop import BackpropOptions, _Run, train_backprop
 from neurocal_cli.network.network import (
+    Patterns,
+    Task,
     e_2d,
     e_orth,
     e_orth_gradient,
@@ -30,7 +32,6 @@ from neurocal_cli.network.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.network.training import Patterns, Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
 CENTRED = UPPER & (np.arange(3) < 2)

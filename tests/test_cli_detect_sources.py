@@ -14,7 +14,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.commands import frames
 from neurocal_cli.detection import batch
-from neurocal_cli.detection.frames import choose_frames
+from neurocal_cli.detection.batch import choose_frames
 from neurocal_cli.files.points_csv import read_points
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"

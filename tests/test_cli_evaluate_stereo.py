@@ -13,8 +13,8 @@ from support.command_line import run
 from support.rigs import RigScene, corner, random_rig
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
-from neurocal_cli.calibration.rig.fit_rig import fit_rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.files.result_files import lean_calibration, lean_rig, write_rig
 

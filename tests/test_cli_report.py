@@ -19,7 +19,7 @@ from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration.calibration import Rejected, Verdict
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
-from neurocal_cli.commands.show.html_drawings import enlargement, error_bars, heat_map, residual_map
+from neurocal_cli.commands.show.html_page import enlargement, error_bars, heat_map, residual_map
 from neurocal_cli.files.images import encode_png, parse_image
 from neurocal_cli.files.result_files import write_result
 

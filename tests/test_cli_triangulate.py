@@ -15,7 +15,7 @@ from support.command_line import run
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
-from neurocal_cli.calibration.rig.fit_rig import fit_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.geometry import Array

@@ -22,8 +22,7 @@ from neurocal_cli.commands.detect import _another_board, _shown
 from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
-from neurocal_cli.files.image_headers import stated_sizes
-from neurocal_cli.files.image_paths import find_images, natural_order
+from neurocal_cli.files.image_files import find_images, natural_order, stated_sizes
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 

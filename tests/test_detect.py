@@ -15,8 +15,7 @@ from support.slow_cases import slow_but
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, gather, label
 from neurocal_cli.detection.identity.identify import Identified, Located
-from neurocal_cli.detection.identity.messages import NoBoardError
-from neurocal_cli.detection.identity.placement import Placement
+from neurocal_cli.detection.identity.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import Rendered, render

@@ -14,13 +14,12 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection import Grid
-from neurocal_cli.detection.finding import levels as find_levels
+from neurocal_cli.detection.finding import saddles as find_levels
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
-from neurocal_cli.detection.finding.levels import Level, levels_of
 from neurocal_cli.detection.finding.links import find_links, find_seeds_3x3, lattice_from_links
 from neurocal_cli.detection.finding.overlaps import largest_second_difference
-from neurocal_cli.detection.finding.saddles import refine_saddles
+from neurocal_cli.detection.finding.saddles import Level, levels_of, refine_saddles
 from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth
 
 cv2 = pytest.importorskip("cv2")

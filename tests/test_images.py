@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.image_headers import read_header
-from neurocal_cli.files.image_paths import find_images, view_names
+from neurocal_cli.files.image_files import find_images, read_header, view_names
 from neurocal_cli.files.images import encode_png, parse_image, read_image
 
 COLOUR = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)

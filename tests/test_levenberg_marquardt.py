@@ -10,8 +10,7 @@ from support.gradients import gradients
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.errors import InputError
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.network.network import e_2d, optimal_gamma, output, random_weights
-from neurocal_cli.network.training import Patterns, Task
+from neurocal_cli.network.network import Patterns, Task, e_2d, optimal_gamma, output, random_weights
 
 ALL_W = np.ones((3, 3), dtype=bool)
 CAMERA = np.array([[1.9, 0.05, 0.1], [0.0, 2.0, -0.1], [0.0, 0.0, 1.0]])

@@ -11,6 +11,7 @@ from support.gradients import gradients
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.network.network import (
+    Patterns,
     e_2d,
     e_orth,
     e_orth_gradient,
@@ -19,7 +20,6 @@ from neurocal_cli.network.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.network.training import Patterns
 
 NETWORKS, POINTS = 3, 7
 RELATIVE = 1e-6

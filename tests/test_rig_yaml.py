@@ -13,7 +13,7 @@ from support.rigs import random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.fit_rig import fit_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.result_files import write_rig

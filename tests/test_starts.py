@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.network.network import Patterns, Task, Trained
 from neurocal_cli.network.starts import Agreement, Learnt, learn
-from neurocal_cli.network.training import Patterns, Task, Trained
 
 K, N = 3, 8
 

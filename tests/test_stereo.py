@@ -76,7 +76,7 @@ def test_the_views_poses_go_through_the_rig() -> None:
 
 
 def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() -> None:
-    from neurocal_cli.calibration.rig.fit_rig import fit_rig
+    from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 
     points = sides(flat(), 0.3)
     apart = fit_rig(*(calibrate(p, skew=False) for p in points))

@@ -10,8 +10,8 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
-from neurocal_cli.calibration.rig.fit_rig import fit_rig
 from neurocal_cli.calibration.rig.triangulation import METHODS
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.camera.pinhole import Pose

@@ -27,7 +27,7 @@ from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, prob
 from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.fit import fit
-from neurocal_cli.calibration.lens_choice.lens_and_target import named_lens_is_too_simple
+from neurocal_cli.calibration.lens_choice.model_selection import named_lens_is_too_simple
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import nearest_similarity, rotation_step
 from neurocal_cli.errors import DegenerateGeometryError

@@ -17,8 +17,15 @@ from neurocal_cli import Correspondences, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.undistorted_view import PANORAMAS, SHAPES, Panorama, field_of_view, undistorted_view
-from neurocal_cli.camera.undistortion import sources, undistort_pixels
+from neurocal_cli.camera.undistortion import (
+    PANORAMAS,
+    SHAPES,
+    Panorama,
+    field_of_view,
+    sources,
+    undistort_pixels,
+    undistorted_view,
+)
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import camera_info_lines
 from neurocal_cli.files.points_csv import read_points, write_points

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.network.training import patterns_of
+from neurocal_cli.network.network import patterns_of
 from neurocal_cli.observations.points import Correspondences
 
 COUNTS = (30, 7, 12)

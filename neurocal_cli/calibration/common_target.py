@@ -12,7 +12,7 @@ from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, enough_views, 
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.lens_choice.lens_and_target import (
+from neurocal_cli.calibration.lens_choice.model_selection import (
     find_lens_and_target,
     named_lens_is_too_simple,
 )

@@ -2,26 +2,37 @@
 
 Wrong stated sigmas, a distortion model that is too simple, wrong given parameters, two cameras and a camera
 that changes between the views all leave residuals that a target of another shape explains in part.
+
+Diagnose why a view of a flat target contradicts the camera of the other views.
+
+Each hypothesis changes the view's pixels, its world points or its camera. The view's pose is then estimated
+as in a problem of type 3 and adjusted. The first hypothesis whose rms error matches that of the other views
+is the explanation. If none does, the view keeps the reason for which it was left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
-from neurocal_cli.adjustment.adjust import Adjusted
+from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.board.find import Found, evidence_as_given
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.outlier_views import least_of_free_networks
-from neurocal_cli.adjustment.problem import Problem
+from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.view_covariance import scores_of_poses
-from neurocal_cli.calibration.lens_choice.lens_and_target import (
+from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.calibration.lens_choice.model_selection import (
     named_lens_is_too_simple,
     richer_lens_is_better,
 )
 from neurocal_cli.calibration.point_errors import places_of_views
+from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.calibration.verdict.given_parameters import (
     AS_WELL,
     TOLD_APART,
@@ -33,7 +44,15 @@ from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.turned_images import best_turned, middle_of
 from neurocal_cli.calibration.verdict.view_change import view_change
 from neurocal_cli.calibration.verdict.view_groups import ViewGroups, view_groups
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.network.options import options_for
+from neurocal_cli.network.orthogonality import cameras_from_products
+from neurocal_cli.network.view_networks import train_networks
+from neurocal_cli.observations.points import Correspondences
 
 _OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
 # The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
@@ -167,3 +186,112 @@ def _are_turned(rivals: _Rivals) -> bool:
     q = reduced(adjusted.normal, free, problem.free_poses)
     best, _ = best_turned(views, adjusted, q, free, middle_of(size, views))
     return rivals.more_probable(float(best.cost.sum()), 2.0**views.n_views)
+
+
+_HOLDS = 2.0  # times the rms error of the other views
+_STEPS = 40
+_STARTS = 20
+_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
+_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
+_CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
+_BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
+_FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
+
+
+def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:
+    """Explain why one view, of which these are the points, contradicts the others.
+
+    The camera is calibrated from the other views, and `rmse_px` is their rms error [px]. A reason is "its u
+    and v are exchanged", for example; it is `otherwise` if no hypothesis fits.
+    """
+    if not arrange(points).nearly_flat.all() or len(points) < 6:
+        return otherwise
+    limit = _HOLDS * rmse_px
+    for reason, changed in _other_points(points):
+        if _fit(changed, _pose(changed, camera))[0] < limit:
+            return reason
+    start = _pose(points, camera)
+    plain, _ = _fit(points, start)
+    if plain == np.inf:
+        return otherwise
+    zoomed, entries = _fit(points, start, _FOCAL)
+    if zoomed < limit:
+        scale = entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
+        if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
+            how = f"it fits another zoom or focus: a focal length of {entries[0]:.5g} px"
+            return how + _or_bent(abs(scale[0] - 1))
+    moved, entries = _fit(points, start, _CENTRE)
+    if moved < limit:
+        how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
+        shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
+        return how + _or_bent(shift / camera.entries[0])
+    free, _ = _fit(points, start, (*_FOCAL, *_CENTRE))
+    if free > _BLURRED * pixel_spread(points):
+        return otherwise
+    if plain < _HOLDS * free:
+        times = f"{plain / rmse_px:.2g} times that of the others"
+        return f"its rms error is {plain:.2g} px, {times}: blurred, or bent"
+    return "its points do not lie as in the other views: another target, a bent one, or another lens"
+
+
+def may_be_bent(reason: str) -> bool:
+    """Whether a reason of `why_odd` may have the target's shape as its cause."""
+    return "bent" in reason
+
+
+def _or_bent(change: float) -> str:
+    """Another cause of a change of this size, over the focal length; "" if it is too large."""
+    return ", or the target is bent" if change < _BY_BENDING else ""
+
+
+def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondences]]:
+    """Hypotheses about errors in a view's rows, each with the rows corrected for it."""
+    pixels, world = points.pixels, points.world
+    yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1])
+    if points.image_size is not None:
+        yield (
+            "its image is turned by 180 degrees against the others",
+            replace(points, pixels=np.array(points.image_size) - 1 - pixels),
+        )
+    for scale, name in ((2.0, "half"), (0.5, "twice")):
+        yield f"its image is of {name} the size", replace(points, pixels=(pixels + 0.5) * scale - 0.5)
+    for factors, name in (([2.0, 1.0], "u"), ([1.0, 2.0], "v")):
+        stretched = replace(points, pixels=pixels * factors)
+        yield f"its {name} is of half resolution, as in interlaced images", stretched
+    for shift in (1, -1):
+        shifted = replace(points, world=np.roll(world, shift, axis=0))
+        yield "its rows are shifted by one against its pixels", shifted
+
+
+def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
+    """The camera, and the view's pose estimated with it [px]; None if the pose cannot be estimated."""
+    try:
+        problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
+        groups, _ = train_networks(
+            problem, options_for("lm", _STARTS, 0), np.random.default_rng(0), np.ones(1, dtype=bool)
+        )
+        state = cameras_from_products(problem, groups, problem.normalised_entries[None])
+    except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
+        return None
+    return in_pixels(*problem.as_seen(state))
+
+
+def _fit(
+    points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()
+) -> tuple[float, Array]:
+    """Rms error and A's entries (5,) [px] after adjustment of a view's pose and the free entries.
+
+    The error is infinite without a start or if that fails.
+    """
+    failed = np.inf, np.full(5, np.nan)
+    if start is None:
+        return failed
+    views = arrange(points)
+    moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
+    try:
+        adjusted = adjust(views.batches, normalised(start, views), moving, True, _STEPS)
+    except (np.linalg.LinAlgError, FloatingPointError):
+        return failed
+    rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale
+    entries = views.pixel_scale * adjusted.state.entries[0] + np.array([0, 0, 0, *views.pixel_centre])
+    return (rmse, entries) if np.isfinite(rmse) else failed

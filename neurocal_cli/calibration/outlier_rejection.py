@@ -25,8 +25,7 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.odd_views import why_odd
-from neurocal_cli.calibration.other_causes import contradicts_sigma
+from neurocal_cli.calibration.other_causes import contradicts_sigma, why_odd
 from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.camera.geometry import Array

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.undistorted_view import Undistorted
-from neurocal_cli.camera.undistortion import chosen_view, sources
+from neurocal_cli.camera.undistortion import Undistorted, chosen_view, sources
 from neurocal_cli.errors import InputError
 
 INTERPOLATIONS = {

@@ -25,8 +25,7 @@ from neurocal_cli.commands.streams import (
     where_reasons_are,
 )
 from neurocal_cli.errors import NeurocalError, UsageError
-from neurocal_cli.files.image_headers import stated_sizes
-from neurocal_cli.files.image_paths import find_images, view_names
+from neurocal_cli.files.image_files import find_images, stated_sizes, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:

@@ -40,7 +40,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 
 
 def _frames(path: str, folder: str, most: int) -> list[str]:
-    from neurocal_cli.detection.frames import choose_frames
+    from neurocal_cli.detection.batch import choose_frames
     from neurocal_cli.files.images import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]

@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
-from neurocal_cli.files.image_paths import find_images, is_image, view_names
+from neurocal_cli.files.image_files import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:

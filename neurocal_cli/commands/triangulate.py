@@ -117,7 +117,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
         rig = read_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
-    from neurocal_cli.calibration.rig.fit_rig import fit_rig
+    from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
     from neurocal_cli.files.calibration_tree import read_calibration
 
     left, right = (read_calibration(name) for name in names)

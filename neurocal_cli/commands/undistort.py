@@ -17,11 +17,11 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import undistorted_before
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.undistorted_view import Panorama, Undistorted, field_of_view
+from neurocal_cli.camera.undistortion import Panorama, Undistorted, field_of_view
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, is_terminal, note, note_once, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.files.image_paths import find_images, is_image
+from neurocal_cli.files.image_files import find_images, is_image
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:

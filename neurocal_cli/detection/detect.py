@@ -15,7 +15,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Identified, Located, identify
-from neurocal_cli.detection.identity.messages import NoBoardError
+from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import InputError

@@ -28,7 +28,7 @@ from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import flow, mapping, number, text
 
 if TYPE_CHECKING:
-    from neurocal_cli.camera.undistorted_view import Panorama
+    from neurocal_cli.camera.undistortion import Panorama
 
 
 # ROS's names of our models. Others are a plumb_bob with 5 coefficients; simpler models use the first of them.

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.network.network import e_2d, e_orth, optimal_gamma, output
-from neurocal_cli.network.training import Patterns, Task, Trained
+from neurocal_cli.network.network import Patterns, Task, Trained, e_2d, e_orth, optimal_gamma, output
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
 # tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later

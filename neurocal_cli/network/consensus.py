@@ -21,8 +21,7 @@ from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.network.network import random_weights
-from neurocal_cli.network.training import Patterns, Task, patterns_of
+from neurocal_cli.network.network import Patterns, Task, patterns_of, random_weights
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view, each within 3 standard deviations of clean data): the hardest scene needed this many

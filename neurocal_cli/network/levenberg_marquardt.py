@@ -27,7 +27,7 @@ from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, Levenber
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.network.training import Patterns, Task, Trained
+from neurocal_cli.network.network import Patterns, Task, Trained
 
 
 @frozen_dataclass

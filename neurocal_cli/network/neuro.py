@@ -45,12 +45,17 @@ from neurocal_cli.network.local_minima import (
     try_mirrored,
     try_start,
 )
+from neurocal_cli.network.network import Patterns, Task, patterns_of
 from neurocal_cli.network.options import MOST_POINTS, Options
 from neurocal_cli.network.orthogonality import cameras_from_products, candidate_intrinsics
-from neurocal_cli.network.radial_step import radial_step
 from neurocal_cli.network.starts import learn
-from neurocal_cli.network.training import Patterns, Task, patterns_of
-from neurocal_cli.network.view_networks import Group, begin_flat, refuse_few_conditions, train_networks
+from neurocal_cli.network.view_networks import (
+    Group,
+    begin_flat,
+    radial_step,
+    refuse_few_conditions,
+    train_networks,
+)
 
 if TYPE_CHECKING:
     from neurocal_cli.network.random_cameras import Found

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
+from neurocal_cli.network.network import Task, Trained, Trainer
 from neurocal_cli.network.starts import Agreement
-from neurocal_cli.network.training import Task, Trained, Trainer
 
 if TYPE_CHECKING:
     from neurocal_cli.network.backprop import BackpropOptions

@@ -28,8 +28,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.local_minima import try_mirrored
 from neurocal_cli.network.neuro import solve
 from neurocal_cli.network.options import Options, options_for
-from neurocal_cli.network.radial_step import even_polynomial, radial_coefficients
-from neurocal_cli.network.view_networks import train_networks
+from neurocal_cli.network.view_networks import even_polynomial, radial_coefficients, train_networks
 from neurocal_cli.observations.points import Correspondences
 
 # lambda_1 = -0.8 is a barrel distortion whose farthest point has 5 times that radius in a pinhole; 0.3 is a

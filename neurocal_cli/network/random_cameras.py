@@ -16,7 +16,7 @@ from neurocal_cli.adjustment.views import PointBatches, Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.state import CameraState
-from neurocal_cli.network.training import Patterns, patterns_of
+from neurocal_cli.network.network import Patterns, patterns_of
 
 # Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.network.network import random_weights
-from neurocal_cli.network.training import Patterns, Task, Trained, Trainer
+from neurocal_cli.network.network import Patterns, Task, Trained, Trainer, random_weights
 
 
 @frozen_dataclass

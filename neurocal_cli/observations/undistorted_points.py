@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.undistorted_view import Undistorted
-from neurocal_cli.camera.undistortion import chosen_view, distorted_by_undistorted, undistort_pixels
+from neurocal_cli.camera.undistortion import (
+    Undistorted,
+    chosen_view,
+    distorted_by_undistorted,
+    undistort_pixels,
+)
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.measured_directions import unit
 from neurocal_cli.observations.points import Correspondences

@@ -28,10 +28,9 @@ from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.files.processes import work_through
 from neurocal_cli.network.backprop import BackpropOptions, train_backprop
-from neurocal_cli.network.network import output, random_weights
+from neurocal_cli.network.network import Task, output, patterns_of, random_weights
 from neurocal_cli.network.options import Progress, options_for
 from neurocal_cli.network.starts import learn
-from neurocal_cli.network.training import Task, patterns_of
 from neurocal_cli.observations.points import Correspondences
 
 RATES_WEIGHTS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)

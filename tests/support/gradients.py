@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.network.training import Patterns
+from neurocal_cli.network.network import Patterns
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,8 +39,8 @@ from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.network.network import patterns_of
 from neurocal_cli.network.orthogonality import cameras_from_products
-from neurocal_cli.network.training import patterns_of
 from neurocal_cli.network.view_networks import Group, begin_flat
 
 

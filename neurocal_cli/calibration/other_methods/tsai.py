@@ -38,7 +38,7 @@ from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.network.training import patterns_of
+from neurocal_cli.network.network import patterns_of
 
 _FEWEST = 5, 7  # points of a flat and of a solid view; each gives one equation
 _DISTORTIONS = ("none", "k1")

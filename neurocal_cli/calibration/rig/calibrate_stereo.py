@@ -1,4 +1,7 @@
-"""`calibrate_stereo`: calibration of a rig from the points of two cameras."""
+"""`calibrate_stereo`: calibration of a rig from the points of two cameras.
+
+The rig of two calibrated cameras: outlier views and the common bundle adjustment.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,180 @@ from dataclasses import replace
 from inspect import signature
 from typing import Any
 
+import numpy as np
+
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.common_target import can_tell, common_target
-from neurocal_cli.calibration.rig.fit_rig import fit_rig
-from neurocal_cli.calibration.rig.pairing import pair_points, pair_views
+from neurocal_cli.calibration.common_target import can_tell, common_target, on_one_target
+from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, free_parameters, rig_problem
+from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.contradiction import contradiction
+from neurocal_cli.calibration.rig.covariance import (
+    covariance_of_stretch,
+    not_smaller,
+    rig_covariance,
+    with_target_uncertainty,
+)
+from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.relative_poses import relative_poses
+from neurocal_cli.calibration.rig.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.errors import UsageError
+from neurocal_cli.calibration.rig.sound_pairs import sound_pairs
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
+
+# Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
+# refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
+_SPOILS = 1.6
+_BASELINE_SIGMAS = 3.0  # a baseline below this number of standard deviations counts as 0
+
+
+def fit_rig(
+    left: Calibration,
+    right: Calibration,
+    *,
+    refine_cameras: bool = False,
+    outliers: str = "reject",
+    target_kept: bool = False,
+) -> Rig:
+    """Find the pose of the right camera relative to the left one from the views of both.
+
+    Parameters
+    ----------
+    left, right : Calibration
+    refine_cameras : bool
+        Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
+        estimated. Otherwise it refines the rig and the poses alone.
+    outliers : {"reject", "keep"}
+        Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
+    target_kept : bool
+        Whether the given target was kept although it could have been estimated from both cameras.
+
+    Returns
+    -------
+    Rig
+
+    Raises
+    ------
+    InputError
+        No pairs of views, or views without common points; see `pairing`.
+    DegenerateGeometryError
+        Views that contradict each other.
+    CoincidentCamerasError
+        Cameras at one place.
+    UsageError
+        An unknown option.
+    """
+    if outliers not in ("reject", "keep"):
+        raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
+    left, right = on_one_target(left, right)
+    views = pair_views(left.points.view_names, right.points.view_names)
+    pair_points(left.points, right.points, views)
+    sound = sound_pairs(left, right, views)
+    if sound.left_out and outliers == "keep":
+        raise DegenerateGeometryError(sound.contradiction(outliers))
+    problem = sound.problem
+    if sound.left_out:
+        kept = tuple(pair for pair in views.both if pair not in sound.left_out)
+        problem = rig_problem(left, right, ViewPairs(kept))
+    fit, warnings = _adjusted(problem, sound.rig, refine_cameras)
+    least = _covariance(fit, sound.by_chance and not sound.left_out)
+    if left.target is not None and left.target is right.target:
+        uncertain = with_target_uncertainty(left.target, fit)
+        least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
+    stretched = None
+    if target_kept or left.target_stretched or right.target_stretched:
+        stretched = covariance_of_stretch(fit)
+    if target_kept and stretched is not None:
+        left, right = (replace(camera, target_stretched=stretched[0]) for camera in (left, right))
+        fit = replace(fit, problem=replace(problem, calibrations=(left, right)))
+    rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched[1])
+    _refuse_one_place(rig)
+    if sound.left_out:
+        warnings.insert(0, sound.contradiction())
+    return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
+
+
+def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[RigFit, list[str]]:
+    """The common bundle adjustment, and its warnings."""
+    moving = [refine_cameras, refine_cameras]
+    warnings = []
+    while True:
+        free = np.concatenate(
+            [free_parameters(c) & moves for c, moves in zip(problem.calibrations, moving, strict=True)]
+            + [np.ones(6, dtype=bool)]
+        )
+        fit = adjust_rig(problem, problem.start(start), free)
+        if any(moving) and np.sqrt(fit.variance) > _SPOILS:
+            moving = [False, False]
+            warnings = [
+                "the pairs of views contradict each other, so both cameras keep the result of their own views"
+            ]
+            continue
+        if not (not_monotonic := non_monotonic_sides(fit)):
+            return fit, warnings
+        for side in not_monotonic:
+            moving[side] = False
+            warnings.append(
+                f"after the common bundle adjustment the distortion model of the {('left', 'right')[side]} "
+                "camera is not monotonic (maps two directions to one pixel) inside the image, where there "
+                "are no points; the result of its own views is kept; add views that show the board in the "
+                "image's corners"
+            )
+
+
+def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
+    """Covariance of the shared parameters if that of independent points is too small; else None."""
+    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
+    held = bool((fit.free != estimated).any())
+    if by_chance and not held:
+        return None
+    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.unit))
+    if poses is None:
+        return None
+    used = np.ones(len(poses), dtype=bool)
+    found = contradiction(poses, used, seek_odd=False)
+    if not held and not found.is_significant:
+        return None
+    moved = fit.free[estimated]
+    return rig_covariance(poses, used, found)[np.ix_(moved, moved)]
+
+
+def _refuse_one_place(rig: Rig) -> None:
+    if rig.baseline > _BASELINE_SIGMAS * rig.std["baseline"]:
+        return
+    raise CoincidentCamerasError(
+        f"both cameras are at the same place: the baseline is {rig.baseline:.3g} +- "
+        f"{rig.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two different cameras"
+    )
+
+
+def _swapped(rig: Rig) -> tuple[str, ...]:
+    """A warning where the right camera is on the left."""
+    centre = -rig.R.T @ rig.t  # of the right camera in the left camera's frame
+    if centre[0] >= 0 or abs(centre[0]) <= abs(centre[1]):
+        return ()
+    return (
+        f"the right camera is {-centre[0]:.4g} {rig.unit} to the left of the left one; if they "
+        "are swapped, give the left camera first",
+    )
+
+
+def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: ViewPairs) -> dict[str, Pose]:
+    """Poses of views in the left camera's frame that fit both cameras of a known rig best, by its names.
+
+    The cameras have the poses of the views in each camera alone.
+    """
+    problem = rig_problem(*cameras, views)
+    start = problem.start(rig)
+    state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
+    R, t = problem.world_poses(state, side=0)
+    return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}
+
 
 _SIDES = ("left", "right")
 _ROUNDS = 2  # rounds of selecting lenses and target alternately

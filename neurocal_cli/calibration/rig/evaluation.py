@@ -16,7 +16,7 @@ from neurocal_cli.calibration.calibration import Calibration, Verdict, undistort
 from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import other_images, predict, refuse_another_size
 from neurocal_cli.calibration.rig.assessment import assess_rig
-from neurocal_cli.calibration.rig.fit_rig import fit_rig, poses_on_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig, poses_on_rig
 from neurocal_cli.calibration.rig.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error

@@ -22,7 +22,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.undistorted_view import plane_like
+from neurocal_cli.camera.undistortion import plane_like
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.undistorted_points import map_points, shown

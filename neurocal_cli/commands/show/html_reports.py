@@ -15,12 +15,16 @@ from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_report import parameter_rows, printable
-from neurocal_cli.commands.show.html_drawings import enlargement, error_bars, heat_map, residual_map, scatter
 from neurocal_cli.commands.show.html_page import (
     Origin,
     definitions,
+    enlargement,
+    error_bars,
     figure,
+    heat_map,
     page,
+    residual_map,
+    scatter,
     section,
     table,
     verdict_block,

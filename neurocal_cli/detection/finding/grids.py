@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grow import edges_visible, grow, has_block, is_smooth, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.links import (
     Links,
     find_links,
@@ -32,6 +31,7 @@ from neurocal_cli.detection.finding.overlaps import (
     split_at_folds,
     trim_overlaps,
 )
+from neurocal_cli.detection.finding.saddles import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
 

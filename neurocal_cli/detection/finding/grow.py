@@ -22,8 +22,7 @@ from neurocal_cli.detection.finding.lattice import (
     predict_vertices,
     signs,
 )
-from neurocal_cli.detection.finding.levels import Level, interpolate
-from neurocal_cli.detection.finding.saddles import refine_saddles
+from neurocal_cli.detection.finding.saddles import Level, interpolate, refine_saddles
 from neurocal_cli.detection.medians import median
 
 # Insensitive, except _INTO and _ALONG: doubled, samples reach the next squares, and 66 of 279 points of three

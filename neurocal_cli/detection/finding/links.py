@@ -22,9 +22,8 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grow import check_lattice
 from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square
-from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.overlaps import largest_second_difference, split_at_folds
-from neurocal_cli.detection.finding.saddles import Saddles, find_saddles, refine_saddles
+from neurocal_cli.detection.finding.saddles import Level, Saddles, find_saddles, interpolate, refine_saddles
 
 # Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))

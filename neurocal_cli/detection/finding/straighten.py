@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.lattice import Index, Lattice
-from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.links import Links, linked_group, whole_blocks
 from neurocal_cli.detection.finding.overlaps import distance
-from neurocal_cli.detection.finding.saddles import refine_saddles
+from neurocal_cli.detection.finding.saddles import Level, interpolate, refine_saddles
 from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 

@@ -28,8 +28,17 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError, ambiguous, wrong_size
-from neurocal_cli.detection.identity.placement import End, Placement, board_ends, placements, trimmed
+from neurocal_cli.detection.identity.placement import (
+    SYMMETRIC_BOARD,
+    End,
+    NoBoardError,
+    Placement,
+    ambiguous,
+    board_ends,
+    placements,
+    trimmed,
+    wrong_size,
+)
 from neurocal_cli.observations.board import Board, Plane
 
 _FLAT = 1e-6  # greatest ratio of thickness to extent of points in one plane, for rounding errors
