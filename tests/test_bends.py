@@ -14,7 +14,7 @@ from support.simulated_targets import draw, outcome
 from support.targets import board
 
 from neurocal_cli import calibrate
-from neurocal_cli.adjustment.board.camera_covariance import covariance_basis
+from neurocal_cli.adjustment.board.uncertainty import covariance_basis
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import _fit as fit_of
