@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.made_calibration import made_points
+from support.places import SAMPLES
 from support.rigs import random_rig, sides
 
 from neurocal_cli import read_calibration, read_points, read_rig, write_points
 
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
 
 

@@ -13,7 +13,7 @@ def test_the_points_that_are_spoilt_are_good() -> None:
     assert outcome(good()) == ("good", ())
 
 
-@pytest.mark.slow  # tests/test_zoom_lens.py has a quick one
+@pytest.mark.slow  # tests/calibration/zoom/test_zoom_lens.py has a quick one
 @pytest.mark.parametrize("name", WRONG)
 def test_no_wrong_zoom_lens_ends_as_good(name: str) -> None:
     spoilt, cause = WRONG[name]

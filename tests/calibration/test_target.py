@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.targets import photographed_pair
@@ -30,7 +31,7 @@ from neurocal_cli.files.rig_yaml import read_rig
 from neurocal_cli.observations.board import Plane, planes_of
 from neurocal_cli.observations.target import board_of
 
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
+SAMPLE = SAMPLES / "bent.csv"
 
 
 @cache

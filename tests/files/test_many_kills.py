@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.places import SAMPLES
 from test_killed import alive, descendants
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 COUNT = int(os.environ.get("NEUROCAL_KILLS", "200"))
 COMMANDS = [
     ["detect", *(str(SAMPLES / f"board0{k}.png") for k in range(1, 7)), "--cols", "9", "--rows", "6",

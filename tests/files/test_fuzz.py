@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 COUNT = int(os.environ.get("NEUROCAL_FUZZ", "10000"))
 FIRST = int(os.environ.get("NEUROCAL_FUZZ_SEED", "0"))
 LIMIT = 20  # seconds

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from support.command_line import run
+from support.places import SAMPLES
 
 from neurocal_cli import Board, read_image
 from neurocal_cli.commands import streams
@@ -23,8 +24,6 @@ from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.files.image_files import find_images, natural_order, stated_sizes
-
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 
 
 def test_images_are_in_natural_order(tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import pytest
 from support.command_line import commands
+from support.places import PROJECT
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = PROJECT
 COMMANDS = [" ".join(words) for words, _ in commands()]
 WORK = """\
 detect {sample}/board01.png {sample}/board02.png {sample}/board03.png \

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.scenes import random_flat_set, table_1
 
@@ -15,7 +16,6 @@ from neurocal_cli import Correspondences, calibrate, read_points, write_points
 from neurocal_cli.commands import options
 from neurocal_cli.simulation.comparison import METHODS, calibrate_with, compare
 
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 CORNER = """
 unit: mm
 planes:

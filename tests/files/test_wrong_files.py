@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.made_calibration import made_calibration
+from support.places import SAMPLES
 from support.rigs import random_rig
 
 from neurocal_cli import write_calibration, write_rig
 from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.neurocal import as_rig
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 POINTS = SAMPLES / "points.csv"
 
 

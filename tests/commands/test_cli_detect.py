@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from click.testing import Result
 from support.command_line import run
+from support.places import SAMPLES
 
 from neurocal_cli import Board, read_image, read_points
 from neurocal_cli.detection.detect import Detection
 from neurocal_cli.observations.board import Plane
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.targets import COLS, ROWS, board, offsets, photographed_pair
 
 from neurocal_cli import Board, calibrate, read_board, read_calibration, read_points
@@ -21,7 +22,6 @@ from neurocal_cli.observations.distances import Distance, fitted_scale
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import scale_of
 
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 OPTIONS = {"distortion": "none", "skew": False}
 TRUE = 1.004  # times the board that the file has
 STD = 0.04  # mm, of a distance of some 200

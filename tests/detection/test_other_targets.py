@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.files.images import read_image
-
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 
 
 def photographed(target: np.ndarray) -> np.ndarray:

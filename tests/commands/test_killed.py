@@ -8,8 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
+from support.places import SAMPLES
 
 
 def descendants(pid: int) -> set[int]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.made_calibration import made_calibration
+from support.places import SAMPLES
 from support.rigs import random_rig, sides
 
 from neurocal_cli import write_calibration, write_points, write_rig
@@ -297,7 +298,7 @@ def test_another_file_is_refused(text: str, message: str, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_a_zoom_lens_has_a_page(tmp_path: Path) -> None:
-    zoom = Path(__file__).parents[1] / "sample_data" / "zoom.csv"
+    zoom = SAMPLES / "zoom.csv"
     assert run("lens", "fit", zoom, "-o", tmp_path / "lens.yaml").exit_code == 0
     result = run("report", tmp_path / "lens.yaml")
     assert result.exit_code == 0, result.stderr

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.distorted import SIGMA, bent_set, new_views, through
+from support.places import SAMPLES
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
@@ -146,7 +146,7 @@ def test_a_rig_keeps_a_camera_that_it_would_fold() -> None:
 def test_a_wide_lens_without_a_polynomial_is_not_fitted_with_the_slopes_of_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    points = read_points(Path(__file__).parents[1] / "sample_data" / "fisheye.csv")
+    points = read_points(SAMPLES / "fisheye.csv")
 
     found = calibrate(points, distortion="omnidir", skew=False, target="given")
     monkeypatch.setattr(given_model, "folds_back", lambda problem, state: "image")

@@ -1,9 +1,8 @@
 """A free camera for each view: what one step and the quadratic there leave, beside hundreds of steps."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate, read_points
@@ -13,7 +12,7 @@ from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.calibration.verdict.assessment import _AtMinimum
 from neurocal_cli.camera.state import CameraState
 
-FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
+FLAT = SAMPLES / "flat.csv"
 
 
 @pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.006)])

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from click.testing import Result
 from support.command_line import run
+from support.places import SAMPLES
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
 from neurocal_cli.files.exchange.reading import read_intrinsics
 from neurocal_cli.files.points_csv import write_points
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 SIZE = (400, 300)
 ROS = """image_width: 400
 image_height: 300

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 
 from neurocal_cli.files.writing import Outputs
-
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.distorted import bent_set
+from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.scenes import Scene, pinhole, random_flat_set, table_1
 from support.targets import board, views_of
@@ -21,7 +22,7 @@ from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_calibration
 
-BENT = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
+BENT = SAMPLES / "bent.csv"
 
 
 def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, depth: float) -> np.ndarray:

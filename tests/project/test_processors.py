@@ -24,11 +24,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import read_points
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 FROM_POINTS = """
 calibrate sample_data/points.csv --type 2 -o corner.yaml
 calibrate sample_data/flat.csv -o flat.yaml

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli.commands import frames
@@ -17,7 +18,6 @@ from neurocal_cli.detection import batch
 from neurocal_cli.detection.batch import choose_frames
 from neurocal_cli.files.points_csv import read_points
 
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
 IMAGES = tuple(SAMPLES / f"board0{k}.png" for k in (1, 2, 3))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.rigs import random_rig, sides
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
@@ -20,8 +21,6 @@ from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stere
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.files.rig_yaml import read_rig
 from neurocal_cli.observations.points import Correspondences
-
-SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 
 
 def csv(points: Correspondences, path: Path) -> Path:
@@ -147,12 +146,12 @@ def test_a_bump_half_way_is_named_and_nothing_else_suffers(real_files: RealFiles
 
 
 def test_the_sample_rig_is_good() -> None:
-    rig = calibrate_stereo(*(read_points(SAMPLE / f"stereo_{side}.csv") for side in ("left", "right")))
+    rig = calibrate_stereo(*(read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right")))
     assert rig.verdict is not None
     assert (rig.verdict.word, rig.verdict.reasons) == ("good", ())
 
 
-@pytest.mark.slow  # detection; tests/test_cli_stereo.py has a quick one
+@pytest.mark.slow  # detection; tests/commands/test_cli_stereo.py has a quick one
 @pytest.mark.parametrize("layout", ["midpoints", "vertices"])
 def test_a_real_rig_is_not_blamed(real_files: RealFiles, tmp_path: Path, layout: str) -> None:
     """Its pairs scatter 2 to 3.5 times as much as noise, as the board is not quite flat: no reason alone."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.made_calibration import made_calibration
+from support.places import SAMPLES
 
 from neurocal_cli import (
     Camera,
@@ -27,7 +28,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.points_csv import format_points, write_points
 from neurocal_cli.files.result_files import write_calibration
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 BEFORE = "the points are undistorted already"
 LENS = Distortion("k1", np.array([-0.2]))
 

@@ -12,12 +12,11 @@ import pytest
 from click.testing import Result
 from support.command_line import run
 from support.made_calibration import CAMERA, made_calibration, made_points
+from support.places import SAMPLES
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
 from neurocal_cli.commands.streams import ProgressBar
 from neurocal_cli.files.calibration_yaml import format_calibration
-
-SAMPLES = Path(__file__).parents[1] / "sample_data"
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 
-SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 FLAT, LEFT, RIGHT = (SAMPLES / f"{name}.csv" for name in ("flat", "stereo_left", "stereo_right"))
 CAMERA = """
 image_width: 640
