@@ -1,7 +1,4 @@
-"""Read and write images as arrays, and make thumbnails of them.
-
-Frames of videos as grey images.
-"""
+"""Read images and frames of videos as arrays, write images, and make thumbnails of them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import Context
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +19,10 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.files.failures import one_line, reading_failures
 from neurocal_cli.files.files import read_bytes
 from neurocal_cli.files.image_files import Header, is_video_header, read_header
-from neurocal_cli.files.writing import write_whole
+from neurocal_cli.files.writing import write_at_once
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-
 MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
-
 BY_EXIF = ", as its EXIF orientation says"
 """Follows what was done to an image, in the note about it."""
 _TURNS = {
@@ -45,6 +39,8 @@ _JPEG = (".jpg", ".jpeg", ".jpe")
 _QUALITY = 95
 _WIDEST = 960  # px; a page shows a photograph no wider
 _NARROWEST = 120
+_HEAD = 16  # bytes that identify the kind of file
+_USUAL, _FASTEST = 30.0, 1e4  # frames per second
 _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # a process has only one stderr
 
@@ -114,73 +110,6 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
     return pixels, (note,)
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Encode a grey (height, width) or colour (height, width, 3; R, G, B) picture as PNG."""
-    return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
-
-
-def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> bytes:
-    try:
-        done, data = cv2.imencode(ending, np.ascontiguousarray(_reversed(picture)), settings)
-    except cv2.error as error:
-        raise InputError(f"a picture of the shape {picture.shape} cannot be written as {kind}") from error
-    if not done:
-        raise NeurocalError(f"the picture cannot be written as {kind}")
-    return data.tobytes()
-
-
-def _reversed(picture: Pixels) -> Pixels:
-    """Swap the order of the colours between ours and OpenCV's."""
-    return picture[..., ::-1] if picture.ndim == 3 else picture
-
-
-def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is of JPEG (100)."""
-    if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
-        raise InputError(
-            f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
-        )
-    if pixels.ndim == 3 and ending.lower() == ".pgm":
-        raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
-    return _encoded(
-        pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
-    )
-
-
-def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
-    """Encode images, by name, as small JPEG files with a limit on their total size.
-
-    All must have the `size` [px] if it is known. Only images of the least width may exceed the limit.
-    """
-    small: dict[str, NDArray[np.uint8]] = {}
-    for name, path in images.items():
-        image = read_image(path)
-        if size is not None and image.size != size:
-            raise FormatError(
-                f"has {image.size[0]} x {image.size[1]} px, but the camera {size[0]} x {size[1]}; give the "
-                "images that were calibrated from",
-                image.source,
-            )
-        small[name] = _shrunk(image.grey, _WIDEST)
-    width = _WIDEST
-    while True:
-        files = {name: encode_image(_shrunk(grey, width), ".jpg", 70) for name, grey in small.items()}
-        total = sum(map(len, files.values()))
-        if total <= most_bytes or width == _NARROWEST:
-            return files
-        # A thumbnail of half the width takes a little more than a quarter of the bytes.
-        width = max(_NARROWEST, int(width * min(0.9, (most_bytes / total) ** 0.6)))
-
-
-def _shrunk(grey: Pixels, width: int) -> NDArray[np.uint8]:
-    """Convert an (H, W) image to 8 bits, and reduce it to at most `width` pixels."""
-    eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
-    if eight.shape[1] <= width:
-        return eight
-    height = max(1, round(eight.shape[0] * width / eight.shape[1]))
-    return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
     """Decode a file with a valid header; the decoder's output to stderr is not shown."""
     with captured_stderr() as complaints:
@@ -228,8 +157,71 @@ def captured_stderr() -> Iterator[list[str]]:
             lines += file.read(100_000).decode("utf-8", "replace").splitlines()
 
 
-_HEAD = 16  # bytes that identify the kind of file
-_USUAL, _FASTEST = 30.0, 1e4  # frames per second
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """Encode a grey (height, width) or colour (height, width, 3; R, G, B) picture as PNG."""
+    return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
+    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is JPEG's."""
+    if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
+        raise InputError(
+            f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
+        )
+    if pixels.ndim == 3 and ending.lower() == ".pgm":
+        raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
+    return _encoded(
+        pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
+    )
+
+
+def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> bytes:
+    try:
+        done, data = cv2.imencode(ending, np.ascontiguousarray(_reversed(picture)), settings)
+    except cv2.error as error:
+        raise InputError(f"a picture of the shape {picture.shape} cannot be written as {kind}") from error
+    if not done:
+        raise NeurocalError(f"the picture cannot be written as {kind}")
+    return data.tobytes()
+
+
+def _reversed(picture: Pixels) -> Pixels:
+    """Swap the order of the colours between ours and OpenCV's."""
+    return picture[..., ::-1] if picture.ndim == 3 else picture
+
+
+def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
+    """Encode images, by name, as small JPEG files with a limit on their total size.
+
+    All must have the `size` [px] if it is known. Only images of the least width may exceed the limit.
+    """
+    small: dict[str, NDArray[np.uint8]] = {}
+    for name, path in images.items():
+        image = read_image(path)
+        if size is not None and image.size != size:
+            raise FormatError(
+                f"has {image.size[0]} x {image.size[1]} px, but the camera {size[0]} x {size[1]}; give the "
+                "images that were calibrated from",
+                image.source,
+            )
+        small[name] = _shrunk(image.grey, _WIDEST)
+    width = _WIDEST
+    while True:
+        files = {name: encode_image(_shrunk(grey, width), ".jpg", 70) for name, grey in small.items()}
+        total = sum(map(len, files.values()))
+        if total <= most_bytes or width == _NARROWEST:
+            return files
+        # A thumbnail of half the width takes a little more than a quarter of the bytes.
+        width = max(_NARROWEST, int(width * min(0.9, (most_bytes / total) ** 0.6)))
+
+
+def _shrunk(grey: Pixels, width: int) -> NDArray[np.uint8]:
+    """Convert an (H, W) image to 8 bits, and reduce it to at most `width` pixels."""
+    eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
+    if eight.shape[1] <= width:
+        return eight
+    height = max(1, round(eight.shape[0] * width / eight.shape[1]))
+    return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def is_video(path: str) -> bool:
@@ -274,5 +266,5 @@ def frame_rate(path: str) -> float:
 
 
 def save_frame(grey: NDArray[np.uint8], path: str) -> None:
-    """Write a frame as PNG at once, not with the outputs that a command holds back until its end."""
-    Context().run(write_whole, path, encode_png(grey))
+    """Write a frame as PNG at once, whatever becomes of the command."""
+    write_at_once(path, encode_png(grey))

@@ -51,14 +51,11 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
             yield f"    - [{ends}, {number(one.length)}, {number(one.std)}]"
     if len(points) == 0:
         yield "  rows: []"
-    elif long:
+        return
+    if long:
         yield from indented(_long_lines(points, np.hstack(blocks)))
-    else:
-        yield "  rows:"
-        yield from _rows(points, np.hstack([points.world, *blocks]))
-
-
-def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
+        return
+    yield "  rows:"
     # OpenCV's FileStorage requires rows to be indented more than their key.
     heads = [f"    - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
@@ -66,7 +63,8 @@ def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
         labels = np.asarray(points.point).tolist()
         ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
         heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
-    return map(add, heads, flow(numbers)[2:-1].split(", ["))
+    numbers = flow(np.hstack([points.world, *blocks]))
+    yield from map(add, heads, numbers[2:-1].split(", ["))
 
 
 def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:

@@ -97,6 +97,11 @@ def words(names: Iterable[str]) -> str:
     return f"[{', '.join(map(text, names))}]"
 
 
+def quoted_words(names: Iterable[str]) -> str:
+    """Write names as a flow sequence, each in quotes."""
+    return f"[{', '.join(map(quoted, names))}]"
+
+
 def mapping(**entries: str) -> str:
     """Write entries, already as text, as a flow mapping ``{a: 1, b: 2}``."""
     return "{" + ", ".join(f"{key}: {value}" for key, value in entries.items()) + "}"
