@@ -116,8 +116,8 @@ def _distortion(root: Field, side: str, whole: bool) -> tuple[str, Array]:
         for key in root.entries() if whole else ():
             if ("dist" in key.lower() and key not in _OTHERS) or key.lower() in ("k1", "k2", "coeffs"):
                 raise InputError(
-                    f"the key {key[:60]!r} may be the distortion, and is not a known name of it; rename it to "
-                    "distortion_coefficients, or remove it"
+                    f"the key {key[:60]!r} may be the distortion, and is not a known name of it; rename it "
+                    "to distortion_coefficients, or remove it"
                 )
         if xi is not None:
             raise InputError("has xi of an omnidirectional camera without its distortion; add D, or zeros")

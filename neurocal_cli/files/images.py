@@ -22,7 +22,7 @@ from neurocal_cli.files.image_files import Header, is_video_header, read_header
 from neurocal_cli.files.writing import write_at_once
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
+_MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
 BY_EXIF = ", as its EXIF orientation says"
 """Follows what was done to an image, in the note about it."""
 _TURNS = {
@@ -81,11 +81,11 @@ def read_image(path: str | Path) -> Image:
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
     """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
     data, source = read_bytes(path)
-    pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    pixels, notes = _upright(data, source, _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return _reversed(pixels), source, notes
 
 
-def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXELS) -> Image:
+def parse_image(data: bytes, source: str = "image", most_pixels: int = _MOST_PIXELS) -> Image:
     """Read an image from the bytes of a file; see `read_image`."""
     grey, notes = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     return Image(grey, source, notes)
@@ -112,7 +112,7 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
     """Decode a file with a valid header; the decoder's output to stderr is not shown."""
-    with captured_stderr() as complaints:
+    with _captured_stderr() as complaints:
         try:
             pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
@@ -138,7 +138,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
 
 
 @contextmanager
-def captured_stderr() -> Iterator[list[str]]:
+def _captured_stderr() -> Iterator[list[str]]:
     """Capture what the C libraries below OpenCV write to stderr; yields a list that receives the lines."""
     lines: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
@@ -234,12 +234,12 @@ def is_video(path: str) -> bool:
 
 def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
     """Iterate over the frames of a video as grey images."""
-    with captured_stderr():
+    with _captured_stderr():
         capture = cv2.VideoCapture(path)
     count = 0
     try:
         while True:
-            with captured_stderr():
+            with _captured_stderr():
                 there, frame = capture.read()
             if not there:
                 break
@@ -258,7 +258,7 @@ def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
 
 def frame_rate(path: str) -> float:
     """Frames per second according to the video's header; 30 if that is missing or absurd."""
-    with captured_stderr():
+    with _captured_stderr():
         capture = cv2.VideoCapture(path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         capture.release()

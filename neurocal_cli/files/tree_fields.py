@@ -34,7 +34,15 @@ class Field:
 
     def fail(self, expected: str) -> NoReturn:
         """Raise a FormatError about an unexpected value."""
-        found = _described(self.value)
+        if isinstance(self.value, dict):
+            found = "a mapping"
+        elif isinstance(self.value, list):
+            found = f"a list of {len(self.value)}"
+        elif self.value is None:
+            found = "nothing"
+        else:
+            shown = repr(self.value)
+            found = shown if len(shown) <= 40 else f"{shown[:37]}..."
         self.refuse(f"{self.path or 'the file'} must be {expected}, found {found}; correct it")
 
     def __contains__(self, key: str) -> bool:
@@ -167,13 +175,3 @@ def _as_float(value: Any) -> float:
     if isinstance(value, str) and is_number(value):
         return float(value)
     return math.nan
-
-
-def _described(value: Any) -> str:
-    if isinstance(value, dict):
-        return "a mapping"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    if value is None:
-        return "nothing"
-    return repr(value) if len(repr(value)) <= 40 else repr(value)[:37] + "..."

@@ -65,7 +65,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
     """
     if str(path) in STDOUT_NAMES:
         for chunk in chunks:
-            write_stdout(_encode(chunk))
+            _write_stdout(_encode(chunk))
         return
     with _writing_failures(path):
         former, outputs = _status(path), held_back()
@@ -126,7 +126,7 @@ def check_places(*paths: str | None) -> None:
             taken.add(target)
 
 
-def write_stdout(data: bytes) -> None:
+def _write_stdout(data: bytes) -> None:
     """Write to stdout, after flushing earlier output."""
     if sys.stdout is None:  # the shell closed it: >&-
         raise NeurocalError("stdout is closed; give a file")
@@ -262,7 +262,7 @@ def _undisturbed() -> Iterator[None]:
 def _finish(outputs: Outputs) -> None:
     try:
         for data in outputs.commit():
-            write_stdout(data)
+            _write_stdout(data)
     except BaseException:
         outputs.discard()
         raise
