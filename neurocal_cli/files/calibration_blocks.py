@@ -5,7 +5,7 @@ The views have an entry each, or columns in a long file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -66,12 +66,20 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
     pose = np.hstack([rotation_to_euler(R), t])
     error = np.array([view.rmse_px for view in views.values()], dtype=float)
     if long:
-        yield from block("views", column_lines(_columns(views, pose, error, R)))
+        known = [name for name in POSE_NAMES if all(name in view.std for view in views.values())]
+        columns: dict[str, NDArray[Any] | list[str]] = {"name": list(views)}
+        columns |= {name: pose[:, k] for k, name in enumerate(POSE_NAMES)}
+        columns |= {f"std_{name}": np.array([view.std[name] for view in views.values()]) for name in known}
+        columns["rmse_px"] = error
+        columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
+        columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
+        columns |= dict(zip(_R, R.reshape(-1, 9).T, strict=True))
+        yield from block("views", column_lines(columns))
         return
     yield "views:"
     P = K @ np.concatenate([R, t[:, :, None]], axis=2)
-    columns = _estimates(pose, views.values()), flows(P), flows(error), flows(R)
-    for (name, view), entries, matrix, rmse, rotation in zip(views.items(), *columns, strict=True):
+    texts = _estimates(pose, views.values()), flows(P), flows(error), flows(R)
+    for (name, view), entries, matrix, rmse, rotation in zip(views.items(), *texts, strict=True):
         yield f"  - name: {text(name)}"
         yield f"    rotation: {{{', '.join(entries[:3])}}}"
         yield f"    translation: {{{', '.join(entries[3:])}}}"
@@ -81,19 +89,6 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
         yield f"    R: {rotation}"  # the angles do not reproduce the last bits
         if view.fixed:
             yield "    fixed: true"
-
-
-def _columns(
-    views: Mapping[str, ViewResult], pose: Array, error: Array, R: Array
-) -> dict[str, NDArray[np.generic] | Sequence[str]]:
-    known = [name for name in POSE_NAMES if all(name in view.std for view in views.values())]
-    columns: dict[str, NDArray[np.generic] | Sequence[str]] = {"name": list(views)}
-    columns |= {name: pose[:, k] for k, name in enumerate(POSE_NAMES)}
-    columns |= {f"std_{name}": np.array([view.std[name] for view in views.values()]) for name in known}
-    columns["rmse_px"] = error
-    columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
-    columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
-    return columns | dict(zip(_R, R.reshape(-1, 9).T, strict=True))
 
 
 def _estimates(pose: Array, views: Collection[ViewResult]) -> Iterator[list[str]]:

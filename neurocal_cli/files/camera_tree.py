@@ -198,7 +198,7 @@ def boofcv_camera(root: Field) -> Camera:
         distortion = Distortion("omnidir", np.array([root["mirror_offset"].number(), *coefficients[:4]]))
     else:
         distortion = Distortion(*from_ros("plumb_bob", coefficients))
-    return Camera(Intrinsics.from_matrix(K), distortion, image_size(pinhole, ""))
+    return Camera(Intrinsics.from_matrix(K), distortion, image_size(pinhole))
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:

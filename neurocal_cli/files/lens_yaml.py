@@ -221,23 +221,22 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
     scale = field["scale"].text()
     if scale not in SCALES:
         field["scale"].fail(f"one of {', '.join(SCALES)}")
-    nets = tuple(_net(field["networks"][name], D) for name in names)
-    return Member(LensNets(scale, nets), _read_constants(field["constants"]))
-
-
-def _net(field: Field, D: int) -> ParameterNet:
-    hidden = field["hidden"].array(2)
-    if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
-        field["hidden"].fail("two numbers of units")
-    topology = Topology(D, int(hidden[0]), int(hidden[1]))
-    return ParameterNet(
-        topology,
-        field["weights"].array(topology.n_weights),
-        field["precision"].array(topology.n_groups),
-        field["centre"].number(),
-        _positive(field["spread"]),
-        field["scatter"].number(),
-    )
+    nets = []
+    for net in (field["networks"][name] for name in names):
+        hidden = net["hidden"].array(2)
+        if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
+            net["hidden"].fail("two numbers of units")
+        topology = Topology(D, int(hidden[0]), int(hidden[1]))
+        parameters = ParameterNet(
+            topology,
+            net["weights"].array(topology.n_weights),
+            net["precision"].array(topology.n_groups),
+            net["centre"].number(),
+            _positive(net["spread"]),
+            net["scatter"].number(),
+        )
+        nets.append(parameters)
+    return Member(LensNets(scale, tuple(nets)), _read_constants(field["constants"]))
 
 
 def _read_constants(field: Field) -> Constants:

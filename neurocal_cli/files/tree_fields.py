@@ -133,7 +133,13 @@ class Field:
         except (ValueError, OverflowError, RecursionError):  # ragged
             self.fail(expected)
         if array.dtype.kind not in "iuf":  # numbers as text, null, or other values
-            array = self._converted(array, expected, unknown)
+            objects = np.array(self.value, dtype=object)
+            flat = objects.ravel().tolist()
+            numbers = [_as_float(x) for x in flat]
+            finite = (math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True))
+            if objects.shape != array.shape or not all(finite):
+                self.fail(expected)
+            array = np.array(numbers).reshape(objects.shape)
         array = array.astype(float)
         if array.size == 0 and any(s < 0 for s in shape):
             array = array.reshape([max(s, 0) for s in shape])
@@ -141,16 +147,6 @@ class Field:
         if not fits or not (unknown or np.isfinite(array).all()):
             self.fail(expected)
         return array
-
-    def _converted(self, array: np.ndarray[Any, Any], expected: str, unknown: bool) -> Array:
-        objects = np.array(self.value, dtype=object)
-        if objects.shape != array.shape:
-            self.fail(expected)
-        flat = objects.ravel().tolist()
-        numbers = [_as_float(x) for x in flat]
-        if not all(math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True)):
-            self.fail(expected)
-        return np.array(numbers, dtype=float).reshape(objects.shape)
 
     def _mapping(self) -> dict[str, Any]:
         if not isinstance(self.value, dict):

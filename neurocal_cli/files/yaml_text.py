@@ -54,7 +54,7 @@ _WORDS: dict[str, Any] = {
     **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
-# The table as written by `calibration_yaml`, at any indentation.
+# The table as written by `observations_yaml`, at any indentation.
 _ROWS = re.compile(
     r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
     re.MULTILINE,
