@@ -202,7 +202,7 @@ def boofcv_camera(root: Field) -> Camera:
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
-    """Lines of the file; `rectified` are R (3, 3) and P (3, 4) of a camera on a rig, as ROS defines them."""
+    """Lines of a camera_info; `rectified` are R (3, 3) and P (3, 4) on a rig, as ROS defines them."""
     R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
     width, height = camera.image_size or (0, 0)  # ROS's readers require numbers
     model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)
@@ -217,7 +217,7 @@ def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = No
 
 
 def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = None) -> str:
-    """Text of the file, which `read_intrinsics` reads; see `camera_info_lines`."""
+    """Text of a camera_info file, which `read_intrinsics` reads; see `camera_info_lines`."""
     return "\n".join([*camera_info_lines(camera, rectified), ""])
 
 

@@ -7,7 +7,6 @@ view, whose numbers are texts: decimals, or packed if PyYAML would take too long
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
 from operator import add
 from typing import Any
 
@@ -120,8 +119,8 @@ def read_observations(
         observations["rows"].fail("at least one row")
 
     def numbers(names: tuple[str, ...]) -> Array:
-        fields = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
-        return np.column_stack([field.array(-1) for field in fields])
+        cells = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
+        return np.column_stack([column.array(-1) for column in cells])
 
     labels = {
         name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
@@ -131,30 +130,26 @@ def read_observations(
         known: dict[str, Any] = {
             attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
         }
+        distances = []
+        for row in observations.get("distances", []).items():
+            cells = list(row.items())
+            if len(cells) != 4:
+                row.fail("a list of from, to, length, std")
+            start, end, length, std = cells
+            distances.append(Distance(start.text(), end.text(), length.number(), std.number()))
         return Correspondences(
             world,
             pixels,
             view=labels.get("view"),
             point=labels.get("point"),
             **known,
-            distances=_distances(observations.get("distances", [])),
+            distances=tuple(distances),
             undistorted=observations.get("undistorted", "").text(),
             image_size=image_size,
             image_center=image_center,
             unit=unit,
             source=observations.source,
         )
-
-
-def _distances(field: Field) -> tuple[Distance, ...]:
-    found = []
-    for row in field.items():
-        cells = list(row.items())
-        if len(cells) != len(fields(Distance)):
-            row.fail("a list of from, to, length, std")
-        start, end, length, std = cells
-        found.append(Distance(start.text(), end.text(), length.number(), std.number()))
-    return tuple(found)
 
 
 def _names(observations: Field) -> list[str]:

@@ -24,11 +24,11 @@ PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
 OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ"), "across": ("nu", "nv")}
 """Names of the optional columns, by their attribute of `Correspondences`."""
-SETTINGS = ("zoom", "focus")
+_SETTINGS = ("zoom", "focus")
 POINTS = Schema(
     kind="points",
     required=(*PLACE, *PIXEL),
-    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *SETTINGS),
+    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=True,
     instead="; neurocal convert --to neurocal makes one of another program's corners",
@@ -223,7 +223,7 @@ def _plain(value: Any) -> str:
 
 def _check_settings(tables: list[Table], notes: list[str]) -> None:
     """Refuse points at several zoom or focus settings, because a calibration has one setting."""
-    for name in SETTINGS:
+    for name in _SETTINGS:
         given = [(table, table.numbers[name]) for table in tables if name in table.numbers]
         if not given:
             continue
