@@ -12,7 +12,7 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import DEEPEST, TOO_DEEP, number, parse_yaml, plain_value, quoted
 

@@ -21,8 +21,8 @@ from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.reading import read_intrinsics
-from neurocal_cli.files.files import read_bytes
 from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
+from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
 from neurocal_cli.files.table_header import Schema
 from neurocal_cli.files.writing import write_whole

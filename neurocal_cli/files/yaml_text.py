@@ -27,7 +27,7 @@ import yaml
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
 
 DEEPEST = 40

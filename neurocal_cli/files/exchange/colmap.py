@@ -19,7 +19,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.yaml_text import number
 
 _HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
