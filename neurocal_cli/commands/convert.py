@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.files.files import repeatable_stdin
+from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
 if TYPE_CHECKING:

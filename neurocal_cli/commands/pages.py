@@ -12,7 +12,7 @@ import click
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.streams import TYPED
-from neurocal_cli.files.files import read_bytes
+from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
-from neurocal_cli.files.files import decode, read_bytes
 from neurocal_cli.files.image_files import photographs_of
+from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ import json
 import os
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Iterator, Sequence
-from contextvars import Context
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
@@ -40,10 +39,10 @@ from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.files.files import read_bytes
 from neurocal_cli.files.images import Image, encode_png, parse_image
 from neurocal_cli.files.processes import start_worker, usable_cores, work_through
-from neurocal_cli.files.writing import write_whole
+from neurocal_cli.files.reading import read_bytes
+from neurocal_cli.files.writing import write_at_once
 from neurocal_cli.observations.board import Board
 
 
@@ -107,7 +106,7 @@ class DetectionCache:
         }
         os.makedirs(self._folder, exist_ok=True)
         text = json.dumps(tree, default=np.ndarray.tolist)
-        Context().run(write_whole, self._path(image), text + "\n")
+        write_at_once(self._path(image), text + "\n")
 
     def _path(self, image: bytes) -> str:
         return os.path.join(self._folder, f"{hashlib.sha256(self._request + image).hexdigest()}.json")

@@ -1,4 +1,4 @@
-"""Read and write files: the only part of the package that knows text formats and paths.
+"""Read and write files: the only part of the package that opens them and knows their formats.
 
 Every function that reads raises a `FormatError` if the file is missing, unreadable or malformed. The message
 names the file, the line or key, and what to do. A function that writes raises a `NeurocalError` if the file

@@ -63,7 +63,13 @@ def board_pdf(sheet: Sheet) -> bytes:
     for line in sheet.lines:
         dash = f"[{_DASH * _POINT:.4f}] 0 d" if line.dashed else "[] 0 d"
         content.append(f"{dash} {line.width * _POINT:.4f} w {place(line.start)} m {place(line.end)} l S")
-    content += [_pdf_text(text, sheet.height) for text in sheet.texts]
+    for text in sheet.texts:
+        shown = text.content.encode("ascii", "replace").decode("ascii")
+        shown = shown.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+        # Centred texts are numbers, and the width of Helvetica's digits is 0.556 of the font size.
+        left = text.place[0] - (0.5 * 0.556 * text.size * len(text.content) if text.middle else 0.0)
+        x, y = left * _POINT, (sheet.height - text.place[1]) * _POINT
+        content.append(f"BT /F {text.size * _POINT:.4f} Tf {x:.4f} {y:.4f} Td ({shown}) Tj ET")
     stream = "\n".join(content).encode("ascii")
     box = f"[0 0 {sheet.width * _POINT:.5f} {sheet.height * _POINT:.5f}]"
     # Ask viewers not to scale the page to the paper when they print it.
@@ -79,16 +85,8 @@ def board_pdf(sheet: Sheet) -> bytes:
     )
 
 
-def _pdf_text(text: Text, height: float) -> str:
-    shown = text.content.encode("ascii", "replace").decode("ascii")
-    shown = shown.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
-    # Centred texts are numbers, and the width of Helvetica's digits is 0.556 of the font size.
-    left = text.place[0] - (0.5 * 0.556 * text.size * len(text.content) if text.middle else 0.0)
-    x, y = left * _POINT, (height - text.place[1]) * _POINT
-    return f"BT /F {text.size * _POINT:.4f} Tf {x:.4f} {y:.4f} Td ({shown}) Tj ET"
-
-
 def _pdf(objects: list[bytes]) -> bytes:
+    """Number the objects, the catalogue first, and add the table of the bytes at which they begin."""
     data, places = b"%PDF-1.4\n", []
     for number, body in enumerate(objects, start=1):
         places.append(len(data))
@@ -121,6 +119,7 @@ def board_png(sheet: Sheet, dpi: float) -> bytes:
 
 
 def _dashes(line: Line) -> list[tuple[Array, Array]]:
+    """Ends of the dashes of a line, or of the whole line."""
     if not line.dashed:
         return [(line.start, line.end)]
     length = float(np.linalg.norm(line.end - line.start))

@@ -17,7 +17,6 @@ from neurocal_cli.observations.distances import Distance
 
 _COUNTS = ("cols", "rows")
 _VECTORS = ("origin", "x_axis", "y_axis")
-_DISTANCE_KEYS = ("from", "to", "length", "std")
 _PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS, "points")
 
 
@@ -79,19 +78,17 @@ def _board(root: Field) -> Board:
     planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
     with value_failures(root.source, "planes: "):
         board = Board(planes, unit)
-    return replace(board, distances=_distances(root, board)) if "distances" in root else board
-
-
-def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
-    found = []
+    if "distances" not in root:
+        return board
+    distances = []
     for field in root["distances"].items():
-        _only(field, _DISTANCE_KEYS)
+        _only(field, ("from", "to", "length", "std"))
         start, end = (field[key].text() for key in ("from", "to"))
         with value_failures(field.source, f"{field.path}: "):
-            found.append(Distance(start, end, field["length"].number(), field["std"].number()))
+            distances.append(Distance(start, end, field["length"].number(), field["std"].number()))
             for label in (start, end):
                 board.place(label)
-    return tuple(found)
+    return replace(board, distances=tuple(distances))
 
 
 def _plane(field: Field, *, alone: bool) -> Plane:

@@ -5,7 +5,7 @@ The views have an entry each, or columns in a long file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,16 +14,33 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Rejected, Verdict, ViewResult
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
-from neurocal_cli.files import text_columns
 from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.text_columns import numbers_of, read_table, table_lines
+from neurocal_cli.files.text_columns import (
+    as_fields,
+    column_lines,
+    named_lines,
+    numbers_of,
+    read_columns,
+    read_named,
+    read_table,
+    table_lines,
+)
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import block, boolean, flows, indented, mapping, number, quoted, text
+from neurocal_cli.files.yaml_text import (
+    block,
+    boolean,
+    flows,
+    indented,
+    mapping,
+    number,
+    quoted,
+    quoted_words,
+    text,
+)
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Bends, Target
 
 POSE_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
-_NAME = "name"
 _R = [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
 
 # The angles reproduce R except for the last bits; a larger difference means that one was edited.
@@ -49,12 +66,20 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
     pose = np.hstack([rotation_to_euler(R), t])
     error = np.array([view.rmse_px for view in views.values()], dtype=float)
     if long:
-        yield from block("views", text_columns.column_lines(_columns(views, pose, error, R)))
+        known = [name for name in POSE_NAMES if all(name in view.std for view in views.values())]
+        columns: dict[str, NDArray[Any] | list[str]] = {"name": list(views)}
+        columns |= {name: pose[:, k] for k, name in enumerate(POSE_NAMES)}
+        columns |= {f"std_{name}": np.array([view.std[name] for view in views.values()]) for name in known}
+        columns["rmse_px"] = error
+        columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
+        columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
+        columns |= dict(zip(_R, R.reshape(-1, 9).T, strict=True))
+        yield from block("views", column_lines(columns))
         return
     yield "views:"
     P = K @ np.concatenate([R, t[:, :, None]], axis=2)
-    columns = _estimates(pose, views.values()), flows(P), flows(error), flows(R)
-    for (name, view), entries, matrix, rmse, rotation in zip(views.items(), *columns, strict=True):
+    texts = _estimates(pose, views.values()), flows(P), flows(error), flows(R)
+    for (name, view), entries, matrix, rmse, rotation in zip(views.items(), *texts, strict=True):
         yield f"  - name: {text(name)}"
         yield f"    rotation: {{{', '.join(entries[:3])}}}"
         yield f"    translation: {{{', '.join(entries[3:])}}}"
@@ -64,19 +89,6 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
         yield f"    R: {rotation}"  # the angles do not reproduce the last bits
         if view.fixed:
             yield "    fixed: true"
-
-
-def _columns(
-    views: Mapping[str, ViewResult], pose: Array, error: Array, R: Array
-) -> dict[str, NDArray[np.generic] | Sequence[str]]:
-    known = [name for name in POSE_NAMES if all(name in view.std for view in views.values())]
-    columns: dict[str, NDArray[np.generic] | Sequence[str]] = {_NAME: list(views)}
-    columns |= {name: pose[:, k] for k, name in enumerate(POSE_NAMES)}
-    columns |= {f"std_{name}": np.array([view.std[name] for view in views.values()]) for name in known}
-    columns["rmse_px"] = error
-    columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
-    columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
-    return columns | dict(zip(_R, R.reshape(-1, 9).T, strict=True))
 
 
 def _estimates(pose: Array, views: Collection[ViewResult]) -> Iterator[list[str]]:
@@ -104,13 +116,13 @@ def read_views(field: Field) -> dict[str, ViewResult]:
 
 
 def _from_columns(field: Field) -> dict[str, ViewResult]:
-    table = text_columns.read_columns(field, frozenset((_NAME,)))
-    columns = text_columns.as_fields(table, field)
+    table = read_columns(field, frozenset(("name",)))
+    columns = as_fields(table, field)
     known = [name for name in POSE_NAMES if f"std_{name}" in columns]
-    for name in (_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed", *_R):
+    for name in ("name", *POSE_NAMES, "rmse_px", "n_points", "fixed", *_R):
         field[name]  # raises an error that names the missing column
-    if len(set(table[_NAME])) < len(table[_NAME]):
-        field[_NAME].fail("names that differ")
+    if len(set(table["name"])) < len(table["name"]):
+        field["name"].fail("names that differ")
     pose = numbers_of(columns, POSE_NAMES).T
     R = numbers_of(columns, _R).T.reshape(-1, 3, 3)
     std = numbers_of(columns, [f"std_{name}" for name in known], unknown=True).T
@@ -124,7 +136,7 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
             rmse_px=Field(table["rmse_px"][k], field.source, f"{field.path}.rmse_px").number_or_nan(),
             fixed=bool(table["fixed"][k]),
         )
-        for k, name in enumerate(table[_NAME])
+        for k, name in enumerate(table["name"])
     }
 
 
@@ -158,8 +170,8 @@ def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
         return
     yield "verdict:"
     yield f"  word: {text(verdict.word)}"
-    yield f"  reasons: [{', '.join(map(quoted, verdict.reasons))}]"
-    yield f"  advice: [{', '.join(map(quoted, verdict.advice))}]"
+    yield f"  reasons: {quoted_words(verdict.reasons)}"
+    yield f"  advice: {quoted_words(verdict.advice)}"
     yield f"  measures: {mapping(**{name: number(value) for name, value in verdict.measures.items()})}"
 
 
@@ -179,7 +191,7 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
         return
     reasons = map(quoted, rejected.views.values())
     yield "rejected:"
-    yield from indented(text_columns.named_lines("views", rejected.views, reasons))
+    yield from indented(named_lines("views", rejected.views, reasons))
     points = rejected.points
     if points is None:
         yield from ("  columns: []", "  rows: []")
@@ -199,7 +211,7 @@ def read_rejected(field: Field, unit: str) -> Rejected:
     """Read the block ``rejected`` back."""
     if field.value is None:
         return Rejected()
-    views = {name: entry.text() for name, entry in text_columns.read_named(field["views"]).items()}
+    views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
     columns = read_table(field, frozenset(("view", "point")))
     if not columns:
         return Rejected(views=views)

@@ -11,16 +11,21 @@ see `text_columns`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import chain
 
 import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
-from neurocal_cli.camera.distortion import StraightLines, coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.files import calibration_blocks as blocks
+from neurocal_cli.files.calibration_blocks import (
+    have_same_std,
+    rejected_lines,
+    target_lines,
+    verdict_lines,
+    view_lines,
+)
 from neurocal_cli.files.camera_tree import camera_info_lines
 from neurocal_cli.files.observations_yaml import observation_lines
 from neurocal_cli.files.text_columns import column_lines, named_lines
@@ -34,6 +39,7 @@ from neurocal_cli.files.yaml_text import (
     number,
     quoted,
     text,
+    words,
 )
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
@@ -57,25 +63,13 @@ def calibration_lines(
 ) -> Iterator[str]:
     """Lines of a file without header; see `camera_info_lines` and, for `by_rows`, `format_calibration`."""
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and blocks.have_same_std(cal.views)
+    long = large and not by_rows and have_same_std(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
-    yield from block(
-        "neurocal",
-        chain(
-            _record_lines(cal, long),
-            _parameter_lines(cal),
-            blocks.view_lines(cal.views, cal.K, long),
-            ["network: null"] if cal.network is None else block("network", _network_lines(cal.network, long)),
-            blocks.verdict_lines(cal.verdict),
-            blocks.rejected_lines(cal.rejected, long),
-            blocks.target_lines(cal.target, long),
-            _straight_lines(cal.straight_lines),
-            observation_lines(cal.points, long),
-        ),
-    )
+    yield from block("neurocal", _block_lines(cal, long))
 
 
-def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
+def _block_lines(cal: Calibration, long: bool) -> Iterator[str]:
+    """Lines of the block ``neurocal``."""
     yield f"format: {FORMATS[long]}"
     yield f"version: {text(__version__)}"
     yield f"type: {cal.type}"
@@ -92,6 +86,24 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
         yield f"target_stretched: {number(cal.target_stretched)}"
     if cal.points.image_center is not None:
         yield f"image_center: {flow(np.array(cal.points.image_center))}"
+    yield from _parameter_lines(cal)
+    yield from view_lines(cal.views, cal.K, long)
+    if cal.network is None:
+        yield "network: null"
+    else:
+        yield from block("network", _network_lines(cal.network, long))
+    yield from verdict_lines(cal.verdict)
+    yield from rejected_lines(cal.rejected, long)
+    yield from target_lines(cal.target, long)
+    if (straight := cal.straight_lines) is not None:
+        yield "straight_lines: " + mapping(
+            n_lines=str(straight.n_lines),
+            n_points=str(straight.n_points),
+            center=flow(np.array(straight.centre)),
+            rms_before_px=number(straight.rms_before),
+            rms_after_px=number(straight.rms_after),
+        )
+    yield from observation_lines(cal.points, long)
 
 
 def _parameter_lines(cal: Calibration) -> Iterator[str]:
@@ -107,11 +119,10 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
         elif name in cal.std:
             entry["std"] = number(cal.std[name])
         yield f"  {name}: {mapping(**entry)}"
-    names = f"[{', '.join(map(text, cal.covariance_names))}]"
-    yield f"covariance: {mapping(names=names, data=flow(cal.covariance))}"
+    yield f"covariance: {mapping(names=words(cal.covariance_names), data=flow(cal.covariance))}"
     if cal.given_names:
-        names = f"[{', '.join(map(text, cal.given_names))}]"
-        yield f"given_covariance: {mapping(names=names, data=flow(cal.given_covariance))}"
+        given = mapping(names=words(cal.given_names), data=flow(cal.given_covariance))
+        yield f"given_covariance: {given}"
     yield "fit: " + mapping(
         n_points=str(len(cal.points)),
         n_rejected=str(cal.n_rejected),
@@ -131,17 +142,6 @@ def _network_lines(network: NetworkRecord, long: bool) -> Iterator[str]:
     for name in NETWORK_ERRORS:
         yield f"{name}: {number(getattr(network, name))}"
     yield f"curve: {flow(np.array(network.curve, dtype=float))}"
-
-
-def _straight_lines(found: StraightLines | None) -> Iterator[str]:
-    if found is not None:
-        yield "straight_lines: " + mapping(
-            n_lines=str(found.n_lines),
-            n_points=str(found.n_points),
-            center=flow(np.array(found.centre)),
-            rms_before_px=number(found.rms_before),
-            rms_after_px=number(found.rms_after),
-        )
 
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> Iterator[str]:

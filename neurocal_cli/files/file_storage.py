@@ -12,11 +12,10 @@ import numpy as np
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import number, parse_yaml, plain_value, quoted
+from neurocal_cli.files.yaml_text import DEEPEST, TOO_DEEP, number, parse_yaml, plain_value, quoted
 
-_DEEPEST = 40
 _PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousand characters
 
 
@@ -65,12 +64,12 @@ def _parse_xml(text: str, source: str) -> Any:
         raise FormatError(
             f"is <{root.tag[:40]}> and not OpenCV's <opencv_storage>; give another file", source
         )
-    return _element_value(root, source, _DEEPEST)
+    return _element_value(root, source, DEEPEST)
 
 
 def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any:
     if depth == 0:
-        raise FormatError("is nested too deeply to be a camera file; give another", source)
+        raise FormatError(TOO_DEEP, source)
     if len(element) == 0:
         text = (element.text or "").strip()
         if len(text) > 1 and text[0] == text[-1] == '"' and '"' not in text[1:-1]:

@@ -1,11 +1,9 @@
-"""Read the metadata of an image file, above all its size, without decoding it.
+"""Find the image files that a command line names, and read their size without decoding them.
 
 A file of a kilobyte can state a terabyte of pixels, and decoders treat truncated files differently. Both are
 checked here before decoding. No library that neurocal needs anyway does this: OpenCV gives a size only after
 decoding (0.4 s for 12 megapixels, where this takes 0.03 s, nearly all of it for checksums), and its versions
 from 4.8 to 5.0 fill, cut or refuse truncated files without a reason.
-
-Find the image files named by the arguments of a command line.
 """
 
 from __future__ import annotations
@@ -23,8 +21,10 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.failures import one_line
 
+_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
+
 _EXIF_MARK = b"Exif\0\0"
-_ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
+_ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257  # tags of TIFF
 _STRIPS = ((273, 279), (324, 325))  # tags of offsets and byte counts of strips, and of tiles
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -43,6 +43,85 @@ _OTHERS = (
     (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", _VIDEO),  # Windows Media
     (rb"GIF8[79]a", "GIF"),
 )
+
+
+def is_image(path: str) -> bool:
+    """Whether a file is an image, judged by its extension."""
+    return path.lower().endswith(_ENDINGS)
+
+
+def find_images(words: Iterable[str]) -> tuple[str, ...]:
+    """Find the files given by names, folders and patterns.
+
+    A file (or ``-``) stands for itself, whether it exists or not. A folder stands for the images in it,
+    recognised by their extensions. A pattern such as ``left*.png``, which no shell expanded, stands for the
+    matching files. Files of folders and patterns are in natural order (1, 2, 10). So are all files if the
+    arguments are in alphabetical order.
+    """
+    paths: list[str] = []
+    for word in words:
+        if word != "-" and os.path.isdir(word):
+            paths += _in_folder(word)
+        elif glob.has_magic(word) and not os.path.lexists(word):
+            found = [path for path in glob.glob(word) if not os.path.isdir(path)]
+            if not found:
+                raise FormatError("no file matches this pattern; check the path", one_line(word))
+            paths += sorted(found, key=natural_order)
+        else:
+            paths.append(word)
+    # A shell expands a pattern in alphabetical order, with 10 before 2.
+    return tuple(sorted(paths, key=natural_order) if paths == sorted(paths) else paths)
+
+
+def _in_folder(folder: str) -> list[str]:
+    try:
+        names = sorted(os.listdir(folder), key=natural_order)
+    except OSError as error:
+        raise FormatError("may not be read; change its permissions", one_line(folder)) from error
+    # Hidden files belong to other programs, such as previews and unfinished copies.
+    names = [name for name in names if is_image(name) and not name.startswith(".")]
+    paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
+    if not paths:
+        raise FormatError(
+            f"holds no images ({', '.join(_ENDINGS)}); give a folder that does", one_line(folder)
+        )
+    return paths
+
+
+def natural_order(name: str) -> list[tuple[int, str, int]]:
+    """Key for sorting names in natural order: left1, left2, left10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [
+        (1, "", int(part)) if part.isdecimal() and part.isascii() else (0, part, 0) for part in parts if part
+    ]
+
+
+def view_names(paths: Iterable[str]) -> tuple[str, ...]:
+    """Name a view after each file, without folder and extension; InputError if two have the same name."""
+    files = tuple(paths)
+    names = tuple("stdin" if path == "-" else Path(path).stem for path in files)
+    doubled = next((name for name, count in Counter(names).items() if count > 1), None)
+    if doubled is not None:
+        first, second, *_ = (
+            one_line(path) for path, name in zip(files, names, strict=True) if name == doubled
+        )
+        if first == second:
+            raise InputError(f"{first} is given twice; give each image once")
+        raise InputError(f"{first} and {second} would both be the view {doubled!r}; rename one of them")
+    return names
+
+
+def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
+    """Find the image of each view in a folder or by a pattern: the file with its name, without extension."""
+    paths = find_images([word])
+    found = dict(zip(view_names(paths), paths, strict=True))
+    images = {view: found[view] for view in views if view in found}
+    if not images:
+        raise InputError(
+            f"{word}: no image has the name of a view, such as {views[0] if views else 'none'}; give the "
+            "folder of the images that were calibrated from"
+        )
+    return images
 
 
 @frozen_dataclass
@@ -86,6 +165,16 @@ def read_header(data: bytes, source: str) -> Header:
     return header
 
 
+def is_video_header(head: bytes) -> bool:
+    """Whether a file that begins with these bytes is a video."""
+    return _other(head) == _VIDEO
+
+
+def _other(data: bytes) -> str | None:
+    """Kind of a file that is not a supported image; None if unknown."""
+    return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
+
+
 def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
     """Larger and smaller side [px] of PNG and JPEG files, read from their headers.
 
@@ -119,24 +208,8 @@ def _stated_size(path: str) -> tuple[int, int] | None:
         return None
 
 
-def is_video_header(head: bytes) -> bool:
-    """Whether a file that begins with these bytes is a video."""
-    return _other(head) == _VIDEO
-
-
-def _other(data: bytes) -> str | None:
-    """Kind of a file that is not a supported image; None if unknown."""
-    return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
-
-
 def _png(data: bytes) -> Header:
-    chunks = dict(_png_chunks(data))
-    width, height = struct.unpack_from(">II", chunks.get(b"IHDR", bytes(8)))
-    return Header("PNG", width, height, _exif_orientation(chunks.get(b"eXIf", b"")))
-
-
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Iterate over the chunks up to IEND, verifying their checksums."""
+    chunks: dict[bytes, bytes] = {}
     at, kind = 8, b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -145,8 +218,11 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise _TruncatedError
         if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise ValueError("a checksum is wrong")
-        yield kind, b"" if kind == b"IDAT" else data[at + 8 : end]
+        if kind != b"IDAT":
+            chunks[kind] = data[at + 8 : end]
         at = end + 4
+    width, height = struct.unpack_from(">II", chunks.get(b"IHDR", bytes(8)))
+    return Header("PNG", width, height, _exif_orientation(chunks.get(b"eXIf", b"")))
 
 
 def _jpeg(data: bytes) -> Header:
@@ -252,89 +328,3 @@ _READERS: tuple[tuple[bytes, Callable[[bytes], Header]], ...] = (
     (rb"BM.{8}", _bmp),
     (rb"P[1-6][\s#]", _pnm),
 )
-
-
-_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
-
-
-def is_image(path: str) -> bool:
-    """Whether a file is an image, judged by its extension."""
-    return path.lower().endswith(_ENDINGS)
-
-
-def find_images(words: Iterable[str]) -> tuple[str, ...]:
-    """Find the files given by names, folders and patterns.
-
-    A file (or ``-``) stands for itself, whether it exists or not. A folder stands for the images in it,
-    recognised by their extensions. A pattern such as ``left*.png``, which no shell expanded, stands for the
-    matching files. Files of folders and patterns are in natural order (1, 2, 10). So are all files if the
-    arguments are in alphabetical order.
-    """
-    paths: list[str] = []
-    for word in words:
-        if word != "-" and os.path.isdir(word):
-            paths += _in_folder(word)
-        elif glob.has_magic(word) and not os.path.lexists(word):
-            paths += _matching(word)
-        else:
-            paths.append(word)
-    # A shell expands a pattern in alphabetical order, with 10 before 2.
-    return tuple(sorted(paths, key=natural_order) if paths == sorted(paths) else paths)
-
-
-def natural_order(name: str) -> list[tuple[int, str, int]]:
-    """Key for sorting names in natural order: left1, left2, left10."""
-    parts = re.split(r"([0-9]+)", name)
-    return [
-        (1, "", int(part)) if part.isdecimal() and part.isascii() else (0, part, 0) for part in parts if part
-    ]
-
-
-def view_names(paths: Iterable[str]) -> tuple[str, ...]:
-    """Name a view after each file, without folder and extension; InputError if two have the same name."""
-    files = tuple(paths)
-    names = tuple("stdin" if path == "-" else Path(path).stem for path in files)
-    doubled = next((name for name, count in Counter(names).items() if count > 1), None)
-    if doubled is not None:
-        first, second, *_ = (
-            one_line(path) for path, name in zip(files, names, strict=True) if name == doubled
-        )
-        if first == second:
-            raise InputError(f"{first} is given twice; give each image once")
-        raise InputError(f"{first} and {second} would both be the view {doubled!r}; rename one of them")
-    return names
-
-
-def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
-    """Find the image of each view in a folder or by a pattern: the file with its name, without extension."""
-    paths = find_images([word])
-    found = dict(zip(view_names(paths), paths, strict=True))
-    images = {view: found[view] for view in views if view in found}
-    if not images:
-        raise InputError(
-            f"{word}: no image has the name of a view, such as {views[0] if views else 'none'!s}; give the "
-            "folder of the images that were calibrated from"
-        )
-    return images
-
-
-def _in_folder(folder: str) -> list[str]:
-    try:
-        names = sorted(os.listdir(folder), key=natural_order)
-    except OSError as error:
-        raise FormatError("may not be read; change its permissions", one_line(folder)) from error
-    # Hidden files belong to other programs, such as previews and unfinished copies.
-    names = [name for name in names if is_image(name) and not name.startswith(".")]
-    paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
-    if not paths:
-        raise FormatError(
-            f"holds no images ({', '.join(_ENDINGS)}); give a folder that does", one_line(folder)
-        )
-    return paths
-
-
-def _matching(pattern: str) -> list[str]:
-    paths = sorted((path for path in glob.glob(pattern) if not os.path.isdir(path)), key=natural_order)
-    if not paths:
-        raise FormatError("no file matches this pattern; check the path", one_line(pattern))
-    return paths

@@ -1,7 +1,4 @@
-"""Read and write images as arrays, and make thumbnails of them.
-
-Frames of videos as grey images.
-"""
+"""Read images and frames of videos as arrays, write images, and make thumbnails of them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import Context
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +17,12 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.files.failures import one_line, reading_failures
-from neurocal_cli.files.files import read_bytes
 from neurocal_cli.files.image_files import Header, is_video_header, read_header
-from neurocal_cli.files.writing import write_whole
+from neurocal_cli.files.reading import read_bytes
+from neurocal_cli.files.writing import write_at_once
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-
-MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
-
+_MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
 BY_EXIF = ", as its EXIF orientation says"
 """Follows what was done to an image, in the note about it."""
 _TURNS = {
@@ -45,6 +39,8 @@ _JPEG = (".jpg", ".jpeg", ".jpe")
 _QUALITY = 95
 _WIDEST = 960  # px; a page shows a photograph no wider
 _NARROWEST = 120
+_HEAD = 16  # bytes that identify the kind of file
+_USUAL, _FASTEST = 30.0, 1e4  # frames per second
 _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # a process has only one stderr
 
@@ -85,11 +81,11 @@ def read_image(path: str | Path) -> Image:
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
     """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
     data, source = read_bytes(path)
-    pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    pixels, notes = _upright(data, source, _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return _reversed(pixels), source, notes
 
 
-def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXELS) -> Image:
+def parse_image(data: bytes, source: str = "image", most_pixels: int = _MOST_PIXELS) -> Image:
     """Read an image from the bytes of a file; see `read_image`."""
     grey, notes = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     return Image(grey, source, notes)
@@ -114,9 +110,69 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
     return pixels, (note,)
 
 
+def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
+    """Decode a file with a valid header; the decoder's output to stderr is not shown."""
+    with _captured_stderr() as complaints:
+        try:
+            pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        except cv2.error:
+            pixels = None
+    if pixels is None:
+        raise FormatError(
+            f"cannot be decoded: a damaged {header.kind}, or a variety of it that few programs read; "
+            "save it as PNG of 8 or 16 bits",
+            source,
+        )
+    # The JPEG decoder fills undecodable parts with grey, and reports this only on stderr.
+    if any(mark in text for text in complaints for mark in ("Corrupt JPEG", "Premature end")):
+        raise FormatError("is damaged; copy the image again", source)
+    turned = header.orientation >= 5
+    size = (header.width, header.height) if turned else (header.height, header.width)
+    if pixels.shape[:2] != size:
+        raise FormatError(
+            f"does not hold a single picture of {header.width} x {header.height} px; save it again", source
+        )
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
+    return pixels
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[list[str]]:
+    """Capture what the C libraries below OpenCV write to stderr; yields a list that receives the lines."""
+    lines: list[str] = []
+    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
+        try:
+            former = os.dup(_STDERR)
+        except OSError:  # stderr is closed, so there is nothing to capture
+            yield lines
+            return
+        try:
+            os.dup2(file.fileno(), _STDERR)
+            yield lines
+        finally:
+            os.dup2(former, _STDERR)
+            os.close(former)
+            file.seek(0)
+            lines += file.read(100_000).decode("utf-8", "replace").splitlines()
+
+
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
     """Encode a grey (height, width) or colour (height, width, 3; R, G, B) picture as PNG."""
     return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
+    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is JPEG's."""
+    if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
+        raise InputError(
+            f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
+        )
+    if pixels.ndim == 3 and ending.lower() == ".pgm":
+        raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
+    return _encoded(
+        pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
+    )
 
 
 def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> bytes:
@@ -132,19 +188,6 @@ def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> by
 def _reversed(picture: Pixels) -> Pixels:
     """Swap the order of the colours between ours and OpenCV's."""
     return picture[..., ::-1] if picture.ndim == 3 else picture
-
-
-def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
-    """Encode a grey or colour (R, G, B) picture with the extension of a file; `quality` is of JPEG (100)."""
-    if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
-        raise InputError(
-            f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
-        )
-    if pixels.ndim == 3 and ending.lower() == ".pgm":
-        raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
-    return _encoded(
-        pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
-    )
 
 
 def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
@@ -181,57 +224,6 @@ def _shrunk(grey: Pixels, width: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
-    """Decode a file with a valid header; the decoder's output to stderr is not shown."""
-    with captured_stderr() as complaints:
-        try:
-            pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-        except cv2.error:
-            pixels = None
-    if pixels is None:
-        raise FormatError(
-            f"cannot be decoded: a damaged {header.kind}, or a variety of it that few programs read; "
-            "save it as PNG of 8 or 16 bits",
-            source,
-        )
-    # The JPEG decoder fills undecodable parts with grey, and reports this only on stderr.
-    if any(mark in text for text in complaints for mark in ("Corrupt JPEG", "Premature end")):
-        raise FormatError("is damaged; copy the image again", source)
-    turned = header.orientation >= 5
-    size = (header.width, header.height) if turned else (header.height, header.width)
-    if pixels.shape[:2] != size:
-        raise FormatError(
-            f"does not hold a single picture of {header.width} x {header.height} px; save it again", source
-        )
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
-    return pixels
-
-
-@contextmanager
-def captured_stderr() -> Iterator[list[str]]:
-    """Capture what the C libraries below OpenCV write to stderr; yields a list that receives the lines."""
-    lines: list[str] = []
-    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
-        try:
-            former = os.dup(_STDERR)
-        except OSError:  # stderr is closed, so there is nothing to capture
-            yield lines
-            return
-        try:
-            os.dup2(file.fileno(), _STDERR)
-            yield lines
-        finally:
-            os.dup2(former, _STDERR)
-            os.close(former)
-            file.seek(0)
-            lines += file.read(100_000).decode("utf-8", "replace").splitlines()
-
-
-_HEAD = 16  # bytes that identify the kind of file
-_USUAL, _FASTEST = 30.0, 1e4  # frames per second
-
-
 def is_video(path: str) -> bool:
     """Whether a file begins like a video; False for stdin and for what is not a file."""
     if path == "-" or not os.path.isfile(path):
@@ -242,12 +234,12 @@ def is_video(path: str) -> bool:
 
 def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
     """Iterate over the frames of a video as grey images."""
-    with captured_stderr():
+    with _captured_stderr():
         capture = cv2.VideoCapture(path)
     count = 0
     try:
         while True:
-            with captured_stderr():
+            with _captured_stderr():
                 there, frame = capture.read()
             if not there:
                 break
@@ -266,7 +258,7 @@ def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
 
 def frame_rate(path: str) -> float:
     """Frames per second according to the video's header; 30 if that is missing or absurd."""
-    with captured_stderr():
+    with _captured_stderr():
         capture = cv2.VideoCapture(path)
         rate = capture.get(cv2.CAP_PROP_FPS)
         capture.release()
@@ -274,5 +266,5 @@ def frame_rate(path: str) -> float:
 
 
 def save_frame(grey: NDArray[np.uint8], path: str) -> None:
-    """Write a frame as PNG at once, not with the outputs that a command holds back until its end."""
-    Context().run(write_whole, path, encode_png(grey))
+    """Write a frame as PNG at once, whatever becomes of the command."""
+    write_at_once(path, encode_png(grey))

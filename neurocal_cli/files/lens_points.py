@@ -21,8 +21,8 @@ from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.reading import read_intrinsics
-from neurocal_cli.files.files import read_bytes
 from neurocal_cli.files.points_csv import POINTS, correspondences, format_points
+from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.table import Table, parse_table
 from neurocal_cli.files.table_header import Schema
 from neurocal_cli.files.writing import write_whole
@@ -57,10 +57,12 @@ def read_lens_data(
     if not several:
         raise InputError("there are no files; give at least one")
     contents = [read_bytes(path) for path in several]
+    headers = [_header(data) for data, _ in contents]
+    known = all("alpha_u" in names or (_FILES in names and "X" not in names) for names in headers)
+    schemas = [POINTS if not known else _TABLE if "alpha_u" in names else _LIST for names in headers]
+    tables = [parse_table(*content, schema) for content, schema in zip(contents, schemas, strict=True)]
     remarks = notes if notes is not None else []
-    if all(names_cameras(data) for data, _ in contents):
-        return read_cameras(contents, remarks)
-    return _points([parse_table(data, source, POINTS) for data, source in contents], remarks)
+    return _cameras(tables, remarks) if known else _points(tables, remarks)
 
 
 def read_lens_points(
@@ -90,8 +92,16 @@ def write_lens_points(lens: LensPoints, path: str | Path) -> None:
     write_whole(path, "\n".join(lines))
 
 
+def _header(data: bytes) -> set[str]:
+    """Names of the columns, and perhaps parts of other words."""
+    for line in data.removeprefix(b"\xef\xbb\xbf").splitlines():
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            return set(re.split(r'[\s,;"]+', line.decode("utf-8", "replace")))
+    return set()
+
+
 def _points(tables: list[Table], notes: list[str]) -> LensPoints:
-    controls = require_setting(tables)
+    controls = _controls(tables)
     values = [np.column_stack([table.numbers[name] for name in controls]) for table in tables]
     plain = []
     for table, setting in zip(tables, values, strict=True):
@@ -118,28 +128,10 @@ def _images(table: Table, controls: tuple[str, ...], setting: Array, several: bo
     return np.char.add(np.char.add(own, " "), texts)
 
 
-def names_cameras(data: bytes) -> bool:
-    """Whether a file's header has the column alpha_u, or a column `camera` and no points."""
-    names = _header(data)
-    return "alpha_u" in names or (_FILES in names and "X" not in names)
-
-
-def _header(data: bytes) -> set[str]:
-    for line in data.removeprefix(b"\xef\xbb\xbf").splitlines():
-        if line.strip() and not line.lstrip().startswith(b"#"):
-            return set(re.split(r'[\s,;"]+', line.decode("utf-8", "replace")))
-    return set()
-
-
-def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> LensCameras:
-    """Read known cameras from pairs of file content and name."""
-    tables = [
-        parse_table(data, source, _TABLE if "alpha_u" in _header(data) else _LIST)
-        for data, source in contents
-    ]
+def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
     for table in tables:
         table.note_unknown(notes)
-    require_setting(tables)
+    _controls(tables)
     parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
     tabled, lenses, stated = zip(*parts, strict=True)
     sizes = set().union(*stated)
@@ -209,7 +201,7 @@ def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array
     return model, padded[:, : len(MODELS[model])]
 
 
-def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
+def _controls(tables: Sequence[Table]) -> tuple[str, ...]:
     """Names of the controls, at least one, which all files must share."""
     names = [set(table.numbers) & set(CONTROLS) for table in tables]
     for found, table in zip(names, tables, strict=True):

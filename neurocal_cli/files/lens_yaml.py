@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -42,15 +41,7 @@ _MOST_UNITS = 1000
 
 def format_lens(lens: ZoomLens) -> str:
     """Text of a lens file."""
-    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
-    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
-    settings = block("settings", table_lines(columns, long=False, indent=2))
-    parts = [_record_lines(lens), settings, _member_lines(lens), _tables_lines(lens)]
-    parts.append(target_lines(lens.target, long=False))
-    if lens.target_coupling is not None:
-        coupling = lens.target_coupling.reshape(len(lens.settings), -1)
-        parts.append(iter([f"target_coupling: {flow(coupling)}"]))
-    return "\n".join([*block(_BLOCK, chain.from_iterable(parts)), ""])
+    return "\n".join([*block(_BLOCK, _lines(lens)), ""])
 
 
 def write_lens(lens: ZoomLens, path: str | Path) -> None:
@@ -77,6 +68,36 @@ def lens_from_field(root: Field) -> ZoomLens:
     """Read a lens from the tree of its file; see `read_lens`."""
     with value_failures(root.source):
         return _lens(root[_BLOCK])
+
+
+def _lines(lens: ZoomLens) -> Iterator[str]:
+    yield from _record_lines(lens)
+    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
+    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
+    yield from block("settings", table_lines(columns, long=False, indent=2))
+    yield "members:"
+    for member in lens.members:
+        yield f"  - scale: {member.nets.scale}"
+        yield f"    constants: {_constants(member.constants)}"
+        yield "    networks:"
+        for name, net in zip(lens.names, member.nets.nets, strict=True):
+            yield f"      {name}:"
+            yield f"        hidden: [{net.topology.own}, {net.topology.hidden}]"
+            for key in ("centre", "spread", "scatter"):
+                yield f"        {key}: {number(getattr(net, key))}"
+            yield f"        precision: {flow(net.precision)}"
+            yield f"        weights: {flow(net.weights)}"
+    for name, table in (("tables", lens.tables), ("static", lens.static)):
+        yield f"{name}:"
+        yield f"  constants: {_constants(table.constants)}"
+        yield f"  local: {flow(table.local)}"
+        upper = np.triu_indices(table.normal.H.shape[1])
+        yield f"  H: {flow(table.normal.H[:, upper[0], upper[1]])}"
+        yield f"  g: {flow(table.normal.g)}"
+        yield f"  cost: {flow(table.normal.cost)}"
+    yield from target_lines(lens.target, long=False)
+    if lens.target_coupling is not None:
+        yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
 
 
 def _record_lines(lens: ZoomLens) -> Iterator[str]:
@@ -109,37 +130,8 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
     yield from list_lines("warnings", map(quoted, lens.warnings))
 
 
-def _member_lines(lens: ZoomLens) -> Iterator[str]:
-    yield "members:"
-    for member in lens.members:
-        yield f"  - scale: {member.nets.scale}"
-        yield f"    constants: {_constants(member.constants)}"
-        yield "    networks:"
-        for name, net in zip(lens.names, member.nets.nets, strict=True):
-            yield f"      {name}:"
-            yield f"        hidden: [{net.topology.own}, {net.topology.hidden}]"
-            for key in ("centre", "spread", "scatter"):
-                yield f"        {key}: {number(getattr(net, key))}"
-            yield f"        precision: {flow(net.precision)}"
-            yield f"        weights: {flow(net.weights)}"
-
-
 def _constants(constants: Constants) -> str:
     return mapping(theta=number(constants.theta), R=flow(constants.R), t=flow(constants.t))
-
-
-def _tables_lines(lens: ZoomLens) -> Iterator[str]:
-    for name, table in (("tables", lens.tables), ("static", lens.static)):
-        yield f"{name}:"
-        yield f"  constants: {_constants(table.constants)}"
-        upper = np.triu_indices(table.normal.H.shape[1])
-        for key, values in (
-            ("local", table.local),
-            ("H", table.normal.H[:, upper[0], upper[1]]),
-            ("g", table.normal.g),
-            ("cost", table.normal.cost),
-        ):
-            yield f"  {key}: {flow(values)}"
 
 
 def _lens(block: Field) -> ZoomLens:
@@ -229,23 +221,22 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
     scale = field["scale"].text()
     if scale not in SCALES:
         field["scale"].fail(f"one of {', '.join(SCALES)}")
-    nets = tuple(_net(field["networks"][name], D) for name in names)
-    return Member(LensNets(scale, nets), _read_constants(field["constants"]))
-
-
-def _net(field: Field, D: int) -> ParameterNet:
-    hidden = field["hidden"].array(2)
-    if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
-        field["hidden"].fail("two numbers of units")
-    topology = Topology(D, int(hidden[0]), int(hidden[1]))
-    return ParameterNet(
-        topology,
-        field["weights"].array(topology.n_weights),
-        field["precision"].array(topology.n_groups),
-        field["centre"].number(),
-        _positive(field["spread"]),
-        field["scatter"].number(),
-    )
+    nets = []
+    for net in (field["networks"][name] for name in names):
+        hidden = net["hidden"].array(2)
+        if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
+            net["hidden"].fail("two numbers of units")
+        topology = Topology(D, int(hidden[0]), int(hidden[1]))
+        parameters = ParameterNet(
+            topology,
+            net["weights"].array(topology.n_weights),
+            net["precision"].array(topology.n_groups),
+            net["centre"].number(),
+            _positive(net["spread"]),
+            net["scatter"].number(),
+        )
+        nets.append(parameters)
+    return Member(LensNets(scale, tuple(nets)), _read_constants(field["constants"]))
 
 
 def _read_constants(field: Field) -> Constants:

@@ -7,7 +7,6 @@ view, whose numbers are texts: decimals, or packed if PyYAML would take too long
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
 from operator import add
 from typing import Any
 
@@ -51,14 +50,11 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
             yield f"    - [{ends}, {number(one.length)}, {number(one.std)}]"
     if len(points) == 0:
         yield "  rows: []"
-    elif long:
+        return
+    if long:
         yield from indented(_long_lines(points, np.hstack(blocks)))
-    else:
-        yield "  rows:"
-        yield from _rows(points, np.hstack([points.world, *blocks]))
-
-
-def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
+        return
+    yield "  rows:"
     # OpenCV's FileStorage requires rows to be indented more than their key.
     heads = [f"    - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
@@ -66,7 +62,8 @@ def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
         labels = np.asarray(points.point).tolist()
         ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
         heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
-    return map(add, heads, flow(numbers)[2:-1].split(", ["))
+    numbers = flow(np.hstack([points.world, *blocks]))
+    yield from map(add, heads, numbers[2:-1].split(", ["))
 
 
 def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
@@ -122,8 +119,8 @@ def read_observations(
         observations["rows"].fail("at least one row")
 
     def numbers(names: tuple[str, ...]) -> Array:
-        fields = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
-        return np.column_stack([field.array(-1) for field in fields])
+        cells = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
+        return np.column_stack([column.array(-1) for column in cells])
 
     labels = {
         name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
@@ -133,30 +130,26 @@ def read_observations(
         known: dict[str, Any] = {
             attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
         }
+        distances = []
+        for row in observations.get("distances", []).items():
+            cells = list(row.items())
+            if len(cells) != 4:
+                row.fail("a list of from, to, length, std")
+            start, end, length, std = cells
+            distances.append(Distance(start.text(), end.text(), length.number(), std.number()))
         return Correspondences(
             world,
             pixels,
             view=labels.get("view"),
             point=labels.get("point"),
             **known,
-            distances=_distances(observations.get("distances", [])),
+            distances=tuple(distances),
             undistorted=observations.get("undistorted", "").text(),
             image_size=image_size,
             image_center=image_center,
             unit=unit,
             source=observations.source,
         )
-
-
-def _distances(field: Field) -> tuple[Distance, ...]:
-    found = []
-    for row in field.items():
-        cells = list(row.items())
-        if len(cells) != len(fields(Distance)):
-            row.fail("a list of from, to, length, std")
-        start, end, length, std = cells
-        found.append(Distance(start.text(), end.text(), length.number(), std.number()))
-    return tuple(found)
 
 
 def _names(observations: Field) -> list[str]:

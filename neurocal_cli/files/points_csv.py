@@ -24,11 +24,11 @@ PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
 OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ"), "across": ("nu", "nv")}
 """Names of the optional columns, by their attribute of `Correspondences`."""
-SETTINGS = ("zoom", "focus")
+_SETTINGS = ("zoom", "focus")
 POINTS = Schema(
     kind="points",
     required=(*PLACE, *PIXEL),
-    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *SETTINGS),
+    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=True,
     instead="; neurocal convert --to neurocal makes one of another program's corners",
@@ -95,7 +95,20 @@ def format_points(points: Correspondences) -> str:
     names, blocks = value_columns(points)
     numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
     rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
-    return "\n".join([*_metadata_lines(points), ",".join([*labels, *PLACE, *names]), *rows, ""])
+    lines = []
+    if points.image_size is not None:
+        lines.append(f"# image_size: {points.image_size[0]} {points.image_size[1]}")
+    if points.image_center is not None:
+        lines.append(f"# image_center: {points.image_center[0]!r} {points.image_center[1]!r}")
+    if points.unit != points.unit.strip(" \t,;") or re.search(r"[\r\n\0]", points.unit) or not points.unit:
+        raise InputError(f"the unit {points.unit!r} cannot be written; name it in a word, such as mm")
+    if points.distances:
+        measured = [[one.start, one.end, one.length, one.std] for one in points.distances]
+        lines.append(f"# distances: {json.dumps(measured)}")
+    lines.append(f"# unit: {points.unit}")
+    if points.undistorted:
+        lines.append(f"# undistorted: {points.undistorted}")
+    return "\n".join([*lines, ",".join([*labels, *PLACE, *names]), *rows, ""])
 
 
 def value_columns(points: Correspondences) -> tuple[list[str], list[Array]]:
@@ -107,21 +120,6 @@ def value_columns(points: Correspondences) -> tuple[list[str], list[Array]]:
             names += columns
             blocks.append(values)
     return names, blocks
-
-
-def _metadata_lines(points: Correspondences) -> list[str]:
-    lines = []
-    if points.image_size is not None:
-        lines.append(f"# image_size: {points.image_size[0]} {points.image_size[1]}")
-    if points.image_center is not None:
-        lines.append(f"# image_center: {points.image_center[0]!r} {points.image_center[1]!r}")
-    if points.unit != points.unit.strip(" \t,;") or re.search(r"[\r\n\0]", points.unit) or not points.unit:
-        raise InputError(f"the unit {points.unit!r} cannot be written; name it in a word, such as mm")
-    if points.distances:
-        rows = [[one.start, one.end, one.length, one.std] for one in points.distances]
-        lines.append(f"# distances: {json.dumps(rows)}")
-    lines.append(f"# unit: {points.unit}")
-    return [*lines, f"# undistorted: {points.undistorted}"] if points.undistorted else lines
 
 
 def _quoted(label: str, name: str) -> str:
@@ -225,7 +223,7 @@ def _plain(value: Any) -> str:
 
 def _check_settings(tables: list[Table], notes: list[str]) -> None:
     """Refuse points at several zoom or focus settings, because a calibration has one setting."""
-    for name in SETTINGS:
+    for name in _SETTINGS:
         given = [(table, table.numbers[name]) for table in tables if name in table.numbers]
         if not given:
             continue

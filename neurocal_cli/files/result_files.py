@@ -60,12 +60,12 @@ def write_result(
         write_whole(path, OPENCV.text(adapted.cameras, ending)[""])
         return (*adapted.losses, *adapted.remarks)
     by_rows = ending == ".json"  # JSON loads fast at any length
-    if not isinstance(result, Calibration):
+    if isinstance(result, Calibration):
+        text = format_calibration(result, by_rows)
+    else:
         from neurocal_cli.files.rig_yaml import format_rig
 
         text = format_rig(result, alpha, by_rows)
-    else:
-        text = format_calibration(result, by_rows)
     if by_rows:
         from neurocal_cli.files.yaml_text import parse_yaml
 

@@ -31,6 +31,7 @@ from neurocal_cli.files.yaml_text import (
     mapping,
     number,
     quoted,
+    quoted_words,
     text,
     words,
 )
@@ -88,14 +89,11 @@ def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
     if rectified is not None:
         matrices = {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
         yield from block("rectification", (f"{key}: {flow(matrix)}" for key, matrix in matrices.items()))
-    yield from list_lines("pairs", map(_quoted, rig.pairs))
-    yield from list_lines("left_out", (_quoted((*pair, reason)) for pair, reason in rig.left_out.items()))
+    yield from list_lines("pairs", map(quoted_words, rig.pairs))
+    left_out = (quoted_words((*pair, reason)) for pair, reason in rig.left_out.items())
+    yield from list_lines("left_out", left_out)
     yield from list_lines("warnings", map(quoted, rig.warnings))
     yield from verdict_lines(rig.verdict)
-
-
-def _quoted(names: tuple[str, ...]) -> str:
-    return f"[{', '.join(map(quoted, names))}]"
 
 
 def read_rig(path: str | Path) -> Rig:

@@ -34,7 +34,15 @@ class Field:
 
     def fail(self, expected: str) -> NoReturn:
         """Raise a FormatError about an unexpected value."""
-        found = _described(self.value)
+        if isinstance(self.value, dict):
+            found = "a mapping"
+        elif isinstance(self.value, list):
+            found = f"a list of {len(self.value)}"
+        elif self.value is None:
+            found = "nothing"
+        else:
+            shown = repr(self.value)
+            found = shown if len(shown) <= 40 else f"{shown[:37]}..."
         self.refuse(f"{self.path or 'the file'} must be {expected}, found {found}; correct it")
 
     def __contains__(self, key: str) -> bool:
@@ -125,7 +133,13 @@ class Field:
         except (ValueError, OverflowError, RecursionError):  # ragged
             self.fail(expected)
         if array.dtype.kind not in "iuf":  # numbers as text, null, or other values
-            array = self._converted(array, expected, unknown)
+            objects = np.array(self.value, dtype=object)
+            flat = objects.ravel().tolist()
+            numbers = [_as_float(x) for x in flat]
+            finite = (math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True))
+            if objects.shape != array.shape or not all(finite):
+                self.fail(expected)
+            array = np.array(numbers).reshape(objects.shape)
         array = array.astype(float)
         if array.size == 0 and any(s < 0 for s in shape):
             array = array.reshape([max(s, 0) for s in shape])
@@ -133,16 +147,6 @@ class Field:
         if not fits or not (unknown or np.isfinite(array).all()):
             self.fail(expected)
         return array
-
-    def _converted(self, array: np.ndarray[Any, Any], expected: str, unknown: bool) -> Array:
-        objects = np.array(self.value, dtype=object)
-        if objects.shape != array.shape:
-            self.fail(expected)
-        flat = objects.ravel().tolist()
-        numbers = [_as_float(x) for x in flat]
-        if not all(math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True)):
-            self.fail(expected)
-        return np.array(numbers, dtype=float).reshape(objects.shape)
 
     def _mapping(self) -> dict[str, Any]:
         if not isinstance(self.value, dict):
@@ -167,13 +171,3 @@ def _as_float(value: Any) -> float:
     if isinstance(value, str) and is_number(value):
         return float(value)
     return math.nan
-
-
-def _described(value: Any) -> str:
-    if isinstance(value, dict):
-        return "a mapping"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    if value is None:
-        return "nothing"
-    return repr(value) if len(repr(value)) <= 40 else repr(value)[:37] + "..."

@@ -25,7 +25,7 @@ MATCHES = Schema(
 )
 _LARGEST = 1e100  # squares of pixels beyond this overflow
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
-FLAGS = np.array(["ok", "off", "behind"])
+_FLAGS = np.array(["ok", "off", "behind"])
 # Ten digits of the coordinates, more than their accuracy; six digits of covariance and epipolar error.
 _ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%s"])
 
@@ -79,7 +79,7 @@ def format_space_points(
         assert found.covariance is not None
         numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
         numbers[~np.isfinite(numbers)] = np.nan  # one text for all undefined values
-        flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
+        flags = _FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
         columns: list[list[Any]] = [*numbers.T.tolist(), flags]
         row = _ROW
         if labels is not None:

@@ -1,15 +1,13 @@
-"""Write numbers, names and matrices as YAML text that every reader reads back exactly.
+"""Write YAML text that every reader reads back exactly, and parse YAML, which may be untrusted.
 
 For a file of 100 views, PyYAML's ``CSafeDumper`` takes 180 ms and this module 20 ms, nearly all of it for the
 shortest decimal form of each number.
 
-Parse YAML text to plain dicts, lists, strings and numbers, also for untrusted text.
-
-The tree is built here from the events of PyYAML (libyaml if it is available), not by its loaders. That is 9
-times faster on calibration files (100 views: 37 ms, by ``CSafeLoader`` 345 ms), and aliases can be refused (a
-few lines of them can expand to gigabytes), as can duplicate keys and absurd nesting. Tags are ignored, so
-OpenCV's ``!!opencv-matrix`` is read like any mapping. Keys of mappings stay text: a view called ``1e5`` or
-``null`` keeps its name.
+A tree of dicts, lists, strings and numbers is built here from the events of PyYAML (libyaml if it is
+available), not by its loaders. That is 9 times faster on calibration files (100 views: 37 ms, by
+``CSafeLoader`` 345 ms), and aliases can be refused (a few lines of them can expand to gigabytes), as can
+duplicate keys and absurd nesting. Tags are ignored, so OpenCV's ``!!opencv-matrix`` is read like any mapping.
+Keys of mappings stay text: a view called ``1e5`` or ``null`` keeps its name.
 
 A long table of JSON-compatible rows, the form in which observations are written, is parsed as JSON, 50 times
 faster.
@@ -29,16 +27,40 @@ import yaml
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
+
+DEEPEST = 40
+TOO_DEEP = "is nested too deeply to be a camera file; give another"
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*").fullmatch
 _RESERVED = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
-
 # Characters that YAML would fold, refuse or show wrongly; \uXXXX has the same meaning in YAML and JSON.
 _UNSAFE = "[\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff0-\uffff]"
-_encode = json.JSONEncoder(ensure_ascii=False).encode
 _SURROGATE = "[\ud800-\udfff]"
+_encode = json.JSONEncoder(ensure_ascii=False).encode
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
+# PyYAML's rule, so that names which it writes without quotes (1e5, 1.5e5, -.5) stay names.
+_FLOAT = re.compile(r"(?:[-+]?[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?").fullmatch
+_WORDS: dict[str, Any] = {
+    "": None,
+    "~": None,
+    **dict.fromkeys(("null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
+    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+}
+# The table as written by `observations_yaml`, at any indentation.
+_ROWS = re.compile(
+    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
+    re.MULTILINE,
+)
+_LABELS = frozenset(("view", "point"))
+_CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
 def number(value: float) -> str:
@@ -97,6 +119,11 @@ def words(names: Iterable[str]) -> str:
     return f"[{', '.join(map(text, names))}]"
 
 
+def quoted_words(names: Iterable[str]) -> str:
+    """Write names as a flow sequence, each in quotes."""
+    return f"[{', '.join(map(quoted, names))}]"
+
+
 def mapping(**entries: str) -> str:
     """Write entries, already as text, as a flow mapping ``{a: 1, b: 2}``."""
     return "{" + ", ".join(f"{key}: {value}" for key, value in entries.items()) + "}"
@@ -128,33 +155,6 @@ def _with_point(numbers: str) -> str:
         if not part[-2:-1] or part[-2] not in "0123456789.":  # a single digit stands before the e
             parts[k] = part + ".0"
     return "e".join(parts)
-
-
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DEEPEST = 40
-_TOO_DEEP = "is nested too deeply to be a camera file; give another"
-
-_INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
-# PyYAML's rule, so that names which it writes without quotes (1e5, 1.5e5, -.5) stay names.
-_FLOAT = re.compile(r"(?:[-+]?[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?").fullmatch
-_WORDS: dict[str, Any] = {
-    "": None,
-    "~": None,
-    **dict.fromkeys(("null", "Null", "NULL")),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
-    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
-    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
-}
-
-# The table as written by `calibration_yaml`, at any indentation.
-_ROWS = re.compile(
-    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
-    re.MULTILINE,
-)
-_LABELS = frozenset(("view", "point"))
-_CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
 
 def read_yaml(path: str | Path) -> Field:
@@ -229,8 +229,8 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
         elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
             if type(containers[-1]) is dict and keys[-1] is None:
                 _fail("a key must be a word, not a list or mapping; correct it", event, source)
-            if len(containers) > _DEEPEST:
-                _fail(_TOO_DEEP, event, source)
+            if len(containers) > DEEPEST:
+                _fail(TOO_DEEP, event, source)
             containers.append({} if kind is yaml.MappingStartEvent else [])
             keys.append(None)
             continue
@@ -271,7 +271,7 @@ def _syntax_error(error: yaml.YAMLError, text: str, source: str) -> FormatError:
     if mark is not None:
         problem = str(getattr(error, "problem", "")) or "it cannot be parsed"
         if "nesting depth" in problem:  # libyaml has a limit of its own since 0.2.6, and looks ahead
-            return FormatError(_TOO_DEEP, source, mark.line + 1)
+            return FormatError(TOO_DEEP, source, mark.line + 1)
         return FormatError(f"is not valid YAML ({problem}); correct it", source, mark.line + 1)
     position = getattr(error, "position", None)  # a character that YAML does not allow
     line = None if position is None else text.count("\n", 0, position) + 1

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from neurocal_cli.errors import FormatError, NeurocalError
-from neurocal_cli.files.files import decode, read_blocks, read_bytes
+from neurocal_cli.files.reading import decode, read_blocks, read_bytes
 from neurocal_cli.files.writing import write_chunks, write_whole
 
 AS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0

@@ -58,10 +58,10 @@ def adapt_cameras(
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
     losses, remarks, adapted, moved = [], [], [], []
+    origin = cameras.origin
     # Pixels of the points with which each camera was calibrated.
     seen: list[Array | None] = [None] * len(cameras.cameras)
-    if cameras.origin is not None:
-        origin = cameras.origin
+    if origin is not None:
         parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
         seen = [part.points.pixels for part in parts]
     for camera, points in zip(cameras.cameras, seen, strict=True):
@@ -71,7 +71,7 @@ def adapt_cameras(
         moved.append(None if near is None else near.over_image)
     changed = any(new is not old for new, old in zip(adapted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
-    if cameras.origin is not None and (changed or not own):
+    if origin is not None and (changed or not own):
         remarks.append(
             f"a file of {target.program} has no place for standard deviations, points and the verdict"
             if not own
@@ -79,7 +79,7 @@ def adapt_cameras(
         )
     if n_views:
         remarks.append(f"a file of {target.program} has no place for the poses of {plural(n_views, 'view')}")
-    found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else cameras.origin)
+    found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else origin)
     return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
 
 
@@ -87,15 +87,17 @@ def _adapted(
     camera: Camera, target: Format, wanted: str | None, force: bool, points: Array | None
 ) -> _Adaptation:
     models = target.models if wanted is None else (wanted,)
-    model = next((m for m in models if with_model(camera.distortion, m) is not None), None)
+    lenses = (with_model(camera.distortion, model) for model in models)
+    exact = next((lens for lens in lenses if lens is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
-    if model is not None and straight:
-        return _as_model(camera, model), None, ""
+    if exact is not None and straight:
+        # The same object tells the caller that nothing changed.
+        return camera if exact is camera.distortion else replace(camera, distortion=exact), None, ""
     if wanted is not None:
         near = nearest_camera(camera, wanted, target.skew, points)
         return near.camera, near, f"the nearest {wanted}{'' if straight else ' without skew'} {_pixels(near)}"
-    if model is not None:
-        near = nearest_camera(camera, model, False, points)
+    if exact is not None:
+        near = nearest_camera(camera, exact.model, False, points)
         if near.over_image.max_px < _NO_SKEW:
             return _straightened(near.camera), None, ""
         what = (
@@ -117,14 +119,6 @@ def _adapted(
     if not force:
         raise InputError(f"{camera.name}: {what}; give --force to write it, or calibrate with this model")
     return near.camera, near, what
-
-
-def _as_model(camera: Camera, model: str) -> Camera:
-    """Express the camera in a model that includes its distortion model; unchanged if that is the same."""
-    distortion = with_model(camera.distortion, model)
-    if distortion is camera.distortion or distortion is None:
-        return camera
-    return replace(camera, distortion=distortion)
 
 
 def _straightened(camera: Camera) -> Camera:

@@ -19,7 +19,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
 from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.files import read_text
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.yaml_text import number
 
 _HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
@@ -165,15 +165,19 @@ def _pose(values: Array) -> Pose:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    files = {
-        "cameras.txt": [
-            "# Camera list with one line of data per camera:",
-            "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-            *(_camera_line(k, camera) for k, camera in enumerate(cameras.cameras, start=1)),
-        ]
-    }
+    lines = [
+        "# Camera list with one line of data per camera:",
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    ]
+    for k, camera in enumerate(cameras.cameras, start=1):
+        width, height = camera.image_size or (0, 0)
+        a, _, b, u0, v0 = camera.entries
+        values = [a, b, u0 + _HALF, v0 + _HALF, *camera.distortion.coefficients.tolist()]
+        model = _NAMES[camera.distortion.model]
+        lines.append(f"{k} {model} {width} {height} {' '.join(map(number, values))}")
     if len(cameras.cameras) == 1 and not cameras.poses:
-        return {"": _joined(files["cameras.txt"])}
+        return {"": _joined(lines)}
+    files = {"cameras.txt": lines}
     rig = cameras.mounted
     sensors = [f"CAMERA {k} 1 {_seven(pose)}" for k, pose in enumerate(rig[1:], start=2)]
     files["rigs.txt"] = [" ".join([f"1 {len(rig)} CAMERA 1", *sensors])]
@@ -182,12 +186,12 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         raise InputError("two names of views differ by blanks alone, which COLMAP's have not; rename one")
     for frame, (view, pose) in enumerate(cameras.poses.items(), start=1):
         data = []
-        for camera, mounted in enumerate(rig, start=1):
-            image = (frame - 1) * len(rig) + camera
-            data.append(f"CAMERA {camera} {image}")
+        for k, mounted in enumerate(rig, start=1):
+            image = (frame - 1) * len(rig) + k
+            data.append(f"CAMERA {k} {image}")
             # As in COLMAP's rigs, the images of each camera are in a folder with its name.
-            name = f"camera{camera}/{_word(view)}" if len(rig) > 1 else _word(view)
-            files["images.txt"] += [f"{image} {_seven(after(mounted, pose))} {camera} {name}", ""]
+            name = f"camera{k}/{_word(view)}" if len(rig) > 1 else _word(view)
+            files["images.txt"] += [f"{image} {_seven(after(mounted, pose))} {k} {name}", ""]
         files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
     return {name: _joined(lines) for name, lines in files.items()}
 
@@ -199,13 +203,6 @@ def _word(name: str) -> str:
 
 def _joined(lines: list[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
-
-
-def _camera_line(k: int, camera: Camera) -> str:
-    width, height = camera.image_size or (0, 0)
-    a, _, b, u0, v0 = camera.entries
-    values = [a, b, u0 + _HALF, v0 + _HALF, *camera.distortion.coefficients.tolist()]
-    return f"{k} {_NAMES[camera.distortion.model]} {width} {height} {' '.join(map(number, values))}"
 
 
 def _seven(pose: Pose) -> str:

@@ -27,8 +27,8 @@ from neurocal_cli.files.exchange.dictionary import arrays_of
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, read_variables, unit_of
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.file_storage import parse_tree
-from neurocal_cli.files.files import decode, read_bytes
 from neurocal_cli.files.points_csv import read_points
+from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences

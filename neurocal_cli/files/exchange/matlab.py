@@ -4,8 +4,6 @@ MATLAB counts pixels from 1, so principal points are larger than ours by 1. Its 
 from the right, so K, rotations and translations are transposed; the skew is ``IntrinsicMatrix(2, 1)``.
 Bouguet's ``Calib_Results.mat`` counts from 0, multiplies column vectors, and has the skew as ``alpha_c``.
 
-Read the variables of a MATLAB file of version 5 to 7: numbers, texts, cells and structs.
-
 ``scipy.io.loadmat`` is not used, because damaged files crash it. The format is MathWorks' "MAT-File Format":
 each element has a type, a length and data, and matrices consist of further elements.
 """
@@ -28,6 +26,9 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
 
+FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
+_STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
+
 _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -38,30 +39,136 @@ _DEEPEST = 12
 _MOST_BYTES = 500_000_000  # unpacked
 
 
+def read_mat(data: bytes, source: str) -> CameraSet:
+    """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
+    tree = read_variables(data, source)
+    for name in _STRUCTS:
+        if isinstance(tree.get(name), dict):
+            tree = tree[name]
+            break
+    if "fc" in tree:
+        return CameraSet((_bouguet(tree, ""),), (), _bouguet_poses(tree), program="MATLAB")
+    if "fc_left" in tree and "fc_right" in tree:
+        pose = Pose(from_vector(_numbers(tree, "om", 3)), _numbers(tree, "T", 3))
+        return CameraSet((_bouguet(tree, "_left"), _bouguet(tree, "_right")), (pose,), program="MATLAB")
+    if "CameraParameters1" in tree and "CameraParameters2" in tree:
+        R = _numbers(tree, "RotationOfCamera2", 9).reshape(3, 3).T
+        pose = Pose(R, _numbers(tree, "TranslationOfCamera2", 3))
+        parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
+        cameras = _camera(parts[0]), _camera(parts[1])
+        return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
+    if "IntrinsicMatrix" in tree or "K" in tree:
+        return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
+    raise InputError(
+        "holds no camera that can be read; in MATLAB save a struct: "
+        "cameraParams = toStruct(cameraParams); save('camera.mat', 'cameraParams', '-v7')"
+    )
+
+
+def _camera(tree: dict[str, Any]) -> Camera:
+    if "IntrinsicMatrix" in tree:
+        K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
+    else:
+        K = _numbers(tree, "K", 9).reshape(3, 3)
+    K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
+    radial = _numbers(tree, "RadialDistortion")
+    tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)
+    if len(radial) not in (2, 3):
+        raise InputError("RadialDistortion must be 2 or 3 numbers; correct it")
+    k1, k2, k3 = [*radial, 0.0][:3]
+    k = np.array([k1, k2, *tangential, k3])
+    size = None
+    if "ImageSize" in tree and np.size(tree["ImageSize"]) == 2:
+        height, width = _numbers(tree, "ImageSize", 2)
+        size = int(width), int(height)
+    model = "plumb_bob" if k3 else "k1k2p1p2" if k.any() else "none"
+    lens = Distortion(model, k[: len(MODELS[model])])
+    return Camera(Intrinsics.from_matrix(K), lens, size)
+
+
+def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
+    if "RotationMatrices" not in tree or "TranslationVectors" not in tree:
+        return {}
+    R = np.asarray(tree["RotationMatrices"], dtype=float).reshape(3, 3, -1)
+    t = np.asarray(tree["TranslationVectors"], dtype=float).reshape(-1, 3)
+    if R.shape[2] != len(t):
+        raise InputError(f"TranslationVectors must be {R.shape[2]} rows; correct it")
+    names = [str(name).strip() for name in tree.get("ViewNames", [])]
+    if len(names) != len(t):
+        names = [f"{k}" for k in range(1, len(t) + 1)]
+    return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
+
+
+def _bouguet(tree: dict[str, Any], side: str) -> Camera:
+    fx, fy = _numbers(tree, f"fc{side}", 2)
+    cx, cy = _numbers(tree, f"cc{side}", 2)
+    alpha = float(_numbers(tree, f"alpha_c{side}", 1)[0]) if f"alpha_c{side}" in tree else 0.0
+    k = _numbers(tree, f"kc{side}", 5)
+    size = None
+    if "nx" in tree and "ny" in tree:
+        size = int(_numbers(tree, "nx", 1)[0]), int(_numbers(tree, "ny", 1)[0])
+    K = np.array([[fx, alpha * fx, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    lens = Distortion("plumb_bob", k) if k.any() else Distortion()
+    return Camera(Intrinsics.from_matrix(K), lens, size, side.removeprefix("_") or "camera")
+
+
+def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
+    numbers = sorted(
+        int(name[4:]) for name in tree if re.fullmatch(r"omc_\d+", name) and f"Tc_{name[4:]}" in tree
+    )
+    poses = {}
+    for k in numbers:
+        om, t = (np.asarray(tree[f"{name}_{k}"], dtype=float).ravel() for name in ("omc", "Tc"))
+        if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # NaN for images left out
+            poses[f"{k}"] = Pose(from_vector(om), t)
+    return poses
+
+
+def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
+    if name not in tree:
+        raise InputError(f"the variable {name} is missing; save it as well")
+    try:
+        values = np.asarray(tree[name], dtype=float).ravel()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers; correct it") from error
+    if (count >= 0 and len(values) != count) or not np.isfinite(values).all():
+        raise InputError(f"{name} must be {count} finite numbers, found {len(values)}; correct it")
+    return values
+
+
+def unit_of(tree: dict[str, Any]) -> str | None:
+    """Unit stated in a struct; None if there is none."""
+    unit = tree.get("WorldUnits")
+    return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
+        str(unit), unit if isinstance(unit, str) and unit else None
+    )
+
+
 def read_variables(data: bytes, source: str) -> dict[str, Any]:
-    """Read arrays, strings, lists for cells and dicts for structs; objects of classes are left out."""
+    """Read the variables of a file of version 5 to 7: arrays, strings, lists for cells and dicts for structs.
+
+    Objects of classes are left out.
+    """
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise FormatError("is no .mat file of version 5 to 7; save it again with -v7", source)
+    variables = {}
     try:
-        return dict(_variables(data[_HEADER:], order))
+        for kind, content in _elements(data[_HEADER:], order, padded=False):
+            if kind == _COMPRESSED:
+                unpacker = zlib.decompressobj()
+                content = unpacker.decompress(content, _MOST_BYTES)
+                if unpacker.unconsumed_tail:
+                    raise ValueError("too large")
+                ((kind, content),) = _elements(content, order)
+            if kind != _MATRIX:
+                raise ValueError("no matrix")
+            name, value = _matrix(content, order, _DEEPEST)
+            if value is not None:
+                variables[name] = value
     except (struct.error, ValueError, KeyError, IndexError, zlib.error, UnicodeError, OverflowError) as error:
         raise FormatError("is a damaged .mat file; save it again with -v7", source) from error
-
-
-def _variables(data: bytes, order: str) -> Iterator[tuple[str, Any]]:
-    for kind, content in _elements(data, order, padded=False):
-        if kind == _COMPRESSED:
-            unpacker = zlib.decompressobj()
-            content = unpacker.decompress(content, _MOST_BYTES)
-            if unpacker.unconsumed_tail:
-                raise ValueError("too large")
-            ((kind, content),) = _elements(content, order)
-        if kind != _MATRIX:
-            raise ValueError("no matrix")
-        name, value = _matrix(content, order, _DEEPEST)
-        if value is not None:
-            yield name, value
+    return variables
 
 
 def _elements(data: bytes, order: str, padded: bool = True) -> Iterator[tuple[int, bytes]]:
@@ -126,36 +233,6 @@ def _values(part: tuple[int, bytes], order: str) -> np.ndarray[Any, Any]:
     return np.frombuffer(content, dtype=np.dtype(order + _TYPES[kind]))
 
 
-FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
-_STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
-
-
-def read_mat(data: bytes, source: str) -> CameraSet:
-    """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
-    tree = read_variables(data, source)
-    for name in _STRUCTS:
-        if isinstance(tree.get(name), dict):
-            tree = tree[name]
-            break
-    if "fc" in tree:
-        return CameraSet((_bouguet(tree, ""),), (), _bouguet_poses(tree), program="MATLAB")
-    if "fc_left" in tree and "fc_right" in tree:
-        pose = Pose(from_vector(_numbers(tree, "om", 3)), _numbers(tree, "T", 3))
-        return CameraSet((_bouguet(tree, "_left"), _bouguet(tree, "_right")), (pose,), program="MATLAB")
-    if "CameraParameters1" in tree and "CameraParameters2" in tree:
-        R = _numbers(tree, "RotationOfCamera2", 9).reshape(3, 3).T
-        pose = Pose(R, _numbers(tree, "TranslationOfCamera2", 3))
-        parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
-        cameras = _camera(parts[0]), _camera(parts[1])
-        return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
-    if "IntrinsicMatrix" in tree or "K" in tree:
-        return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
-    raise InputError(
-        "holds no camera that can be read; in MATLAB save a struct: "
-        "cameraParams = toStruct(cameraParams); save('camera.mat', 'cameraParams', '-v7')"
-    )
-
-
 def saved(tree: dict[str, Any]) -> bytes:
     """Write a ``.mat`` file of variables; the same variables give the same file."""
     from scipy.io import savemat
@@ -164,87 +241,6 @@ def saved(tree: dict[str, Any]) -> bytes:
     savemat(buffer, tree, oned_as="row")
     # The first 116 bytes are a comment with the current date.
     return b"MATLAB 5.0 MAT-file, written by neurocal".ljust(116) + buffer.getvalue()[116:]
-
-
-def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
-    if name not in tree:
-        raise InputError(f"the variable {name} is missing; save it as well")
-    try:
-        values = np.asarray(tree[name], dtype=float).ravel()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be numbers; correct it") from error
-    if (count >= 0 and len(values) != count) or not np.isfinite(values).all():
-        raise InputError(f"{name} must be {count} finite numbers, found {len(values)}; correct it")
-    return values
-
-
-def unit_of(tree: dict[str, Any]) -> str | None:
-    """Unit stated in a struct; None if there is none."""
-    unit = tree.get("WorldUnits")
-    return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
-        str(unit), unit if isinstance(unit, str) and unit else None
-    )
-
-
-def _camera(tree: dict[str, Any]) -> Camera:
-    if "IntrinsicMatrix" in tree:
-        K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
-    else:
-        K = _numbers(tree, "K", 9).reshape(3, 3)
-    K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
-    radial = _numbers(tree, "RadialDistortion")
-    tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)
-    k1, k2, k3 = [*radial, 0.0][:3] if len(radial) in (2, 3) else _wrong("RadialDistortion", "2 or 3 numbers")
-    k = np.array([k1, k2, *tangential, k3])
-    size = None
-    if "ImageSize" in tree and np.size(tree["ImageSize"]) == 2:
-        height, width = _numbers(tree, "ImageSize", 2)
-        size = int(width), int(height)
-    model = "plumb_bob" if k3 else "k1k2p1p2" if k.any() else "none"
-    lens = Distortion(model, k[: len(MODELS[model])])
-    return Camera(Intrinsics.from_matrix(K), lens, size)
-
-
-def _wrong(name: str, what: str) -> Any:
-    raise InputError(f"{name} must be {what}; correct it")
-
-
-def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
-    if "RotationMatrices" not in tree or "TranslationVectors" not in tree:
-        return {}
-    R = np.asarray(tree["RotationMatrices"], dtype=float).reshape(3, 3, -1)
-    t = np.asarray(tree["TranslationVectors"], dtype=float).reshape(-1, 3)
-    if R.shape[2] != len(t):
-        _wrong("TranslationVectors", f"{R.shape[2]} rows")
-    names = [str(name).strip() for name in tree.get("ViewNames", [])]
-    if len(names) != len(t):
-        names = [f"{k}" for k in range(1, len(t) + 1)]
-    return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
-
-
-def _bouguet(tree: dict[str, Any], side: str) -> Camera:
-    fx, fy = _numbers(tree, f"fc{side}", 2)
-    cx, cy = _numbers(tree, f"cc{side}", 2)
-    alpha = float(_numbers(tree, f"alpha_c{side}", 1)[0]) if f"alpha_c{side}" in tree else 0.0
-    k = _numbers(tree, f"kc{side}", 5)
-    size = None
-    if "nx" in tree and "ny" in tree:
-        size = int(_numbers(tree, "nx", 1)[0]), int(_numbers(tree, "ny", 1)[0])
-    K = np.array([[fx, alpha * fx, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    lens = Distortion("plumb_bob", k) if k.any() else Distortion()
-    return Camera(Intrinsics.from_matrix(K), lens, size, side.removeprefix("_") or "camera")
-
-
-def _bouguet_poses(tree: dict[str, Any]) -> dict[str, Pose]:
-    numbers = sorted(
-        int(name[4:]) for name in tree if re.fullmatch(r"omc_\d+", name) and f"Tc_{name[4:]}" in tree
-    )
-    poses = {}
-    for k in numbers:
-        om, t = (np.asarray(tree[f"{name}_{k}"], dtype=float).ravel() for name in ("omc", "Tc"))
-        if len(om) == len(t) == 3 and np.isfinite([om, t]).all():  # NaN for images left out
-            poses[f"{k}"] = Pose(from_vector(om), t)
-    return poses
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:

@@ -15,7 +15,7 @@ from neurocal_cli.files.exchange import colmap, dictionary, kalibr, matlab, mrca
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.files.failures import source_of, value_failures
 from neurocal_cli.files.file_storage import parse_tree
-from neurocal_cli.files.files import decode, read_bytes
+from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
