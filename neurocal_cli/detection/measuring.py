@@ -35,17 +35,11 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response, sharp_profile
-from neurocal_cli.detection.fitting.grid_fit import (
-    GridEdges,
-    GridFit,
-    GridImage,
-    fit_grid,
-    fit_grid_vertices,
-    fit_rim,
-)
+from neurocal_cli.detection.fitting.grid_edges import GridEdges, GridImage
+from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_grid, fit_rim
 from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import grid_lines
-from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
 
