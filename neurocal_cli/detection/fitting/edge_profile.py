@@ -136,13 +136,13 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
     size = np.abs(d)
     ramp = np.minimum(size, a - b) / a
     beyond = np.clip(size - (a - b), 0, 2 * b)
-    value = with_sign(ramp + beyond * (4 * b - beyond) * share, d)
+    value = _with_sign(ramp + beyond * (4 * b - beyond) * share, d)
     slope = np.where(size < a + b, (2 * b - beyond) * (2 * share), 0)
     widening = np.zeros_like(d)
     for x, sign in ((d + (a + b), 1), (d + (a - b), -1), (d - (a - b), -1), (d - (a + b), 1)):
         z = x / psf
         e, p = erf_and_density(z)
-        rest = e - with_sign(np.ones_like(x), x)
+        rest = e - _with_sign(np.ones_like(x), x)
         weight = sign * share
         p *= psf
         value += weight * (0.5 * (x * x * rest + psf * psf * e) + x * p)
@@ -208,10 +208,10 @@ def erf_and_density(z: Real) -> tuple[Real, Real]:
     series *= bell
     bell *= _PEAK
     np.subtract(1, series, out=series)
-    return with_sign(series, z), bell
+    return _with_sign(series, z), bell
 
 
-def with_sign(size: Real, of: Real) -> Real:
+def _with_sign(size: Real, of: Real) -> Real:
     """Give a positive array the sign of another, in place, by the sign bit; faster than `numpy.copysign`."""
     kind, sign = _SIGN_BITS[of.dtype.itemsize]
     bits = size.view(kind)

@@ -27,9 +27,9 @@ from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 
-# Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
-# of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them 8 times
-# larger.
+# Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/support/rendered.py).
+# There, half of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them
+# 8 times larger.
 _SLACK = 0.5  # px, added to the strips because lines are not accurate yet
 _FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
 _CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box

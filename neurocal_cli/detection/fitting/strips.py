@@ -143,7 +143,11 @@ def strip_pixels(
     index, inside = packed(inside, used)
     s, d = s.reshape(-1).take(index), d.reshape(-1).take(index)
     u, v = lines.pixels(s, d)
-    return Strips(s, d, _values(image, lines, u, v), inside, u, v, 1 - used / np.maximum(total, 1))
+    place, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
+    row *= image.shape[1]
+    place += row
+    value = image.reshape(-1).take(place, mode="clip").astype(np.float32)  # padding may lie outside
+    return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1))
 
 
 def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
@@ -160,14 +164,6 @@ def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.boo
     inside = (row >= 0) & (row < high[:, :, None])
     inside &= ((column >= 0) & (column < wide))[:, :, None]
     return inside.reshape(len(column), -1)
-
-
-def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> Single:
-    """Image values at pixels (E, N) given relative to the lines' middles; padding may lie outside."""
-    column, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
-    row *= image.shape[1]
-    row += column
-    return image.reshape(-1).take(row, mode="clip").astype(np.float32)
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

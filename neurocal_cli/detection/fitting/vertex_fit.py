@@ -75,7 +75,7 @@ def fit_grid_vertices(
     neighbours = [unknown[1:-1, :-2], unknown[1:-1, 2:], unknown[:-2, 1:-1], unknown[2:, 1:-1]]
     last = np.stack([which[grid_image.grid.seen] for which in neighbours], axis=1).reshape(-1, 2, 2)
     rho = correlation(blur, lines)
-    data = vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, last)
+    data = _vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, last)
     shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
@@ -83,7 +83,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
     fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
-    fit = with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
+    fit = _with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
     if fitted.shifts.used:
         fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
     fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
@@ -127,7 +127,7 @@ class VertexPixels(FitPixels):
     relative: Single  # (V, 2) blur across both lines, relative to their mean
 
 
-def vertex_pixels(
+def _vertex_pixels(
     image: NDArray[np.generic],
     lines: tuple[Lines, Lines],
     light: Array,
@@ -247,7 +247,7 @@ def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, 
     return series, by_z1, by_z2
 
 
-def with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
+def _with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
     """Continue the fits of vertices by a step that also fits gradients of the light, and of the blur.
 
     Gradients that shading and blur of the board do not contain displace a vertex, because opposite squares

@@ -37,9 +37,9 @@ from neurocal_cli.detection.identity.placement import (
     trimmed,
     wrong_size,
 )
-from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board import Board, Plane, is_flat
 
-_FLAT = 1e-6  # greatest ratio of thickness to extent of points in one plane, for rounding errors
+_ROUNDING = 1e-6  # greatest error of a motion that maps the board onto itself, relative to its extent
 _WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by this factor
 
 # tests/test_identity.py accepts and refuses rendered boards with these limits.
@@ -287,7 +287,7 @@ def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
     R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
     t = b - R @ a
     misses = np.abs(first @ R.T + t - second).max()
-    return (R, t) if misses <= _FLAT * max(float(np.ptp(first)), 1e-300) else None
+    return (R, t) if misses <= _ROUNDING * max(float(np.ptp(first)), 1e-300) else None
 
 
 @frozen_dataclass
@@ -320,12 +320,6 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
     if undetermined:
         return CameraFit(rms, 0)
     return CameraFit(rms, int(np.sign(depth[0]) * np.sign(np.linalg.det(P[:, :3]))))
-
-
-def is_flat(world: Array) -> bool:
-    """Whether points (N, 3) lie in one plane."""
-    extents = np.linalg.svd(world - world.mean(axis=0), compute_uv=False)
-    return bool(extents[2] <= _FLAT * extents[0])
 
 
 def _plane_coordinates(world: Array, front: Array | None) -> Array:

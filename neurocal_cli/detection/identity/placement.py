@@ -26,12 +26,11 @@ from neurocal_cli.detection.grid import TURNS, Grid
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.board import Board, Plane
 
-Side = tuple[slice | int, ...]
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 # Sides of a grid, named by their outward directions (c, r).
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
-_SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
+_SIDES: tuple[tuple[slice | int, ...], ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
 _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
 
 # With these limits tests/test_identity.py classifies ends of rendered boards, occluders and image borders.
@@ -128,28 +127,20 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     """
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
-    while not _fits(left, planes):
+    sizes = [sorted((plane.cols, plane.rows)) for plane in planes]
+    while True:
+        short, long = sorted(left.shape)
+        if any(short <= narrow and long <= wide for narrow, wide in sizes):
+            return left
         shares = [float(left.seen[side].mean()) for side in _SIDES]
-        if min(shares) > few or min(left.shape) <= 3:
+        if min(shares) > few or short <= 3:
             return grid
-        left = _without(left, _SIDES[shares.index(min(shares))])
-    return left
-
-
-def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
-    size = sorted(grid.shape)
-    return any(
-        size[0] <= min(plane.cols, plane.rows) and size[1] <= max(plane.cols, plane.rows) for plane in planes
-    )
-
-
-def _without(grid: Grid, side: Side) -> Grid:
-    """Remove the line of a side, and lines that are then empty."""
-    pixels = grid.pixels.copy()
-    pixels[side] = np.nan
-    seen = np.isfinite(pixels[..., 0])
-    (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
-    return Grid(pixels[top : bottom + 1, west : east + 1], int(grid.dark + top + west) % 2)
+        pixels = left.pixels.copy()
+        pixels[_SIDES[shares.index(min(shares))]] = np.nan
+        # This removes the line, and lines beside it that are empty now.
+        seen = np.isfinite(pixels[..., 0])
+        (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
+        left = Grid(pixels[top : bottom + 1, west : east + 1], int(left.dark + top + west) % 2)
 
 
 class End(Enum):
