@@ -71,6 +71,7 @@ def fit_grid_vertices(
     blur = fitted.blur
     (first, spread), (second, _) = (blur.at(line) for line in lines)
     sigma = 0.5 * (first + second)
+    # Ends of the lines, along c and along r, at which no vertex is known.
     unknown = ~np.pad(grid_image.grid.seen, 1)
     neighbours = [unknown[1:-1, :-2], unknown[1:-1, 2:], unknown[:-2, 1:-1], unknown[2:, 1:-1]]
     last = np.stack([which[grid_image.grid.seen] for which in neighbours], axis=1).reshape(-1, 2, 2)
