@@ -5,18 +5,17 @@ Data flows one way, from an image to mid-points with covariances:
 ==========================================  ===========================================================
 Step                                        Module
 ==========================================  ===========================================================
-image -> levels of a pyramid                `finding.levels`
--> saddle points of the brightness          `finding.saddles` (`finding.subpixel`)
--> links along edges -> seeds               `finding.links`
--> growing lattices                         `finding.from_links`, `finding.grow` (`finding.lattice`,
-                                            `finding.predict`, `finding.checks`)
--> grids, one for each plane                `finding.grids` (`finding.folds`, `overlaps`, `straighten`)
--> identity: the board's coordinates        `identity.identify` (`ends`, `placement`, `linear_camera`)
--> edge fits to all pixels nearby           `fitting.grid_fit` (`initial_fit`, `edge_fit`, `edge_profile`,
-                                            `common_parameters`, `fit_quality`)
--> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.map_fit`
--> mid-points or vertices with covariance   `measuring`
--> labelled points of an image              `detect`; of many images `batch`, drawn by `overlay`
+image -> pyramid -> saddle points           `finding.saddles`
+-> links along edges -> seeds of lattices   `finding.links`
+-> growing lattices                         `finding.grow` (`finding.lattice`)
+-> grids, one for each plane                `finding.grids` (`overlaps`, `straighten`, `wide_lens`)
+-> identity: the board's coordinates        `identity.identify` (`identity.placement`)
+-> edge fits to all pixels nearby           `fitting.grid_fit` (`grid_edges`, `initial_fit`,
+                                            `common_parameters`, `edge_fit`, `edge_profile`, `shading`)
+-> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.wide_map`, `fitting.map_fit`
+-> mid-points or vertices with covariance   `measuring` (`fitting.vertex_fit`)
+-> labelled points of an image              `detect`
+-> those of many images, and their pictures `batch`, `overlay`
 ==========================================  ===========================================================
 """
 

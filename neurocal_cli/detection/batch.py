@@ -1,15 +1,11 @@
 """Detect boards in many image files, in one process or several, in the given order.
 
-A folder that caches the outcomes of detection, so that a later run need not repeat it.
+A `DetectionCache` keeps the outcomes, so that a later run need not repeat them. Each image has its own file,
+named after a hash of its bytes, the request, and neurocal's version. The file is written at once, so that an
+interrupted run continues where it stopped.
 
-Each image has its own file, named after a hash of its bytes, the request, and neurocal's version. The file is
-written at once, so that an interrupted run continues where it stopped.
-
-What came of one image file.
-
-Choose frames of a video to measure: sharp ones that differ from each other.
-
-Each short stretch of the video gives its sharpest frame. Frames much less sharp than the median of these are
+`choose_frames` chooses the images to measure from a video: sharp frames that differ from each other. Each
+short stretch of the video gives its sharpest frame. Frames much less sharp than the median of these are
 dropped. The sharpest frame is chosen first, then repeatedly the one that differs most from all chosen so far,
 until the next one would hardly differ. So a board that is held still gives one frame.
 """
@@ -39,11 +35,23 @@ from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.images import Image, encode_png, parse_image
 from neurocal_cli.files.processes import start_worker, usable_cores, work_through
-from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_at_once
 from neurocal_cli.observations.board import Board
+
+_FORMAT = 5  # raised when the same image gives other points than before
+# Of a detection; its grids are not cached, which only its picture needs.
+_FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings")
+_WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
+_KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold
+_STRETCH = 0.25  # seconds; even a shaking hand is still for a moment in it
+_LONGEST = 60  # frames
+_WIDTH = 640  # px; enough to measure sharpness, at less cost
+_THUMB = (48, 36)  # px
+_SHARP = 0.4  # least sharpness, relative to the median of the stretches
+_DIFFERENT = 6.0  # DN rms between thumbnails; the noise of a still camera gives 1 after averaging
 
 
 @frozen_dataclass(eq=False)
@@ -59,85 +67,6 @@ class Outcome:
     shown: tuple[int, int] | None = None
 
 
-_FORMAT = 5  # raised when the same image gives other points than before
-# Of a detection; its grids are not cached, which only its picture needs.
-_FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings")
-
-
-class DetectionCache:
-    """A folder of cached outcomes, created if it does not exist.
-
-    The text of the request differs if the requested detection differs.
-    """
-
-    def __init__(self, folder: str, request: str) -> None:
-        self._folder, self._request = folder, f"{_FORMAT} {__version__} {request}".encode()
-
-    def find(self, image: bytes) -> Outcome | None:
-        """Find the outcome for an image, given the bytes of its file; None if it is not cached."""
-        path = self._path(image)
-        if not os.path.exists(path):
-            return None
-        try:
-            tree = json.loads(read_bytes(path)[0])
-            return Outcome(
-                path="",
-                detection=None if tree["detection"] is None else _detection(tree["detection"]),
-                problem=str(tree["problem"]),
-                notes=tuple(map(str, tree["notes"])),
-                overlay=None if tree["overlay"] is None else b64decode(tree["overlay"]),
-                shown=None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
-            )
-        except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: detect again
-            return None
-
-    def store(self, image: bytes, outcome: Outcome) -> None:
-        """Write an outcome at once, because the outputs that a command holds back are lost if it stops.
-
-        Raises NeurocalError if the folder cannot be written to.
-        """
-        found, overlay = outcome.detection, outcome.overlay
-        tree = {
-            "detection": None if found is None else {name: getattr(found, name) for name in _FIELDS},
-            "problem": outcome.problem,
-            "notes": outcome.notes,
-            "overlay": None if overlay is None else b64encode(overlay).decode(),
-            "shown": outcome.shown,
-        }
-        os.makedirs(self._folder, exist_ok=True)
-        text = json.dumps(tree, default=np.ndarray.tolist)
-        write_at_once(self._path(image), text + "\n")
-
-    def _path(self, image: bytes) -> str:
-        return os.path.join(self._folder, f"{hashlib.sha256(self._request + image).hexdigest()}.json")
-
-
-def _detection(tree: dict[str, Any]) -> Detection:
-    ids = tuple(map(str, tree["ids"]))
-    width, height = tree["image_size"]
-    return Detection(
-        ids=ids,
-        world=_array(tree["world"], len(ids), 3),
-        pixels=_array(tree["pixels"], len(ids), 2),
-        covariance=_array(tree["covariance"], len(ids), 3),
-        across=None if tree["across"] is None else _array(tree["across"], len(ids), 2),
-        image_size=(int(width), int(height)),
-        rejected=int(tree["rejected"]),
-        warnings=tuple(map(str, tree["warnings"])),
-    )
-
-
-def _array(values: Any, rows: int, columns: int) -> Array:
-    array = np.array(values, dtype=float)
-    if array.shape != (rows, columns) or not np.isfinite(array).all():
-        raise ValueError("a table of another size")
-    return array
-
-
-_WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
-_KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold
-
-
 @frozen_dataclass
 class DetectionOptions:
     """Options of a detection; `points` and `gamma` are those of `detect_points`."""
@@ -150,17 +79,17 @@ class DetectionOptions:
     cache: DetectionCache | None = None  # outcomes of earlier runs; new ones are added
 
 
-def default_jobs(images: int) -> int:
-    """Default number of processes for a number of images."""
-    return max(1, min(usable_cores(), images // _WORTH_A_PROCESS))
-
-
 def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
     """Detect boards in image files with any number of processes, in the order of the paths."""
     jobs = min(jobs, len(paths))
     if jobs <= 1:
         retain_freed_memory()
     yield from work_through(partial(detect_file, options=options), paths, jobs, _start_worker)
+
+
+def default_jobs(images: int) -> int:
+    """Default number of processes for a number of images."""
+    return max(1, min(usable_cores(), images // _WORTH_A_PROCESS))
 
 
 def detect_file(path: str, options: DetectionOptions) -> Outcome:
@@ -246,21 +175,74 @@ def _start_worker() -> None:
     retain_freed_memory()
 
 
-_STRETCH = 0.25  # seconds; even a shaking hand is still for a moment in it
-_LONGEST = 60  # frames
-_WIDTH = 640  # px; enough to measure sharpness, at less cost
-_THUMB = (48, 36)  # px
-_SHARP = 0.4  # least sharpness, relative to the median of the stretches
-_DIFFERENT = 6.0  # DN rms between thumbnails; the noise of a still camera gives 1 after averaging
+class DetectionCache:
+    """A folder of cached outcomes, created if it does not exist.
+
+    The text of the request differs if the requested detection differs.
+    """
+
+    def __init__(self, folder: str, request: str) -> None:
+        self._folder, self._request = folder, f"{_FORMAT} {__version__} {request}".encode()
+
+    def find(self, image: bytes) -> Outcome | None:
+        """Find the outcome for an image, given the bytes of its file; None if it is not cached."""
+        path = self._path(image)
+        if not os.path.exists(path):
+            return None
+        try:
+            tree = json.loads(read_bytes(path)[0])
+            return Outcome(
+                path="",
+                detection=None if tree["detection"] is None else _detection(tree["detection"]),
+                problem=str(tree["problem"]),
+                notes=tuple(map(str, tree["notes"])),
+                overlay=None if tree["overlay"] is None else b64decode(tree["overlay"]),
+                shown=None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
+            )
+        except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: detect again
+            return None
+
+    def store(self, image: bytes, outcome: Outcome) -> None:
+        """Write an outcome at once, because the outputs that a command holds back are lost if it stops.
+
+        Raises NeurocalError if the folder cannot be written to.
+        """
+        found, overlay = outcome.detection, outcome.overlay
+        tree = {
+            "detection": None if found is None else {name: getattr(found, name) for name in _FIELDS},
+            "problem": outcome.problem,
+            "notes": outcome.notes,
+            "overlay": None if overlay is None else b64encode(overlay).decode(),
+            "shown": outcome.shown,
+        }
+        os.makedirs(self._folder, exist_ok=True)
+        text = json.dumps(tree, default=np.ndarray.tolist)
+        write_at_once(self._path(image), text + "\n")
+
+    def _path(self, image: bytes) -> str:
+        return os.path.join(self._folder, f"{hashlib.sha256(self._request + image).hexdigest()}.json")
 
 
-@frozen_dataclass(eq=False)
-class _Frame:
-    """A frame of a video."""
+def _detection(tree: dict[str, Any]) -> Detection:
+    ids = tuple(map(str, tree["ids"]))
+    width, height = tree["image_size"]
+    return Detection(
+        ids=ids,
+        world=_array(tree["world"], len(ids), 3),
+        pixels=_array(tree["pixels"], len(ids), 2),
+        covariance=_array(tree["covariance"], len(ids), 3),
+        across=None if tree["across"] is None else _array(tree["across"], len(ids), 2),
+        image_size=(int(width), int(height)),
+        rejected=int(tree["rejected"]),
+        warnings=tuple(map(str, tree["warnings"])),
+    )
 
-    number: int
-    sharpness: float
-    thumb: Array
+
+def _array(values: Any, rows: int, columns: int) -> Array:
+    array = np.array(values, dtype=float)
+    if array.shape != (rows, columns) or not np.isfinite(array).all():
+        raise ValueError("a table of another size")
+    return array
 
 
 def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 30.0) -> list[int]:
@@ -270,7 +252,7 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 
     stretch.
     """
     length = int(np.clip(round(_STRETCH * rate), 1, _LONGEST))
-    seen = (_seen(number, grey) for number, grey in enumerate(frames))
+    seen = (_Frame.of(number, grey) for number, grey in enumerate(frames))
     stretches = groupby(seen, key=lambda frame: frame.number // length)
     best = [max(stretch, key=lambda frame: frame.sharpness) for _, stretch in stretches]
     if not best:
@@ -286,12 +268,23 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 
     return sorted(sharp[k].number for k in chosen)
 
 
-def _seen(number: int, grey: NDArray[np.uint8]) -> _Frame:
-    height, width = grey.shape
-    factor = min(1.0, _WIDTH / width)
-    small = cv2.resize(grey, (round(factor * width), round(factor * height)), interpolation=cv2.INTER_AREA)
-    thumb = cv2.resize(small, _THUMB, interpolation=cv2.INTER_AREA).astype(float)
-    return _Frame(number, float(cv2.Laplacian(small, cv2.CV_32F).var()), thumb)
+@frozen_dataclass(eq=False)
+class _Frame:
+    """A frame of a video."""
+
+    number: int
+    sharpness: float
+    thumb: Array
+
+    @classmethod
+    def of(cls, number: int, grey: NDArray[np.uint8]) -> _Frame:
+        """Judge a grey frame by a smaller picture of it."""
+        height, width = grey.shape
+        factor = min(1.0, _WIDTH / width)
+        size = round(factor * width), round(factor * height)
+        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        thumb = cv2.resize(small, _THUMB, interpolation=cv2.INTER_AREA).astype(float)
+        return cls(number, float(cv2.Laplacian(small, cv2.CV_32F).var()), thumb)
 
 
 def _distance(thumbs: Array, one: Array) -> Array:

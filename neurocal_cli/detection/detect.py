@@ -14,7 +14,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
-from neurocal_cli.detection.identity.identify import Identified, Located, identify
+from neurocal_cli.detection.identity.identify import Located, identify
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
@@ -124,11 +124,20 @@ def detect_points(
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError("some pixels of the image are not finite numbers; replace them, for example by 0")
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
-    identified = _identified(board, found, image)
+    try:
+        identified = identify(board, found, image)
+    except NoBoardError as error:
+        other = other_target(image)
+        if other:
+            raise NoBoardError(other) from error
+        raise
     located = identified.located
     measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
+    count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
+    if count < _FEWEST:
+        share = f"{count} of {count + rejected} points"
+        raise NoBoardError(f"only {share} of the board can be measured; take a sharper or nearer image")
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
-    _check_enough(measured)
     orders = [one.order for one in labels]
 
     def joined(parts: Iterable[Array]) -> Array:
@@ -141,33 +150,16 @@ def detect_points(
         joined(one.covariance for one in measured),
         None if points == "vertices" else joined(_directions(one) for one in measured),
         (image.shape[1], image.shape[0]),
-        sum(one.rejected for one in measured),
+        rejected,
         identified.warnings,
         located,
         measured,
     )
 
 
-def _identified(board: Board, grids: list[Grid], image: NDArray[np.generic]) -> Identified:
-    try:
-        return identify(board, grids, image)
-    except NoBoardError as error:
-        other = other_target(image)
-        if other:
-            raise NoBoardError(other) from error
-        raise
-
-
 def wanted_sizes(board: Board) -> list[tuple[int, int]]:
     """Size of a single-plane board, for `find_grids`; empty for several planes."""
     return [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
-
-
-def _check_enough(measured: Iterable[Measured]) -> None:
-    found, rejected = np.sum([(len(one.kind), one.rejected) for one in measured], axis=0)
-    if found < _FEWEST:
-        share = f"{found} of {found + rejected} points"
-        raise NoBoardError(f"only {share} of the board can be measured; take a sharper or nearer image")
 
 
 def _directions(measured: Measured) -> Array:
@@ -211,6 +203,12 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
                 f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; run detect "
                 "for each camera separately"
             )
+    across = None
+    if any(one.across is not None for one in found):
+        # Vertices have no direction.
+        across = np.concatenate(
+            [np.zeros((len(one.ids), 2)) if one.across is None else one.across for one in found]
+        )
     return Correspondences(
         np.concatenate([one.world for one in found]),
         np.concatenate([one.pixels for one in found]),
@@ -218,16 +216,7 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
         image_size=found[0].image_size,
         point=np.array([name for one in found for name in one.ids]),
         covariance=np.concatenate([one.covariance for one in found]),
-        across=_all_directions(found),
+        across=across,
         unit=unit,
         source="detected points",
-    )
-
-
-def _all_directions(found: list[Detection]) -> Array | None:
-    """Measured directions of the points of all images; (0, 0) for vertices."""
-    if all(one.across is None for one in found):
-        return None
-    return np.concatenate(
-        [np.zeros((len(one.ids), 2)) if one.across is None else one.across for one in found]
     )

@@ -25,12 +25,13 @@ def other_target(grey: NDArray[np.generic]) -> str:
     small = _small(grey)
     if _shows_markers(small):
         return f"the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; {_WANTED}"
-    if _shows_circles(small):
+    if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
         return f"the image shows a grid of circles, no chessboard; {_WANTED}"
     return ""
 
 
 def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Reduce a large image, to 8 bits as well."""
     scale = min(1.0, _LONGEST / max(grey.shape))
     if scale < 1:
         size = [max(1, round(scale * length)) for length in grey.shape[::-1]]
@@ -55,14 +56,8 @@ def _shows_markers(grey: NDArray[np.uint8]) -> bool:
     return False
 
 
-def _shows_circles(grey: NDArray[np.uint8]) -> bool:
-    if grey.size < _CIRCLES * _OUTLINE:
-        return False
-    return any(_is_grid(image) for image in (grey, 255 - grey))
-
-
-def _is_grid(image: NDArray[np.uint8]) -> bool:
-    """Whether there are enough dark ellipses of similar size, evenly spaced and sharp."""
+def _shows_circles(image: NDArray[np.uint8]) -> bool:
+    """Whether an image shows enough dark ellipses of similar size, evenly spaced and sharp."""
     level, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     darkest, brightest = np.quantile(image, [0.02, 0.98])
     found = _ellipses(image, level)

@@ -45,17 +45,24 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
     square = min(one.grid.square for one in detection.located)
-    scale = _enlargement(lengths, square)
+    typical = max(float(np.median(lengths)), 1e-9)
+    scale = max((scale for scale in _SCALES if scale * typical <= _ARROW * square), default=1)
+    pairs = zip(detection.located, detection.measured, strict=True)
+    kinds = [label(located, measured).kind for located, measured in pairs]
+    every = np.concatenate(kinds)
+    counts = [f"{name} ({n})" for kind, name in _KINDS.items() if (n := np.count_nonzero(every == kind))]
+    offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
     lines = [
         f"{len(detection.ids)} points, {detection.rejected} rejected; residuals x {scale}: rms "
         f"{np.sqrt((lengths**2).mean()):.3g} px, largest {lengths.max():.3g} px",
-        _legend(detection),
+        f"{', '.join(counts)}; edges displaced by {offsets} px before correction",
     ]
     canvas = _Canvas(grey, lines)
-    for located, measured, residual in zip(detection.located, detection.measured, residuals, strict=True):
+    grids = zip(detection.located, detection.measured, residuals, kinds, strict=True)
+    for located, measured, residual, kinds_of in grids:
         for pixel, arrow in zip(measured.pixels, residual * scale, strict=True):
             canvas.line(pixel, pixel + arrow, _RESIDUAL)
-        for pixel, kind in zip(measured.pixels, label(located, measured).kind.tolist(), strict=True):
+        for pixel, kind in zip(measured.pixels, kinds_of.tolist(), strict=True):
             canvas.cross(pixel, _COLOURS[kind])
         _draw_frame(canvas, located, measured)
     return canvas.picture
@@ -85,19 +92,6 @@ def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
         canvas.circle(at[0, 0], _WHITE)
     for key in sorted({min(at, key=lambda p: p[0] * a + p[1] * b) for a in (-1, 1) for b in (-1, 1)}):
         canvas.text(at[key], f"{located.plane.prefix}{key[0]}:{key[1]}", _WHITE)
-
-
-def _legend(detection: Detection) -> str:
-    pairs = zip(detection.located, detection.measured, strict=True)
-    every = np.concatenate([label(located, measured).kind for located, measured in pairs])
-    kinds = [f"{name} ({n})" for kind, name in _KINDS.items() if (n := np.count_nonzero(every == kind))]
-    offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
-    return f"{', '.join(kinds)}; edges displaced by {offsets} px before correction"
-
-
-def _enlargement(lengths: Array, square: float) -> int:
-    typical = max(float(np.median(lengths)), 1e-9)
-    return max((scale for scale in _SCALES if scale * typical <= _ARROW * square), default=1)
 
 
 class _Canvas:

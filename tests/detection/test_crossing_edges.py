@@ -17,7 +17,8 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.detect import Detection, detect_points
-from neurocal_cli.detection.fitting.grid_fit import GridEdges, GridImage, fit_grid
+from neurocal_cli.detection.fitting.grid_edges import GridEdges, GridImage
+from neurocal_cli.detection.fitting.grid_fit import fit_grid
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.wide_map import WideMap
 from neurocal_cli.detection.measuring import edges_served, positions_along_edges

@@ -35,6 +35,8 @@ from neurocal_cli.detection.finding.saddles import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
 
+Size = tuple[int, int]
+
 # Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless nothing
 # has been found yet. Chosen for speed: tests/benchmarks/test_detection_speed.py.
 _SEARCHED = 1.4e6
@@ -45,8 +47,6 @@ _MOST_SEARCHED = 30_000_000
 _TRIES, _TRIES_2X3 = 8, 4
 _UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
 _BEHIND = 3.0  # ratio of the squares' sizes above which a second board is not searched
-
-Size = tuple[int, int]
 
 
 def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list[Grid]:
@@ -60,9 +60,14 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     clutter and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
-    levels = levels_of(image)
-    lattices = _find(levels, wanted)
+    lattices = _find(levels_of(image), wanted)
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+
+
+def _area(pixels: Array) -> float:
+    """Area of all complete squares [px^2]."""
+    p, q = pixels[1:, 1:] - pixels[:-1, :-1], pixels[1:, :-1] - pixels[:-1, 1:]
+    return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
 
 
 def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) -> list[Lattice]:
@@ -130,33 +135,12 @@ def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
             # A vertex removed near the fold may belong to one of the planes.
             planes = [remove_outliers(level, grow(level, x, outwards=False)) for x in planes]
         result += [x for x in planes if has_block(x) and is_smooth(level, x)]
-    filled = (_fill_gaps(level, x) for x in merge_lattices(drop_duplicates(result)))
+    # Gaps are searched for missing vertices, including those behind a missing neighbour.
+    filled = (
+        x if x.seen.all() else remove_outliers(level, grow(level, x, outwards=False, reach=2))
+        for x in merge_lattices(drop_duplicates(result))
+    )
     return [x for x in filled if has_block(x)]
-
-
-def _fill_gaps(level: Level, lattice: Lattice) -> Lattice:
-    """Search for missing vertices, including those behind a missing neighbour."""
-    if lattice.seen.all():
-        return lattice
-    return remove_outliers(level, grow(level, lattice, outwards=False, reach=2))
-
-
-def _area(pixels: Array) -> float:
-    """Area of all complete squares [px^2]."""
-    p, q = pixels[1:, 1:] - pixels[:-1, :-1], pixels[1:, :-1] - pixels[:-1, 1:]
-    return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
-
-
-def _nearest_whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
-    """Largest width of the squares [px] among complete grids of a wanted size; 0 if there is none."""
-    widths = (x.width for x in lattices if x.contrast.shape in wanted and x.seen.all())
-    return max(widths, default=0.0)
-
-
-def _sides(points: Array) -> Array:
-    """(S,) longest sides of the squares in blocks of points (S, R, C, 2) [px]."""
-    along, down = points[:, :, 1:] - points[:, :, :-1], points[:, 1:] - points[:, :-1]
-    return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
 
 
 def _find_new(level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size]) -> list[Lattice]:
@@ -222,6 +206,23 @@ def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     return found
 
 
+def _boards(lattice: Lattice) -> list[Lattice]:
+    """Connected parts of a lattice with a block of 3 x 3 vertices."""
+    return [part for part in lattice.connected_parts() if has_block(part)]
+
+
+def _nearest_whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
+    """Largest width of the squares [px] among complete grids of a wanted size; 0 if there is none."""
+    widths = (x.width for x in lattices if x.contrast.shape in wanted and x.seen.all())
+    return max(widths, default=0.0)
+
+
+def _sides(points: Array) -> Array:
+    """(S,) longest sides of the squares in blocks of points (S, R, C, 2) [px]."""
+    along, down = points[:, :, 1:] - points[:, :, :-1], points[:, 1:] - points[:, :-1]
+    return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
+
+
 def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
     """Mask of the squares of grids, with a margin around them."""
     mask = np.zeros(level.image.shape, dtype=np.uint8)
@@ -234,8 +235,3 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
         cv2.fillPoly(mask, list(whole), 255)
         cv2.polylines(mask, list(whole), True, 255, thickness)
     return mask
-
-
-def _boards(lattice: Lattice) -> list[Lattice]:
-    """Connected parts of a lattice with a block of 3 x 3 vertices."""
-    return [part for part in lattice.connected_parts() if has_block(part)]

@@ -4,10 +4,9 @@ The blocks are the seeds of grids. An edge that leaves a vertex at a port follow
 next vertex at a port preceded by a dark sector. So along a line of the board, each edge connects an even with
 an odd port.
 
-A shortcut for growth: build most of a grid at once, by following links from vertex to vertex.
-
-The lattice is accepted only if every vertex passes the tests of `grow`. Growing layer by layer gives the same
-result more slowly.
+`lattice_from_links` is a shortcut for growth: it builds most of a grid at once, by following links from
+vertex to vertex. The lattice is accepted only if every vertex passes the tests of `grow`. Growing layer by
+layer gives the same result more slowly.
 """
 
 from __future__ import annotations
@@ -26,7 +25,8 @@ from neurocal_cli.detection.finding.overlaps import largest_second_difference, s
 from neurocal_cli.detection.finding.saddles import Level, Saddles, find_saddles, interpolate, refine_saddles
 
 # Steps (c, r) from a vertex to its neighbours, at the port along c and at the next ports.
-STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+_STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
 _FEWEST = 9  # saddles, for 3 x 3 vertices
 # Insensitive; tests/test_finding.py.
 _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
@@ -35,6 +35,13 @@ _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within t
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... or greatest second difference times this weight
+# Insensitive: a lattice rejected here is grown instead, which only costs time
+# (tests/benchmarks/test_detection_speed.py).
+_NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
+_FEWEST_AT_ONCE = 12  # vertices; smaller lattices are grown from the seed
+_ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
+_MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
+_WHOLE = 0.5  # least share of linked vertices in an outer line; links beyond the board are wrong
 
 
 @frozen_dataclass(eq=False)
@@ -135,7 +142,7 @@ def find_seeds_3x3(links: Links) -> Index:
     centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
     block[:, 1, 1] = centre
-    for p, (c, r) in enumerate(STEPS):
+    for p, (c, r) in enumerate(_STEPS):
         block[:, 1 + r, 1 + c] = links.to[centre, p]
         # The vertex between ports p and p + 1: from the neighbour, through the port before the entry.
         corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
@@ -144,44 +151,6 @@ def find_seeds_3x3(links: Links) -> Index:
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")
     return block[order[irregularity[order] < _IRREGULAR]]
-
-
-def whole_blocks(links: Links) -> Index:
-    """Saddles (S,) with four closed squares around them."""
-    return np.flatnonzero(_closed(links).all(axis=1))
-
-
-def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
-    """Find blocks of two closed squares side by side, the most regular first.
-
-    Returns saddles (S, 2, 3), and whether each block is dark (S,) as in `Lattice`.
-    """
-    closed = _closed(links)
-    middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
-    right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
-    # The outer vertices of the first and the second square.
-    corner = links.to[right, (links.port[middle, p] - 1) % 4]
-    other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
-    block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
-    grid = links.saddles.points[block]
-    c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
-    second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
-    irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)
-    order = np.argsort(irregularity, kind="stable")
-    return block[order], (p[order] + 1) % 2
-
-
-def _closed(links: Links) -> NDArray[np.bool_]:
-    """(N, 4) whether four links, starting at port p, lead around a square and back to port p + 1."""
-    count = len(links.to)
-    at = np.repeat(np.arange(count)[:, None], 4, axis=1)
-    port = np.repeat(np.arange(4)[None], count, axis=0)
-    alive = np.ones((count, 4), dtype=bool)
-    for _ in range(4):
-        alive &= links.to[at, port] >= 0
-        at, port = links.to[at, port], (links.port[at, port] - 1) % 4
-    home = np.arange(count)[:, None]
-    return alive & (at == home) & (port == np.arange(4)[None])
 
 
 def _irregularity(grid: Array) -> Array:
@@ -206,13 +175,42 @@ def _irregularity(grid: Array) -> Array:
     return worst
 
 
-# Insensitive: a lattice rejected here is grown instead, which only costs time
-# (tests/benchmarks/test_detection_speed.py).
-_NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
-_FEWEST_AT_ONCE = 12  # vertices; smaller lattices are grown from the seed
-_ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
-_MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
-_WHOLE = 0.5  # least share of linked vertices in an outer line; links beyond the board are wrong
+def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
+    """Find blocks of two closed squares side by side, the most regular first.
+
+    Returns saddles (S, 2, 3), and whether each block is dark (S,) as in `Lattice`.
+    """
+    closed = _closed(links)
+    middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
+    right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
+    # The outer vertices of the first and the second square.
+    corner = links.to[right, (links.port[middle, p] - 1) % 4]
+    other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
+    block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
+    grid = links.saddles.points[block]
+    c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
+    second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
+    irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)
+    order = np.argsort(irregularity, kind="stable")
+    return block[order], (p[order] + 1) % 2
+
+
+def whole_blocks(links: Links) -> Index:
+    """Saddles (S,) with four closed squares around them."""
+    return np.flatnonzero(_closed(links).all(axis=1))
+
+
+def _closed(links: Links) -> NDArray[np.bool_]:
+    """(N, 4) whether four links, starting at port p, lead around a square and back to port p + 1."""
+    count = len(links.to)
+    at = np.repeat(np.arange(count)[:, None], 4, axis=1)
+    port = np.repeat(np.arange(4)[None], count, axis=0)
+    alive = np.ones((count, 4), dtype=bool)
+    for _ in range(4):
+        alive &= links.to[at, port] >= 0
+        at, port = links.to[at, port], (links.port[at, port] - 1) % 4
+    home = np.arange(count)[:, None]
+    return alive & (at == home) & (port == np.arange(4)[None])
 
 
 def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[np.bool_]) -> Lattice | None:
@@ -247,22 +245,6 @@ def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[n
     return None
 
 
-def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
-    """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares."""
-    place, member = _follow(links, middle, [False] * len(links.to))
-    place -= place.min(axis=0)
-    seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
-    seen[tuple(place.T)] = True
-    kept = in_whole_square(seen)[tuple(place.T)]
-    return place[kept], member[kept]
-
-
-def _with(parts: list[Lattice], point: Array) -> Lattice | None:
-    """The lattice with a vertex at a point [px]."""
-    near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
-    return next(near, None)
-
-
 def _lattice(saddles: Saddles, place: Index, member: Index) -> Lattice:
     """Make a lattice of saddles by their places (c, r), without incomplete squares and sparse outer lines."""
     left, top = place.min(axis=0)
@@ -279,6 +261,22 @@ def _lattice(saddles: Saddles, place: Index, member: Index) -> Lattice:
     return Lattice(pixels, contrast, int(left + top) % 2).cropped()
 
 
+def _with(parts: list[Lattice], point: Array) -> Lattice | None:
+    """The lattice with a vertex at a point [px]."""
+    near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
+    return next(near, None)
+
+
+def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
+    """Places (N, 2) and saddles (N,) reached by links from a saddle, as far as they form whole squares."""
+    place, member = _follow(links, middle, [False] * len(links.to))
+    place -= place.min(axis=0)
+    seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
+    seen[tuple(place.T)] = True
+    kept = in_whole_square(seen)[tuple(place.T)]
+    return place[kept], member[kept]
+
+
 def _follow(links: Links, middle: int, taken: list[bool]) -> tuple[Index, Index]:
     """Places (N, 2) relative to the middle saddle, and saddles (N,) there, by a breadth-first search."""
     to, entry = links.lists
@@ -287,7 +285,7 @@ def _follow(links: Links, middle: int, taken: list[bool]) -> tuple[Index, Index]
     while waiting:
         c, r = waiting.popleft()
         saddle = places[c, r]
-        for turn, (dc, dr) in enumerate(STEPS):
+        for turn, (dc, dr) in enumerate(_STEPS):
             port = (along[saddle] + turn) % 4
             neighbour, there = to[saddle][port], (c + dc, r + dr)
             if neighbour < 0 or taken[neighbour] or there in places or neighbour in along:

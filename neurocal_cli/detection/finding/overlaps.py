@@ -1,9 +1,7 @@
-"""Let each vertex belong to one lattice, and each board have one lattice.
+"""Let each vertex belong to one lattice, each board have one lattice, and each lattice cover one plane.
 
 Copies of a lattice and rows beyond a fold are removed; the parts of a board that an occluder divides are
-joined.
-
-Split a lattice that covers two planes at the fold between them.
+joined; and a lattice that covers two planes is split at the fold between them (`split_at_folds`).
 
 Along a line of vertices on one plane, second differences change slowly, for any tilt and lens distortion. At
 a fold they jump: at one vertex if the fold goes through it, otherwise at the two vertices beside it.
@@ -32,6 +30,22 @@ _BESIDE = 2.0  # squares; lattices farther apart share no vertices
 _NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
 _LEAST = 4  # least number of vertices compared
+# Pairs of the least second difference of a fold [squares] and its least ratio to those of distant rows,
+# because paper is not flat either. Insensitive, like all that follow; FOLDED and WHOLE in
+# tests/test_finding.py repeat this.
+_FOLDS = ((0.13, 4.0), (0.06, 12.0))
+_VERTEX_ERROR = 0.2  # px, added for the errors of the vertices
+_UNKNOWN = 0.03  # squares; second difference assumed if there are no distant rows
+_LEAST_ROWS = 4
+_BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
+_ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
+_ALIKE = 2.0  # more than 1.4, so that independent errors (means of two are 1.4 times smaller) are not limited
+_OUTERMOST = (
+    (np.s_[0, :], np.s_[1, :]),
+    (np.s_[-1, :], np.s_[-2, :]),
+    (np.s_[:, 0], np.s_[:, 1]),
+    (np.s_[:, -1], np.s_[:, -2]),
+)
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
@@ -49,19 +63,14 @@ def any_overlap(lattices: list[Lattice]) -> bool:
     """Whether any two lattices are near enough to share vertices."""
     boxes = []
     for lattice in lattices:
-        points, room = lattice.pixels[lattice.seen], _BESIDE * _longest(lattice)
+        p, points = lattice.pixels, lattice.pixels[lattice.seen]
+        sides = np.concatenate([np.diff(p, axis=0).reshape(-1, 2), np.diff(p, axis=1).reshape(-1, 2)])
+        room = _BESIDE * float(np.nanmax(np.hypot(*sides.T)))
         boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
     return any(
         bool(((low <= other_high) & (other_low <= high)).all())
         for (low, high), (other_low, other_high) in combinations(boxes, 2)
     )
-
-
-def _longest(lattice: Lattice) -> float:
-    """Longest side of a square [px]."""
-    p = lattice.pixels
-    sides = np.concatenate([np.diff(p, axis=0).reshape(-1, 2), np.diff(p, axis=1).reshape(-1, 2)])
-    return float(np.nanmax(np.hypot(*sides.T)))
 
 
 def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
@@ -89,6 +98,7 @@ def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
 
 
 def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
+    """Remove the outermost rows that lie on another lattice, whose `_vertices_and_next` is `place`."""
     points, width = place
     seen = lattice.seen
     away = np.full(seen.shape, np.inf)
@@ -103,14 +113,6 @@ def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
     if not drop.any():
         return lattice
     return lattice.subset(seen & ~drop)
-
-
-_OUTERMOST = (
-    (np.s_[0, :], np.s_[1, :]),
-    (np.s_[-1, :], np.s_[-2, :]),
-    (np.s_[:, 0], np.s_[:, 1]),
-    (np.s_[:, -1], np.s_[:, -2]),
-)
 
 
 def distance(points: Array, others: Array) -> Array:
@@ -138,6 +140,7 @@ def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:
 
 
 def _union(large: Lattice, small: Lattice) -> Lattice | None:
+    """Join two parts of one board; None if their grids do not agree, or share a vertex."""
     motion = _motion(large, small)
     if motion is None or _motion(small, large) is None:
         return None
@@ -201,18 +204,6 @@ def _continued(base: Lattice, other: Lattice) -> Array:
     depth = ahead[:, 2] * side
     depth = np.where(depth > 1e-9, depth, np.nan)
     return np.asarray(ahead[:, :2] * side / depth[:, None])
-
-
-# Pairs of the least second difference of a fold [squares] and its least ratio to those of distant rows,
-# because paper is not flat either. Insensitive, like all constants here; FOLDED and WHOLE in
-# tests/test_finding.py repeat this.
-_FOLDS = ((0.13, 4.0), (0.06, 12.0))
-_VERTEX_ERROR = 0.2  # px, added for the errors of the vertices
-_UNKNOWN = 0.03  # squares; second difference assumed if there are no distant rows
-_LEAST_ROWS = 4
-_BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
-_ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
-_ALIKE = 2.0  # more than 1.4, so that independent errors (means of two are 1.4 times smaller) are not limited
 
 
 def split_at_folds(lattice: Lattice) -> list[Lattice]:

@@ -47,36 +47,6 @@ _STRAY = 3.0  # median distances from the middle; farther saddles are ignored
 _MOST_COVERED = 0.25  # greatest share of the image that the saddles may cover
 
 
-@frozen_dataclass(eq=False)
-class PlaneView:
-    """A view perpendicular to a plane, sampled from the image through the fitted lens."""
-
-    fit: WideFit
-    square: float  # [px] side of a square in the view
-    first: Array  # (2,) [squares] grid coordinates of the view's first pixel
-    size: tuple[int, int]  # (width, height) [px]
-
-    @classmethod
-    def of(cls, fit: WideFit, places: Array) -> PlaneView:
-        """Choose the view that shows places (N, 2) of the plane and their surroundings."""
-        low, high = places.min(axis=0), places.max(axis=0)
-        around = np.maximum(_AROUND * (high - low), _LEAST_AROUND)
-        extent = high - low + 2 * around
-        square = min(_SQUARE, float(np.sqrt(_MOST_PIXELS / extent.prod())))
-        width, height = np.ceil(square * extent).astype(int).tolist()
-        return cls(fit, square, low - around, (width, height))
-
-    def back(self, points: Array) -> Array:
-        """Map points (..., 2) of the view to the image [px]."""
-        return self.fit.at(self.first + points / self.square)
-
-    def seen(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Sample the view from the image."""
-        width, height = self.size
-        v, u = np.mgrid[0:height, 0:width].astype(float)
-        return interpolate(image, self.back(np.stack([u, v], axis=-1))).astype(np.float32)
-
-
 def any_left(links: Links, known: list[Lattice]) -> bool:
     """Whether linked saddles outside all lattices form a block, or a line beside a lattice."""
     saddles = links.saddles
@@ -173,6 +143,36 @@ def _widths(fit: WideFit, places: Array) -> Array:
     return np.sqrt(np.maximum(np.abs(c[:, 0] * r[:, 1] - c[:, 1] * r[:, 0]), 1e-6))
 
 
+@frozen_dataclass(eq=False)
+class PlaneView:
+    """A view perpendicular to a plane, sampled from the image through the fitted lens."""
+
+    fit: WideFit
+    square: float  # [px] side of a square in the view
+    first: Array  # (2,) [squares] grid coordinates of the view's first pixel
+    size: tuple[int, int]  # (width, height) [px]
+
+    @classmethod
+    def of(cls, fit: WideFit, places: Array) -> PlaneView:
+        """Choose the view that shows places (N, 2) of the plane and their surroundings."""
+        low, high = places.min(axis=0), places.max(axis=0)
+        around = np.maximum(_AROUND * (high - low), _LEAST_AROUND)
+        extent = high - low + 2 * around
+        square = min(_SQUARE, float(np.sqrt(_MOST_PIXELS / extent.prod())))
+        width, height = np.ceil(square * extent).astype(int).tolist()
+        return cls(fit, square, low - around, (width, height))
+
+    def back(self, points: Array) -> Array:
+        """Map points (..., 2) of the view to the image [px]."""
+        return self.fit.at(self.first + points / self.square)
+
+    def seen(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Sample the view from the image."""
+        width, height = self.size
+        v, u = np.mgrid[0:height, 0:width].astype(float)
+        return interpolate(image, self.back(np.stack([u, v], axis=-1))).astype(np.float32)
+
+
 def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice:
     """Map a lattice of the view to the level, without vertices outside the level."""
     pixels = view.back(lattice.pixels)
@@ -203,18 +203,6 @@ def refined(level: Level, lattice: Lattice, sigma: Array | float, most: float) -
     return replace(lattice, pixels=pixels)
 
 
-@frozen_dataclass(eq=False)
-class Stretched:
-    """A part of a level, stretched, with its own pixel coordinates."""
-
-    level: Level
-    forth: Array  # (2, 3) affine map from pixels of the original to those of the part
-
-    def back(self, points: Array) -> Array:
-        """Map points (..., 2) of the part to the original [px]."""
-        return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
-
-
 def stretch(level: Level, saddles: Array) -> Stretched | None:
     """Stretch the surroundings of saddles (N, 2) [px] across the direction of most edges.
 
@@ -241,3 +229,15 @@ def stretch(level: Level, saddles: Array) -> Stretched | None:
     forth = np.concatenate([turn, shift[:, None]], axis=1)
     part = cv2.warpAffine(level.image, forth, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return Stretched(Level(np.asarray(part, dtype=np.float32), 1), forth)
+
+
+@frozen_dataclass(eq=False)
+class Stretched:
+    """A part of a level, stretched, with its own pixel coordinates."""
+
+    level: Level
+    forth: Array  # (2, 3) affine map from pixels of the original to those of the part
+
+    def back(self, points: Array) -> Array:
+        """Map points (..., 2) of the part to the original [px]."""
+        return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)

@@ -1,11 +1,10 @@
-"""Estimate the common parameters of a board's edges for the next fits: noise, profile shape, blur, levels.
+"""Common parameters of a board's edges, estimated for the next fits: noise, profile, blur, levels, shifts.
 
-Shifts of edges towards the light side, which alternate from square to square.
-
-A nonlinear response shifts an edge in proportion to its blur, by a share that depends on its levels. The
-shift is the same for all edges if blur, light and response are. Motion blurs edges of one direction more than
-others, haze and glare change the levels, and the tone mapping of phones changes the response over the image.
-The terms of the shift that the edges of a board require are unknowns of its map:
+A nonlinear response shifts an edge towards the light or the dark side, so the shifts alternate from square to
+square. They are in proportion to the blur, by a share that depends on the edge's levels. The shift is the
+same for all edges if blur, light and response are. Motion blurs edges of one direction more than others, haze
+and glare change the levels, and the tone mapping of phones changes the response over the image. The terms of
+the shift that the edges of a board require (`EdgeShifts`) are unknowns of its map:
 
     shift = c_0 + c_1 (s - 1) + s (c_2 A + c_3 B) + s (c_4 x + c_5 y + c_6 x^2 + c_7 x y + c_8 y^2)
 
@@ -44,8 +43,9 @@ from neurocal_cli.detection.fitting.edge_profile import (
 )
 from neurocal_cli.detection.fitting.map_fit import MapFit
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance, polynomial_terms
-from neurocal_cli.detection.fitting.smooth_map import Frame
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single
+from neurocal_cli.detection.fitting.wide_map import WideMap
 from neurocal_cli.detection.medians import upper_median
 
 # Insensitive, except _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
@@ -54,6 +54,9 @@ _LEAST_SHARE = 0.3  # least noise variance relative to the largest one; clipped 
 _ROUND = 0.5  # relative deviation of the squared blur at which an edge has half the weight ...
 _ROUND_EDGES = 1.0  # ... and weight, in edges, of the prior that blur is isotropic
 _FIELD_STEPS, _FIELD_SPREAD = 5, 0.25  # reweighted fits; deviation of log sigma at which the weight is half
+# The blur may change over the board if the edges deviate from a common one by more than this, relatively, and
+# the changing one leaves less than this share of their variance.
+_UNEVEN_BLUR, _CLEARLY_LESS = 0.1, 0.5
 _BLUR_SPREAD = 0.03  # least relative standard deviation of an edge's blur from the board's
 _ENOUGH = 10000  # pixels, enough to estimate the profile's shape
 # Prior standard deviations of tails and response. They matter if blur and contrast have the same effect, and
@@ -63,6 +66,10 @@ _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # least prior variance of the levels, in variances of the noise
 _TINY = np.float32(1e-30)
 _FAR, _PLACES = 4.0, 401  # samples of the profile: sigma on both sides, and their number
+_KINDS = (range(1, 2), range(2, 4), range(4, 9))  # columns of the terms of blur, levels and place
+# Insensitive. Excess variance of a map above which terms are tried; chi2 that each must gain, in variances of
+# the residuals left; and number of edges for each unknown.
+_NOT_NOISE, _GAIN, _EDGES = 1.3, 8.0, 4
 
 
 @frozen_dataclass
@@ -162,6 +169,18 @@ def with_shift(shape: ProfileShape, sigma: float, shift: float) -> ProfileShape:
     return replace(shape, nonlinearity=shape.nonlinearity + change)
 
 
+def board_blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:
+    """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
+    good = good if good.any() else np.ones_like(good)
+    board = BoardBlur.of(fit, edges.normal, good)
+    wide = isinstance(at, WideMap)
+    if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
+        field = FieldBlur.of(fit, edges, good, at.frame)
+        if wide or field.relative * board.usual**2 < _CLEARLY_LESS * board.spread:
+            return field
+    return board
+
+
 @frozen_dataclass(eq=False)
 class BoardBlur:
     """Common blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n."""
@@ -232,6 +251,11 @@ class FieldBlur:
         return sigma, self.relative * sigma**2
 
 
+def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
+    n_u, n_v = normal.T
+    return np.column_stack([polynomial_terms(frame, place, 6), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
+
+
 def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Array:
     """(E,) correlation of the blur along the normals of two crossing lines.
 
@@ -244,11 +268,6 @@ def correlation(blur: BoardBlur | FieldBlur, lines: tuple[Lines, Lines]) -> Arra
         blur.at(one) for one in (first, second, replace(first, normal=both / np.sqrt(square)[:, None]))
     )
     return np.asarray((square * c**2 - a**2 - b**2) / (2 * a * b))
-
-
-def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
-    n_u, n_v = normal.T
-    return np.column_stack([polynomial_terms(frame, place, 6), n_u * n_u - n_v * n_v, 2 * n_u * n_v])
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: Array, noise: float) -> LevelPrior:
@@ -265,12 +284,6 @@ def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: Array
     precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
     precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)
     return LevelPrior(np.stack([mean, contrast, sigma], axis=-1), precision)
-
-
-_KINDS = (range(1, 2), range(2, 4), range(4, 9))  # columns of the terms of blur, levels and place
-# Insensitive. Excess variance of a map above which terms are tried; chi2 that each must gain, in variances of
-# the residuals left; and number of edges for each unknown.
-_NOT_NOISE, _GAIN, _EDGES = 1.3, 8.0, 4
 
 
 @frozen_dataclass(eq=False)

@@ -135,8 +135,8 @@ def levels_beside(strips: Strips, half_width: Array, mean: Array, contrast: Arra
     return np.where(other, own_mean, mean), np.where(other, own_contrast, contrast)
 
 
-def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
-    """Estimate offset [px], slope and blur [px] (E,) of edges anywhere in strips of half widths (E,) [px].
+def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array]:
+    """Estimate offset [px] and blur [px] (E,) of edges anywhere in strips of half widths (E,) [px].
 
     With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and the mean of 1 - e^2 is 4
     sigma / sqrt(pi) over the width. The estimate is inaccurate, but needs no initial value.
@@ -147,11 +147,9 @@ def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> 
     np.clip(e, -2 * one, 2 * one, out=e)
     e *= inside
     count = np.maximum(inside.sum(axis=1), 1)
-    square = np.einsum("en,en,en->e", strips.s, strips.s, inside)
-    slope = -half_width * np.einsum("en,en->e", e, strips.s) / np.maximum(square, 1)
     offset = -half_width * e.sum(axis=1) / count
     sigma = 2 * half_width / _BLUR_LOSS * (1 - np.einsum("en,en->e", e, e) / count)
-    return offset.astype(float), slope.astype(float), sigma.astype(float)
+    return offset.astype(float), sigma.astype(float)
 
 
 def light_at(data: EdgePixels, values: Array) -> Single:

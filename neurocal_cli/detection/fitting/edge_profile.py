@@ -34,6 +34,7 @@ from neurocal_cli.camera.geometry import Array
 Real = NDArray[np.floating]
 
 RESPONSE_TERMS = 6
+PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun 7.1.26)
 # with seven minimax coefficients, found by Lawson's method. The error is at most 7.3e-10
@@ -51,40 +52,34 @@ _C = (
 )
 _ROOT_HALF = float(np.sqrt(0.5))
 _PEAK = float(1 / np.sqrt(2 * np.pi))
-PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
+_SIGN_BITS = {4: (np.int32, np.int32(-(2**31))), 8: (np.int64, np.int64(-(2**63)))}
+# Coefficients of He_3 / z and He_5 / z, and of -He_4 and -He_6, as polynomials in z^2.
+_ODD_POWERS = np.array([[-3.0, 1.0, 0.0], [15.0, -10.0, 1.0]])
+_EVEN_POWERS = np.array([[-3.0, 6.0, -1.0, 0.0], [15.0, -45.0, 15.0, -1.0]])
 # Limits that avoid division by 0, below what can be measured; insensitive.
 _LEAST_PSF = 0.02  # px
 _LEAST_HALF = 5e-3  # px
 
 
-def erf_and_density(z: Real) -> tuple[Real, Real]:
-    """``erf(z / sqrt 2)`` and the normal density ``exp(-z^2 / 2) / sqrt(2 pi)``, in float32 or float64."""
-    bell = z * z
-    bell *= -0.5
-    np.exp(bell, out=bell)
-    t = np.abs(z)
-    t *= _P * _ROOT_HALF
-    t += 1
-    np.reciprocal(t, out=t)
-    series = t * _C[-1]
-    for coefficient in _C[-2::-1]:
-        series += coefficient
-        series *= t
-    series *= bell
-    bell *= _PEAK
-    np.subtract(1, series, out=series)
-    return with_sign(series, z), bell
+def sharp_profile(
+    z: Real, sigma: Real, tails: Real, half: Array | None
+) -> tuple[Real, Real, Real | None, Real]:
+    """E(z), its derivative by z, the extra derivative by log sigma, and the normal density.
 
-
-def with_sign(size: Real, of: Real) -> Real:
-    """Give a positive array the sign of another, in place, by the sign bit; faster than `numpy.copysign`."""
-    kind, sign = _SIGN_BITS[of.dtype.itemsize]
-    bits = size.view(kind)
-    bits |= of.view(kind) & sign
-    return size
-
-
-_SIGN_BITS = {4: (np.int32, np.int32(-(2**31))), 8: (np.int64, np.int64(-(2**63)))}
+    If the profile only scaled with sigma, the derivative of E(d / sigma) by log sigma would be -z times that
+    by z. The pixel's box does not grow with the blur, which adds the third result. Without half widths of the
+    box, it is `profile`.
+    """
+    if half is None:
+        value, slope, density = profile(z, tails)
+        return value, slope, None, density
+    value, slope, widening = box_profile(z * sigma, sigma, half)
+    slope *= sigma
+    widening *= sigma
+    widening += z * slope
+    density = erf_and_density(z)[1]
+    _add_tails(value, slope, z, density, tails)
+    return value, slope, widening, density
 
 
 def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
@@ -110,11 +105,6 @@ def _add_tails(value: Real, slope: Real, z: Real, density: Real, tails: Real) ->
     slope += steeper
 
 
-# Coefficients of He_3 / z and He_5 / z, and of -He_4 and -He_6, as polynomials in z^2.
-_ODD_POWERS = np.array([[-3.0, 1.0, 0.0], [15.0, -10.0, 1.0]])
-_EVEN_POWERS = np.array([[-3.0, 6.0, -1.0, 0.0], [15.0, -45.0, 15.0, -1.0]])
-
-
 def _polynomial(x: Real, coefficients: Real) -> Real:
     """Polynomials of x (E, N) with coefficients (E, K), the constant first."""
     value = x * coefficients[:, -1:]
@@ -131,6 +121,48 @@ def tail_terms(z: Real, density: Real, out: Real) -> None:
     odd = density * z
     np.multiply(odd, square - 3, out=out[:, 0])
     np.multiply(odd, square * (square - 10) + 15, out=out[:, 1])
+
+
+def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
+    """Edge spread function at distances d (E, N) [px], and its derivatives by d and by sigma [1/px].
+
+    `sigma` is (E, 1) [px], ``sigma^2 = psf^2 + 1/12``, and `half` (E, 2) [px] as of `half_widths`.
+    """
+    kind = d.dtype
+    a, b = (half[:, k, None].astype(kind) for k in (0, 1))
+    psf = np.sqrt(np.maximum(sigma * sigma - kind.type(PIXEL), kind.type(_LEAST_PSF**2)))
+    share = 1 / (4 * a * b)
+    # Without blur, the profile is a ramp, rounded off within 2 b of its ends.
+    size = np.abs(d)
+    ramp = np.minimum(size, a - b) / a
+    beyond = np.clip(size - (a - b), 0, 2 * b)
+    value = _with_sign(ramp + beyond * (4 * b - beyond) * share, d)
+    slope = np.where(size < a + b, (2 * b - beyond) * (2 * share), 0)
+    widening = np.zeros_like(d)
+    for x, sign in ((d + (a + b), 1), (d + (a - b), -1), (d - (a - b), -1), (d - (a + b), 1)):
+        z = x / psf
+        e, p = erf_and_density(z)
+        rest = e - _with_sign(np.ones_like(x), x)
+        weight = sign * share
+        p *= psf
+        value += weight * (0.5 * (x * x * rest + psf * psf * e) + x * p)
+        slope += weight * (x * rest + 2 * p)
+        widening += weight * e
+    widening *= sigma
+    return value, slope, widening
+
+
+def half_widths(normal: Array) -> Array:
+    """Half widths (E, 2) of the two boxes [px] of a pixel along unit normals (E, 2); the wider one first."""
+    return np.asarray(np.maximum(np.sort(0.5 * np.abs(normal), axis=1)[:, ::-1], _LEAST_HALF))
+
+
+def box_kurtosis(normal: Array, sigma: Array) -> Array:
+    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``, for normals (E, 2).
+
+    It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
+    """
+    return np.asarray((normal**4).sum(axis=-1) / (1440 * sigma**4))
 
 
 def response(x: Real, coefficients: Array) -> tuple[Real, Real]:
@@ -160,64 +192,28 @@ def response_terms(x: Real, scale: Real, out: Real) -> None:
         np.multiply(out[:, k - 1], x, out=out[:, k])
 
 
-def box_kurtosis(normal: Array, sigma: Array) -> Array:
-    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``, for normals (E, 2).
-
-    It follows by Edgeworth's series from the box's fourth cumulant along the normal, -(n_u^4 + n_v^4)/120.
-    """
-    return np.asarray((normal**4).sum(axis=-1) / (1440 * sigma**4))
-
-
-def half_widths(normal: Array) -> Array:
-    """Half widths (E, 2) of the two boxes [px] of a pixel along unit normals (E, 2); the wider one first."""
-    return np.asarray(np.maximum(np.sort(0.5 * np.abs(normal), axis=1)[:, ::-1], _LEAST_HALF))
-
-
-def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
-    """Edge spread function at distances d (E, N) [px], and its derivatives by d and by sigma [1/px].
-
-    `sigma` is (E, 1) [px], ``sigma^2 = psf^2 + 1/12``, and `half` (E, 2) [px] as of `half_widths`.
-    """
-    kind = d.dtype
-    a, b = (half[:, k, None].astype(kind) for k in (0, 1))
-    psf = np.sqrt(np.maximum(sigma * sigma - kind.type(PIXEL), kind.type(_LEAST_PSF**2)))
-    share = 1 / (4 * a * b)
-    # Without blur, the profile is a ramp, rounded off within 2 b of its ends.
-    size = np.abs(d)
-    ramp = np.minimum(size, a - b) / a
-    beyond = np.clip(size - (a - b), 0, 2 * b)
-    value = with_sign(ramp + beyond * (4 * b - beyond) * share, d)
-    slope = np.where(size < a + b, (2 * b - beyond) * (2 * share), 0)
-    widening = np.zeros_like(d)
-    for x, sign in ((d + (a + b), 1), (d + (a - b), -1), (d - (a - b), -1), (d - (a + b), 1)):
-        z = x / psf
-        e, p = erf_and_density(z)
-        rest = e - with_sign(np.ones_like(x), x)
-        weight = sign * share
-        p *= psf
-        value += weight * (0.5 * (x * x * rest + psf * psf * e) + x * p)
-        slope += weight * (x * rest + 2 * p)
-        widening += weight * e
-    widening *= sigma
-    return value, slope, widening
+def erf_and_density(z: Real) -> tuple[Real, Real]:
+    """``erf(z / sqrt 2)`` and the normal density ``exp(-z^2 / 2) / sqrt(2 pi)``, in float32 or float64."""
+    bell = z * z
+    bell *= -0.5
+    np.exp(bell, out=bell)
+    t = np.abs(z)
+    t *= _P * _ROOT_HALF
+    t += 1
+    np.reciprocal(t, out=t)
+    series = t * _C[-1]
+    for coefficient in _C[-2::-1]:
+        series += coefficient
+        series *= t
+    series *= bell
+    bell *= _PEAK
+    np.subtract(1, series, out=series)
+    return _with_sign(series, z), bell
 
 
-def sharp_profile(
-    z: Real, sigma: Real, tails: Real, half: Array | None
-) -> tuple[Real, Real, Real | None, Real]:
-    """E(z), its derivative by z, the extra derivative by log sigma, and the normal density.
-
-    If the profile only scaled with sigma, the derivative of E(d / sigma) by log sigma would be -z times that
-    by z. The pixel's box does not grow with the blur, which adds the third result. Without half widths of the
-    box, it is `profile`.
-    """
-    if half is None:
-        value, slope, density = profile(z, tails)
-        return value, slope, None, density
-    value, slope, widening = box_profile(z * sigma, sigma, half)
-    slope *= sigma
-    widening *= sigma
-    widening += z * slope
-    density = erf_and_density(z)[1]
-    _add_tails(value, slope, z, density, tails)
-    return value, slope, widening, density
+def _with_sign(size: Real, of: Real) -> Real:
+    """Give a positive array the sign of another, in place, by the sign bit; faster than `numpy.copysign`."""
+    kind, sign = _SIGN_BITS[of.dtype.itemsize]
+    bits = size.view(kind)
+    bits |= of.view(kind) & sign
+    return size

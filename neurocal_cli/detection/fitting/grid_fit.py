@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,9 @@ from neurocal_cli.detection.fitting.common_parameters import (
     EdgeShifts,
     FieldBlur,
     PixelNoise,
-    correlation,
+    board_blur,
     level_prior,
     profile_shape,
-    with_shift,
 )
 from neurocal_cli.detection.fitting.edge_fit import (
     OFFSET,
@@ -38,6 +36,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
     usual_stride,
 )
 from neurocal_cli.detection.fitting.edge_profile import half_widths
+from neurocal_cli.detection.fitting.grid_edges import ANCHOR, GridEdges, GridImage
 from neurocal_cli.detection.fitting.initial_fit import fit_initial, is_reliable, is_typical
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
 from neurocal_cli.detection.fitting.shading import (
@@ -49,20 +48,9 @@ from neurocal_cli.detection.fitting.shading import (
     square_levels,
 )
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import (
-    FIRST,
-    SECOND,
-    vertex_lines,
-    vertex_model,
-    vertex_pixels,
-    with_gradients,
-)
+from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
-from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
-
-Image = NDArray[np.generic]
 
 # Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px; standard deviation of the coordinates of the found vertices
@@ -73,100 +61,12 @@ _STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
 _UNEVEN = 100.0
 _NOT_NOISE, _CLEARLY = 2.0, 0.5  # excess variance above which a wide lens is tried, and share it must leave
 _PARAMETER = 2.0  # chi2 that a parameter must gain, in the choice between the two kinds of lenses
-_ANCHOR = 2.0  # px; standard deviation of the found vertices as anchors, which keep later maps regular
-_ENOUGH = 60  # edges above which such anchors are not needed
-_UNEVEN_BLUR = 0.1  # relative deviation of the edges' blur above which it may change over the board
 _MOMENT_SIGMA = 0.05  # px; standard deviation of offsets from moments
 _WIDEST = 12.0  # px; greatest half width of the strips for moments
-_STEPS = 6  # greatest number of Gauss-Newton steps
+STEPS = 6  # greatest number of Gauss-Newton steps
 _LEAST_VARIANCE = 1e-12  # px^2
-_LEAST_SCALE = 0.1  # least ratio of the noise variance from the final residuals to the first estimate
+LEAST_SCALE = 0.1  # least ratio of the noise variance from the final residuals to the first estimate
 _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
-
-
-@frozen_dataclass(eq=False)
-class GridEdges:
-    """E edges of a grid, those along c first."""
-
-    index: NDArray[np.int64]  # (E, 2) first vertex, (c, r)
-    vertical: NDArray[np.bool_]
-    centre: Array  # (E, 2) [squares]
-    light: Array  # (E,) +1 if the light side is that of growing r (growing c for vertical edges), else -1
-    known: NDArray[np.bool_]  # (E, 2) whether the vertices at both ends are known
-
-    @classmethod
-    def of(cls, grid: Grid, known_ends: int) -> GridEdges:
-        """All edges with so many known ends.
-
-        With two they are between vertices; with one they lead to the rim, or to vertices that were not found.
-        """
-        seen = np.pad(grid.seen, 1)
-        ends = (
-            np.stack([seen[1:-1, :-1], seen[1:-1, 1:]], axis=-1),
-            np.stack([seen[:-1, 1:-1], seen[1:, 1:-1]], axis=-1),
-        )
-        wanted = [known.sum(axis=2) == known_ends for known in ends]
-        along_c, along_r = (
-            np.argwhere(which)[:, ::-1] - first for which, first in zip(wanted, ([1, 0], [0, 1]), strict=True)
-        )
-        index = np.concatenate([along_c, along_r])
-        vertical = np.arange(len(index)) >= len(along_c)
-        centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
-        light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
-        known = np.concatenate([both[which] for both, which in zip(ends, wanted, strict=True)])
-        return cls(index.astype(np.int64), vertical, centre, light, known)
-
-    def lines(self, at: SmoothMap) -> Lines:
-        """Map the edges to the image."""
-        return grid_lines(at, self.centre, self.vertical, self.light)
-
-    def observations(self, lines: Lines, offset: Array, variance: Array, shift: Array) -> Observations:
-        """Use the edges as observations of a map, with unknown shifts towards the light side.
-
-        `shift` (E, K) are `EdgeShifts.terms`.
-        """
-        value = (lines.middle * lines.normal).sum(axis=1) + offset
-        return Observations(self.centre, lines.normal, value, variance, shift)
-
-
-@frozen_dataclass(eq=False)
-class GridImage:
-    """An image [DN] and a grid in it, prepared for the fits."""
-
-    image: Image
-    grid: Grid
-    floor: float  # [DN^2] least variance of the pixels, that of rounding
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the image [px]."""
-        return self.image.shape[1], self.image.shape[0]
-
-    @cached_property
-    def edges(self) -> GridEdges:
-        """The edges between found vertices."""
-        return GridEdges.of(self.grid, 2)
-
-    @cached_property
-    def vertices(self) -> Array:
-        """(V, 2) grid coordinates of the found vertices."""
-        return np.argwhere(self.grid.seen)[:, ::-1].astype(float)
-
-    @property
-    def pixels(self) -> Array:
-        """(V, 2) pixels of the found vertices."""
-        return self.grid.pixels[self.grid.seen]
-
-    def anchors(self, sigma: float, shifts: int = 1) -> Observations:
-        """The found vertices as observations of a map, with a standard deviation [px]."""
-        return Observations.of_points(self.vertices, self.pixels, sigma, shifts)
-
-    def observations(self, lines: Lines, offset: Array, variance: Array, shift: Array) -> Observations:
-        """Use edges as observations of a map; a few edges are joined with the found vertices as anchors."""
-        edges = self.edges.observations(lines, offset, variance, shift)
-        if len(offset) > _ENOUGH:
-            return edges
-        return edges.joined_with(self.anchors(_ANCHOR, shift.shape[1]))
 
 
 @frozen_dataclass(eq=False)
@@ -180,6 +80,11 @@ class GridFit:
     shading: Shading
     noise: PixelNoise
     good: NDArray[np.bool_]  # (E,) edges that passed the quality tests
+
+    @property
+    def blur(self) -> BoardBlur | FieldBlur:
+        """Blur of the board, from the fits of all edges."""
+        return board_blur(self.fit, self.lines, self.good, self.map.map)
 
     @property
     def shift(self) -> Array:
@@ -196,7 +101,7 @@ class GridFit:
     def offset_variance(self) -> Array:
         """(E,) variance of the fitted offsets [px^2], that of an anchor for edges that are not good."""
         variance = np.maximum(self.fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
-        return np.where(self.good, variance, _ANCHOR**2)
+        return np.where(self.good, variance, ANCHOR**2)
 
     @property
     def unevenness(self) -> float:
@@ -242,18 +147,6 @@ def _wide_if_better(
     return wide if costs[1] < costs[0] else found
 
 
-def _may_be_wide(found: MapFit, vertices: Array) -> bool:
-    """Whether the excess variance of a map may be due to a wide lens, which `SmoothMap` does not model.
-
-    If the lens displaces points only weakly, `SmoothMap` is accurate to hundredths of a pixel, and a larger
-    excess comes from an uneven board.
-    """
-    if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
-        return False
-    bend = found.map.bend(vertices)
-    return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
-
-
 def _by_moments(
     grid_image: GridImage, found: MapFit, shading: Shading
 ) -> tuple[MapFit, float, tuple[Array, Array]]:
@@ -265,7 +158,7 @@ def _by_moments(
     half = np.clip(half, 2.0, _WIDEST)
     strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
     levels = levels_beside(strips, half, *shading.at(lines.middle))
-    offset, _, blur = moments(strips, half, *levels)
+    offset, blur = moments(strips, half, *levels)
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     variance = np.full(len(offset), _MOMENT_SIGMA**2)
     observations = grid_image.observations(lines, offset, variance, np.ones((len(offset), 1)))
@@ -287,11 +180,11 @@ def _first_fit(
     good = is_typical(fit, lines.middle)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
-    variance = np.where(good, variance, _ANCHOR**2)
+    variance = np.where(good, variance, ANCHOR**2)
     # Try at least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
     index = mapped.model_index
     models = mapped.map.models[index : max(index, mapped.map.richest_lens) + 1]
-    shifts = EdgeShifts.of(_blur(fit, lines, good, mapped.map), shading, lines)
+    shifts = EdgeShifts.of(board_blur(fit, lines, good, mapped.map), shading, lines)
     # Only large shifts matter here; those of paper boards would cost a tenth of the time.
     chosen, shifts, observations = _selected(
         grid_image, mapped, lines, fit, variance, shifts, models, _CLEARLY
@@ -302,6 +195,18 @@ def _first_fit(
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
     return GridFit(lines, fit, chosen, shifts, shading, PixelNoise(noise, noise, noise), good)
+
+
+def _may_be_wide(found: MapFit, vertices: Array) -> bool:
+    """Whether the excess variance of a map may be due to a wide lens, which `SmoothMap` does not model.
+
+    If the lens displaces points only weakly, `SmoothMap` is accurate to hundredths of a pixel, and a larger
+    excess comes from an uneven board.
+    """
+    if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
+        return False
+    bend = found.map.bend(vertices)
+    return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
 
 
 def _selected(
@@ -344,12 +249,12 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
-    blur = _blur(first.fit, first.lines, good, first.map.map)
+    blur = first.blur
     fit, noise = _fine_fit(grid_image, first, lines, shading, blur.at(lines))
-    scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
+    scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
-    trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    trusted = np.where(is_typical(fit, lines.middle) & (variance > _LEAST_VARIANCE), variance, ANCHOR**2)
     # More accurate edges may need a richer model.
     richer = first.map.map.models[first.map.model_index :]
     shifts = EdgeShifts.of(blur, shading, lines, first.shifts.used)
@@ -365,6 +270,20 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     possible = np.abs(shifts.terms(lines) @ mapped.shift) < 0.5 * lines.width
     good = is_reliable(fit, np.where(possible, departure, np.inf))
     return GridFit(lines, fit, mapped, shifts, shading, noise, good)
+
+
+def _shading(first: GridFit) -> Shading:
+    """Estimate the shading of the whole board from the levels of its edges."""
+    covariance, values, good = first.fit.covariance, first.fit.values, first.good
+    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
+    cross = 2 * covariance[:, MEAN, CONTRAST]
+    place = first.lines.middle[good]
+    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
+    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
+    smooth = fit_shading(first.map.map.frame, dark, light)
+    if isinstance(first.map.map, WideMap):
+        return LocalShading.of(smooth, dark, light)
+    return adapted_shading(smooth, dark, light)
 
 
 def _fine_fit(
@@ -385,12 +304,12 @@ def _fine_fit(
         # The error of the profile, estimated from a part of the pixels, now dominates: estimate it again.
         shape = profile_shape(fit, first.good)
         noise = PixelNoise.of(fit, grid_image.floor)
-        fit = fit.continued(shape, _STEPS, weight=noise.weights(fit.linear.x))
+        fit = fit.continued(shape, STEPS, weight=noise.weights(fit.linear.x))
     return fit, noise
 
 
 def _fitted(
-    image: Image,
+    image: NDArray[np.generic],
     lines: Lines,
     offset: Array,
     blur: tuple[Array, Array],
@@ -405,7 +324,7 @@ def _fitted(
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), prior.mean], axis=1)
     data = data.weighed(noise.weights(light_at(data, start)))
-    return fit_batch(edge_model, data, start, prior, shape, _STEPS)
+    return fit_batch(edge_model, data, start, prior, shape, STEPS)
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
@@ -417,7 +336,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
         grid_image.image,
         lines,
         shift,
-        _blur(fitted.fit, fitted.lines, fitted.good, fitted.map.map).at(lines),
+        fitted.blur.at(lines),
         fitted.shading,
         fitted.fit.shape.elsewhere(half_widths(lines.normal)),
         fitted.noise,
@@ -429,90 +348,3 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     # If none of these is reliable, there is nothing to compare with.
     good = is_reliable(fit, departure, known=fitted.fit.chi2_per_pixel[fitted.good]) & fitted.good.any()
     return edges, replace(fitted, lines=lines, fit=fit, good=good)
-
-
-def fit_grid_vertices(
-    grid_image: GridImage, fitted: GridFit
-) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
-    """Fit all known vertices after the edges; returns also their lines and a mask of the reliable ones."""
-    grid = grid_image.vertices
-    lines = vertex_lines(fitted.map.map, grid)
-    light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
-    place = lines[0].middle
-    blur = _blur(fitted.fit, fitted.lines, fitted.good, fitted.map.map)
-    (first, spread), (second, _) = (blur.at(line) for line in lines)
-    sigma = 0.5 * (first + second)
-    ends = _ends(grid_image.grid.seen)
-    rho = correlation(blur, lines)
-    data = vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, ends)
-    shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
-    shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
-    prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
-    start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
-    unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
-    fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
-    fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
-    fit = with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
-    if fitted.shifts.used:
-        fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
-    fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
-    departure = np.zeros(len(grid))
-    for line, which in zip(lines, (FIRST, SECOND), strict=True):
-        variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
-        variance *= fitted.map.excess
-        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
-    # Map, blur and levels come from the edges: if no edge is reliable, no vertex is.
-    return fit, lines, is_reliable(fit, departure) & fitted.good.any()
-
-
-def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Array:
-    """(V, count) effect on the values of vertices of lines whose two halves have different shifts.
-
-    The halves are shifted in opposite directions; equal shifts only turn the line. The common response is in
-    the vertices' model.
-    """
-    result, ones = np.zeros((len(grid), count)), np.ones(len(grid))
-    for which, step in zip((FIRST, SECOND), 0.25 * np.eye(2), strict=True):
-        vertical = np.full(len(grid), which == SECOND)
-        before, after = (
-            fitted.shifts.beyond_response(
-                grid_lines(fitted.map.map, grid + side * step, vertical, ones), fitted.map.shift
-            )
-            for side in (-1, 1)
-        )
-        result[:, which] = 0.5 * light * (after - before)
-    return result
-
-
-def _blur(fit: BatchFit, edges: Lines, good: NDArray[np.bool_], at: SmoothMap) -> BoardBlur | FieldBlur:
-    """Estimate the blur of the board from the fits of all its edges; it may change over the board."""
-    good = good if good.any() else np.ones_like(good)
-    board = BoardBlur.of(fit, edges.normal, good)
-    wide = isinstance(at, WideMap)
-    if wide or board.spread > (_UNEVEN_BLUR * board.usual) ** 2:
-        field = FieldBlur.of(fit, edges, good, at.frame)
-        if wide or field.relative * board.usual**2 < _CLEARLY * board.spread:
-            return field
-    return board
-
-
-def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V, 2, 2) mask of missing neighbours of known vertices: along c and along r, before and after."""
-    beyond = ~np.pad(seen, 1)
-    along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
-    along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
-    return np.asarray(np.stack([along_c[seen], along_r[seen]], axis=1))
-
-
-def _shading(first: GridFit) -> Shading:
-    """Estimate the shading of the whole board from the levels of its edges."""
-    covariance, values, good = first.fit.covariance, first.fit.values, first.good
-    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
-    cross = 2 * covariance[:, MEAN, CONTRAST]
-    place = first.lines.middle[good]
-    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
-    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    smooth = fit_shading(first.map.map.frame, dark, light)
-    if isinstance(first.map.map, WideMap):
-        return LocalShading.of(smooth, dark, light)
-    return adapted_shading(smooth, dark, light)

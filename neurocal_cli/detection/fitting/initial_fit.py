@@ -1,9 +1,8 @@
-"""First fits of a board's edges, each with its own levels, to estimate blur and profile.
+"""First fits of a board's edges, each with its own levels, and the tests of these and later fits.
 
-Reject fits that disagree with their pixels, with the rest of the board, or with the map.
-
-In: fits. Out: masks of the typical fits, from which common parameters are estimated, and of the reliable
-fits, which are reported.
+`fit_initial` gives the blur and the profile with which the later fits begin. Fits are rejected if they
+disagree with their pixels, with the rest of the board, or with the map: common parameters are estimated from
+the typical fits (`is_typical`), and the reliable ones are reported (`is_reliable`).
 """
 
 from __future__ import annotations
@@ -28,6 +27,16 @@ from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 
+# Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/support/rendered.py).
+# There, half of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them
+# 8 times larger.
+_SLACK = 0.5  # px, added to the strips because lines are not accurate yet
+_FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
+_CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box
+_WORSE = 1.2  # ratio of chi2 above which fits with the new blur are rejected
+_BLUR_OFF = 0.2  # relative error of the blur above which the fits are repeated
+_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to contrast and blur
+
 # Insensitive as long as they admit a ratio of 1 to the prior, and fits of 8 pixels for the smallest squares.
 # tests/test_measuring.py counts the fits of hidden edges that are accepted.
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
@@ -44,64 +53,6 @@ _MOST_SPREAD = 0.5  # sigma; greatest standard deviation of an offset
 # A fit has converged if its last step is below the first limit [standard deviations] or the second [px]. The
 # latter is for sharp images, whose noise is below the error of the edge model.
 _MOST_STEP, _MOST_MOVE = 1.0, 0.03
-
-
-def is_typical(fit: BatchFit, place: Array) -> NDArray[np.bool_]:
-    """(E,) mask of fits at places (E, 2) [px] with contrast and chi2 like those of most fits of the board.
-
-    Where the light is weaker, it is sufficient to have the contrast of the neighbours.
-    """
-    contrast = fit.values[:, CONTRAST]
-    usual = upper_median(contrast)
-    seen = contrast > _LEAST_CONTRAST**2 * usual
-    faint = np.flatnonzero(~seen & (contrast > _FAINTEST * usual))
-    if len(faint):
-        away = ((place[faint, None] - place) ** 2).sum(axis=-1)
-        near = np.argsort(away, axis=1)[:, :_NEIGHBOURS]
-        seen[faint] = contrast[faint] > _LEAST_CONTRAST * np.median(contrast[near], axis=1)
-    rough = fit.chi2_per_pixel
-    usual = upper_median(rough)
-    scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
-    return seen & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
-
-
-def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:
-    """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
-
-    `departure` (E,) is the distance from the map in standard deviations. `known` are values of chi2 per pixel
-    of fits that are known to be reliable; without it, the fits are compared with each other.
-    """
-    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
-    blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
-    good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
-    good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
-    good &= (fit.pixels.beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
-    # The values before the levels are alternately the offset and the tilt of a line.
-    offsets = range(0, fit.values.shape[1] + MEAN, 2)
-    spread = fit.covariance[:, offsets, offsets]
-    good &= (spread > 0).all(axis=1)
-    moved = fit.step * np.sqrt(np.maximum(spread.max(axis=1), 0.0))
-    good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
-    good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
-    good &= np.abs(departure) < _LIMIT
-    rough = fit.chi2_per_pixel
-    among = rough[good] if known is None else known
-    usual = upper_median(among) if len(among) else 1.0
-    scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0
-    chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
-    good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
-    return good & (good.mean() > _LEAST_SHARE) if len(good) else good
-
-
-# Insensitive, except for edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
-# of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, which never selects the box, makes them 8 times
-# larger.
-_SLACK = 0.5  # px, added to the strips because lines are not accurate yet
-_FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
-_CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box
-_WORSE = 1.2  # ratio of chi2 above which fits with the new blur are rejected
-_BLUR_OFF = 0.2  # relative error of the blur above which the fits are repeated
-_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to contrast and blur
 
 
 def fit_initial(
@@ -149,16 +100,15 @@ def _few_steps(
 
 def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
     """Continue the fits with each blur profile, and choose the one with the lower chi2."""
-    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
+    results = []
+    for shape in _blur_profiles(lines, sigma):
+        fit = started
+        if (shape.half is None) != (fit.shape.half is None):
+            fit = fit.continued(shape, _FEW_STEPS, 0)
+        results.append(fit.continued(profile_shape(fit, is_typical(fit, lines.middle)), _STEPS))
     smooth, box = (upper_median(results[k].chi2_per_pixel) for k in (0, -1))
     # Prefer the pixel's box if they are about equal, as they are if all edges run along the pixels.
     return results[0] if smooth < _CLEARLY * box else results[-1]
-
-
-def _converged(fit: BatchFit, lines: Lines, shape: ProfileShape) -> BatchFit:
-    if (shape.half is None) != (fit.shape.half is None):
-        fit = fit.continued(shape, _FEW_STEPS, 0)
-    return fit.continued(profile_shape(fit, is_typical(fit, lines.middle)), _STEPS)
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
@@ -170,3 +120,50 @@ def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
         # The series is tried, too, because sharpening in the camera changes the profile of the pixel's box.
         shapes.append(ProfileShape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
     return shapes
+
+
+def is_typical(fit: BatchFit, place: Array) -> NDArray[np.bool_]:
+    """(E,) mask of fits at places (E, 2) [px] with contrast and chi2 like those of most fits of the board.
+
+    Where the light is weaker, it is sufficient to have the contrast of the neighbours.
+    """
+    contrast = fit.values[:, CONTRAST]
+    usual = upper_median(contrast)
+    seen = contrast > _LEAST_CONTRAST**2 * usual
+    faint = np.flatnonzero(~seen & (contrast > _FAINTEST * usual))
+    if len(faint):
+        away = ((place[faint, None] - place) ** 2).sum(axis=-1)
+        near = np.argsort(away, axis=1)[:, :_NEIGHBOURS]
+        seen[faint] = contrast[faint] > _LEAST_CONTRAST * np.median(contrast[near], axis=1)
+    rough = fit.chi2_per_pixel
+    usual = upper_median(rough)
+    scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
+    return seen & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
+
+
+def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:
+    """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
+
+    `departure` (E,) is the distance from the map in standard deviations. `known` are values of chi2 per pixel
+    of fits that are known to be reliable; without it, the fits are compared with each other.
+    """
+    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
+    blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
+    good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
+    good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
+    good &= (fit.pixels.beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
+    # The values before the levels are alternately the offset and the tilt of a line.
+    offsets = range(0, fit.values.shape[1] + MEAN, 2)
+    spread = fit.covariance[:, offsets, offsets]
+    good &= (spread > 0).all(axis=1)
+    moved = fit.step * np.sqrt(np.maximum(spread.max(axis=1), 0.0))
+    good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
+    good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
+    good &= np.abs(departure) < _LIMIT
+    rough = fit.chi2_per_pixel
+    among = rough[good] if known is None else known
+    usual = upper_median(among) if len(among) else 1.0
+    scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0
+    chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
+    good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
+    return good & (good.mean() > _LEAST_SHARE) if len(good) else good

@@ -175,17 +175,30 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
 
 def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
     """Fit polynomials to levels, of the degree up to 2 that their number allows."""
-    around = _around(frame, np.concatenate([dark.place, light.place]))
-    (low, low_spread), (high, high_spread) = (_fit(around, levels) for levels in (dark, light))
-    return Shading(around, low, high, np.array([low_spread, high_spread]))
+    places = np.concatenate([dark.place, light.place])
+    if len(places):
+        # Coordinates from -1 to 1 on the board, where high powers can be told apart.
+        first, last = places.min(axis=0), places.max(axis=0)
+        centre, unit = 0.5 * (first + last), max(0.5 * float((last - first).max()), 1.0)
+        frame = replace(frame, centre=centre, unit=unit)
+    (low, low_spread), (high, high_spread) = (_fit(frame, levels) for levels in (dark, light))
+    return Shading(frame, low, high, np.array([low_spread, high_spread]))
 
 
-def _around(frame: Frame, places: Array) -> Frame:
-    """Scale coordinates to [-1, 1] on the board, where high powers can be told apart."""
-    if not len(places):
-        return frame
-    low, high = places.min(axis=0), places.max(axis=0)
-    return replace(frame, centre=0.5 * (low + high), unit=max(0.5 * float((high - low).max()), 1.0))
+def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
+    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2]."""
+    n = len(levels.level)
+    coefficients = np.zeros(_TERMS[-1])
+    if n == 0:
+        return coefficients, np.inf
+    terms = polynomial_terms(frame, levels.place, _TERMS[-1])
+    residual, spread = levels.level - upper_median(levels.level), 0.0
+    most = max([m for m in _TERMS if 3 * m <= n], default=1)
+    # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
+    for used in (*_TERMS, *(most,) * _STEPS):
+        used = min(used, most)
+        coefficients[:used], residual, spread = _refit(terms[:, :used], levels, residual, spread)
+    return coefficients, spread + most / n * upper_median(levels.variance)
 
 
 def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
@@ -208,22 +221,6 @@ def adapted_shading(smooth: Shading, dark: Levels, light: Levels) -> Shading:
     by_local = [_unlike_others(near, above) for near, above in zip(local.near, local.above, strict=True)]
     errors = [np.abs(np.concatenate(left)).mean() for left in (richer.off_levels(both), by_local)]
     return local if errors[1] < _CLEARLY * errors[0] else richer
-
-
-def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
-    """Coefficients of a robust polynomial, and the variance of single levels around it [DN^2]."""
-    n = len(levels.level)
-    coefficients = np.zeros(_TERMS[-1])
-    if n == 0:
-        return coefficients, np.inf
-    terms = polynomial_terms(frame, levels.place, _TERMS[-1])
-    residual, spread = levels.level - upper_median(levels.level), 0.0
-    most = max([m for m in _TERMS if 3 * m <= n], default=1)
-    # Raise the degree step by step from the median, to find hidden squares before they change a gradient.
-    for used in (*_TERMS, *(most,) * _STEPS):
-        used = min(used, most)
-        coefficients[:used], residual, spread = _refit(terms[:, :used], levels, residual, spread)
-    return coefficients, spread + most / n * upper_median(levels.variance)
 
 
 def _richer(smooth: Shading, dark: Levels, light: Levels) -> Shading:

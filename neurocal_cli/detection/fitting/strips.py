@@ -11,9 +11,11 @@ from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 
 Single = NDArray[np.float32]
 
-_AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
+# Places around the middle of a line [squares]: itself, the ends, places beside these, and on the next lines.
+_AROUND = np.array(
+    [[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2], [0, -1], [0, 1]]
+)
 _CLOSEST = 0.5  # px, least distance of parallel lines, to avoid division by 0; insensitive
-_NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
 @frozen_dataclass(eq=False)
@@ -59,16 +61,15 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     r (growing c for vertical lines), else -1.
     """
     swap = vertical[:, None, None]
-    offsets = np.concatenate([_AROUND, _NEIGHBOURS])
-    offsets = np.where(swap, offsets[:, ::-1], offsets)
-    points = at.at(centre[:, None] + offsets)
+    points = at.at(centre[:, None] + np.where(swap, _AROUND[:, ::-1], _AROUND))
     middle, first, last = points[:, 0], points[:, 1], points[:, 2]
     tangent = last - first
     tangent /= np.hypot(*tangent.T)[:, None]
     turned = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
     normal = turned * (light * np.where(vertical, -1, 1))[:, None]
-    ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
-    sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
+    from_middle = points - middle[:, None]
+    ends = np.einsum("eki,ei->ek", from_middle[:, 1:3], tangent)
+    sag = np.einsum("eki,ei->ek", from_middle[:, 1:3], normal)
     # Put a parabola through both ends, and turn the frame by its slope at the origin.
     curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
     slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
@@ -78,7 +79,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     crossing /= np.hypot(crossing[..., 0], crossing[..., 1])[..., None]
     inward = np.einsum("eki,ei->ek", crossing, tangent) * [1.0, -1.0]
     crossing *= np.sign(inward)[..., None]
-    apart = np.einsum("eki,ei->ek", points[:, 7:9] - middle[:, None], normal)
+    apart = np.einsum("eki,ei->ek", from_middle[:, 7:9], normal)
     apart = np.stack([-apart.min(axis=1), apart.max(axis=1)], axis=-1)
     return Lines(middle, tangent, normal, curvature, ends, crossing, np.maximum(apart, _CLOSEST))
 
@@ -142,15 +143,27 @@ def strip_pixels(
     index, inside = packed(inside, used)
     s, d = s.reshape(-1).take(index), d.reshape(-1).take(index)
     u, v = lines.pixels(s, d)
-    return Strips(s, d, _values(image, lines, u, v), inside, u, v, 1 - used / np.maximum(total, 1))
-
-
-def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> Single:
-    """Image values at pixels (E, N) given relative to the lines' middles; padding may lie outside."""
-    column, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
+    place, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
     row *= image.shape[1]
-    row += column
-    return image.reshape(-1).take(row, mode="clip").astype(np.float32)
+    place += row
+    value = image.reshape(-1).take(place, mode="clip").astype(np.float32)  # padding may lie outside
+    return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1))
+
+
+def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
+    """(E, C rows) mask of the parallelograms' pixels inside the image; None if all are.
+
+    The pixels are `rows` consecutive ones from `top` (E, C) in each `column` (E, C); `size` (E, 2) is that of
+    the image.
+    """
+    wide, high = size[:, :1], size[:, 1:]
+    last = top + (rows - 1)
+    if (column >= 0).all() and (top >= 0).all() and (column < wide).all() and (last < high).all():
+        return None
+    row = top[:, :, None] + np.arange(rows)
+    inside = (row >= 0) & (row < high[:, :, None])
+    inside &= ((column >= 0) & (column < wide))[:, :, None]
+    return inside.reshape(len(column), -1)
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -168,19 +181,3 @@ def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[
 
 def _column(x: Array) -> Single:
     return np.asarray(x[:, None], dtype=np.float32)
-
-
-def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
-    """(E, C rows) mask of the parallelograms' pixels inside the image; None if all are.
-
-    The pixels are `rows` consecutive ones from `top` (E, C) in each `column` (E, C); `size` (E, 2) is that of
-    the image.
-    """
-    wide, high = size[:, :1], size[:, 1:]
-    last = top + (rows - 1)
-    if (column >= 0).all() and (top >= 0).all() and (column < wide).all() and (last < high).all():
-        return None
-    row = top[:, :, None] + np.arange(rows)
-    inside = (row >= 0) & (row < high[:, :, None])
-    inside &= ((column >= 0) & (column < wide))[:, :, None]
-    return inside.reshape(len(column), -1)

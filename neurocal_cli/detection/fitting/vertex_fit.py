@@ -1,4 +1,4 @@
-"""Model of vertices, where two edges cross, for maximum-likelihood fits to their pixels.
+"""Fit vertices, where two edges cross, to all their pixels by maximum likelihood, after the edges.
 
 The values of a fit are offset and tilt of both lines through the vertex, and those of `BatchFit`. With z1, z2
 the distances from the two lines in sigma, towards growing r and growing c, the light is
@@ -27,12 +27,22 @@ from neurocal_cli.detection.fitting.batched_newton import (
     FitPixels,
     Linearised,
     ProfileShape,
+    fit_batch,
     rows_for,
 )
+from neurocal_cli.detection.fitting.common_parameters import FieldBlur, correlation, level_prior, with_shift
 from neurocal_cli.detection.fitting.edge_fit import ALONE, REACH
-from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response, sharp_profile
+from neurocal_cli.detection.fitting.edge_profile import (
+    Real,
+    erf_and_density,
+    half_widths,
+    response,
+    sharp_profile,
+)
+from neurocal_cli.detection.fitting.grid_edges import GridImage
+from neurocal_cli.detection.fitting.grid_fit import LEAST_SCALE, STEPS, GridFit
+from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.shading import Shading, excess_variance
-from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, Single, grid_lines, packed, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 
@@ -41,11 +51,69 @@ from neurocal_cli.detection.medians import upper_median
 FIRST, SECOND = 0, 2
 # Insensitive.
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
-# Number of terms of the series for crossings with a cosine below each limit, and for all others;
-# tests/test_fit_models.py compares them with a rendered cross.
 _RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
 _NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
+# Number of terms of the series for crossings with a cosine below each limit, and for all others;
+# tests/test_fit_models.py compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
+
+
+def fit_grid_vertices(
+    grid_image: GridImage, fitted: GridFit
+) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
+    """Fit all known vertices after the edges; returns also their lines and a mask of the reliable ones."""
+    grid = grid_image.vertices
+    # Their normals point towards growing r and growing c.
+    at, ones, along_c = fitted.map.map, np.ones(len(grid)), np.zeros(len(grid), dtype=np.bool_)
+    lines = grid_lines(at, grid, along_c, ones), grid_lines(at, grid, ~along_c, ones)
+    light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
+    place = lines[0].middle
+    blur = fitted.blur
+    (first, spread), (second, _) = (blur.at(line) for line in lines)
+    sigma = 0.5 * (first + second)
+    # Ends of the lines, along c and along r, at which no vertex is known.
+    unknown = ~np.pad(grid_image.grid.seen, 1)
+    neighbours = [unknown[1:-1, :-2], unknown[1:-1, 2:], unknown[:-2, 1:-1], unknown[2:, 1:-1]]
+    last = np.stack([which[grid_image.grid.seen] for which in neighbours], axis=1).reshape(-1, 2, 2)
+    rho = correlation(blur, lines)
+    data = _vertex_pixels(grid_image.image, lines, light, (first, second), rho, fitted.shading, last)
+    shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
+    shape = with_shift(shape, upper_median(sigma), float(fitted.map.shift[0]))
+    prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
+    start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
+    unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
+    fit = fit_batch(vertex_model, unit, start, prior, shape, STEPS)
+    fit = fit.continued(shape, STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = _with_gradients(fit, of_blur=isinstance(blur, FieldBlur))
+    if fitted.shifts.used:
+        fit = replace(fit, values=fit.values - _displacements(fitted, grid, light, fit.values.shape[1]))
+    fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), LEAST_SCALE))
+    departure = np.zeros(len(grid))
+    for line, which in zip(lines, (FIRST, SECOND), strict=True):
+        variance = fit.covariance[:, which, which] + at.variance(grid, line.normal)
+        variance *= fitted.map.excess
+        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
+    # Map, blur and levels come from the edges: if no edge is reliable, no vertex is.
+    return fit, lines, is_reliable(fit, departure) & fitted.good.any()
+
+
+def _displacements(fitted: GridFit, grid: Array, light: Array, count: int) -> Array:
+    """(V, count) effect on the values of vertices of lines whose two halves have different shifts.
+
+    The halves are shifted in opposite directions; equal shifts only turn the line. The common response is in
+    the vertices' model.
+    """
+    result, ones = np.zeros((len(grid), count)), np.ones(len(grid))
+    for which, step in zip((FIRST, SECOND), 0.25 * np.eye(2), strict=True):
+        vertical = np.full(len(grid), which == SECOND)
+        before, after = (
+            fitted.shifts.beyond_response(
+                grid_lines(fitted.map.map, grid + side * step, vertical, ones), fitted.map.shift
+            )
+            for side in (-1, 1)
+        )
+        result[:, which] = 0.5 * light * (after - before)
+    return result
 
 
 @frozen_dataclass(eq=False)
@@ -60,17 +128,7 @@ class VertexPixels(FitPixels):
     relative: Single  # (V, 2) blur across both lines, relative to their mean
 
 
-def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
-    """Lines along c and along r through vertices (V, 2), half a square to both sides.
-
-    Their normals point towards growing r and growing c.
-    """
-    ones = np.ones(len(grid))
-    flat = np.zeros(len(grid), dtype=np.bool_)
-    return grid_lines(at, grid, flat, ones), grid_lines(at, grid, ~flat, ones)
-
-
-def vertex_pixels(
+def _vertex_pixels(
     image: NDArray[np.generic],
     lines: tuple[Lines, Lines],
     light: Array,
@@ -167,7 +225,30 @@ def vertex_model(data: VertexPixels, values: Array, shape: ProfileShape) -> Line
     return Linearised(rows, z, x)
 
 
-def with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
+@np.errstate(over="ignore", invalid="ignore")  # in fits that diverge, which are rejected
+def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
+    """Correction of E(z1) E(z2) for the angle between two lines, and its derivatives by z1 and z2.
+
+    It is the tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1}
+    He_{n-1}, with more terms for more oblique lines.
+    """
+    most = float(np.abs(rho).max(initial=0.0))
+    terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)
+    power: Real = 4 * rho * density
+    # He_{n-1} and He_n of both distances.
+    last1, now1, last2, now2 = np.ones_like(z1), z1, np.ones_like(z2), z2
+    series, by_z1, by_z2 = power.copy(), -power * z1, -power * z2
+    for n in range(2, terms + 1):
+        power = power * rho / n
+        last1, now1 = now1, z1 * now1 - (n - 1) * last1
+        last2, now2 = now2, z2 * now2 - (n - 1) * last2
+        series += power * last1 * last2
+        by_z1 -= power * now1 * last2
+        by_z2 -= power * last1 * now2
+    return series, by_z1, by_z2
+
+
+def _with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
     """Continue the fits of vertices by a step that also fits gradients of the light, and of the blur.
 
     Gradients that shading and blur of the board do not contain displace a vertex, because opposite squares
@@ -207,26 +288,3 @@ def with_gradients(fit: BatchFit, of_blur: bool) -> BatchFit:
     lost = cross.swapaxes(1, 2) @ np.linalg.solve(own[:, used[:, None], used] + prior, cross)
     chi2 = fit.chi2 - (right.swapaxes(1, 2) @ gradients)[:, 0, 0]
     return replace(fit, values=fit.values + step, information=fit.information - lost, chi2=chi2)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # in fits that diverge, which are rejected
-def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
-    """Correction of E(z1) E(z2) for the angle between two lines, and its derivatives by z1 and z2.
-
-    It is the tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1}
-    He_{n-1}, with more terms for more oblique lines.
-    """
-    most = float(np.abs(rho).max(initial=0.0))
-    terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)
-    power: Real = 4 * rho * density
-    # He_{n-1} and He_n of both distances.
-    last1, now1, last2, now2 = np.ones_like(z1), z1, np.ones_like(z2), z2
-    series, by_z1, by_z2 = power.copy(), -power * z1, -power * z2
-    for n in range(2, terms + 1):
-        power = power * rho / n
-        last1, now1 = now1, z1 * now1 - (n - 1) * last1
-        last2, now2 = now2, z2 * now2 - (n - 1) * last2
-        series += power * last1 * last2
-        by_z1 -= power * now1 * last2
-        by_z2 -= power * last1 * now2
-    return series, by_z1, by_z2

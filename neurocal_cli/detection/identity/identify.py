@@ -12,10 +12,8 @@ The criteria, in this order:
    right or down; of four, the one whose x axis points right. The choice changes if the board is turned, so
    the user is warned.
 
-Fit one projective camera to points of several planes by the direct linear transform.
-
-`identify` tests arrangements of grids with it. Distortion is not modelled: its few pixels are small compared
-with the errors of wrong arrangements, which are whole squares.
+The camera is projective, and fitted by the direct linear transform (`fit_camera`). Distortion is not
+modelled: its few pixels are small compared with the errors of wrong arrangements, which are whole squares.
 """
 
 from __future__ import annotations
@@ -39,96 +37,10 @@ from neurocal_cli.detection.identity.placement import (
     trimmed,
     wrong_size,
 )
-from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board import Board, Plane, is_flat
 
-_FLAT = 1e-6  # greatest ratio of thickness to extent of points in one plane, for rounding errors
+_ROUNDING = 1e-6  # greatest error of a motion that maps the board onto itself, relative to its extent
 _WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by this factor
-
-
-@frozen_dataclass
-class CameraFit:
-    """A projective camera fitted to points."""
-
-    rms: float  # [px]
-    # 1 for a camera, -1 for a mirror image, 0 if undetermined because of too little perspective or because
-    # all points lie in one plane
-    handed: int
-
-
-def is_flat(world: Array) -> bool:
-    """Whether points (N, 3) lie in one plane."""
-    extents = np.linalg.svd(world - world.mean(axis=0), compute_uv=False)
-    return bool(extents[2] <= _FLAT * extents[0])
-
-
-def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> CameraFit:
-    """Fit a camera to world points (N, 3) and pixels (N, 2) by the direct linear transform.
-
-    `front` (3,) is, for points in one plane, its normal that must point away from the camera.
-    """
-    flat = is_flat(world)
-    points = _plane_coordinates(world, front) if flat else world
-    P, rms = _linear_camera(points, pixels)
-    depth = np.column_stack([points, np.ones(len(points))]) @ P[2]
-    if not np.isfinite(rms) or depth.min() < 0 < depth.max():
-        return CameraFit(np.inf, 0)
-    undetermined = front is None if flat else _affine_rms(points, pixels) < _WEAK * rms
-    if undetermined:
-        return CameraFit(rms, 0)
-    return CameraFit(rms, int(np.sign(depth[0]) * np.sign(np.linalg.det(P[:, :3]))))
-
-
-def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
-    """R and t with ``second = first R^T + t`` for points (N, 3), R a rotation; None if no motion fits."""
-    a, b = first.mean(axis=0), second.mean(axis=0)
-    U, _, Vt = np.linalg.svd((first - a).T @ (second - b))
-    R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
-    t = b - R @ a
-    misses = np.abs(first @ R.T + t - second).max()
-    return (R, t) if misses <= _FLAT * max(float(np.ptp(first)), 1e-300) else None
-
-
-def _plane_coordinates(world: Array, front: Array | None) -> Array:
-    """Coordinates within the points' plane; with `front`, their axes and `front` are right-handed."""
-    centred = world - world.mean(axis=0)
-    x, y, normal = np.linalg.svd(centred, full_matrices=False)[2]
-    if front is not None and normal @ front * np.linalg.det([x, y, normal]) < 0:
-        y = -y
-    return centred @ np.array([x, y]).T
-
-
-def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
-    """Projection matrix (3, d + 1) from points (N, d) to pixels, and its rms error [px]."""
-    T, x = _scaled(points)
-    S, d = _scaled(pixels)
-    zeros = np.zeros_like(x)
-    rows = np.concatenate([np.hstack([x, zeros, -d[:, :1] * x]), np.hstack([zeros, x, -d[:, 1:2] * x])])
-    normal = np.linalg.eigh(rows.T @ rows)[1][:, 0]
-    P = np.linalg.inv(S) @ normal.reshape(3, -1) @ T
-    seen = np.column_stack([points, np.ones(len(points))]) @ P.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = seen[:, :2] / seen[:, 2:] - pixels
-    return P, _rms(error)
-
-
-def _affine_rms(points: Array, pixels: Array) -> float:
-    x = np.column_stack([points, np.ones(len(points))])
-    return _rms(x @ np.linalg.lstsq(x, pixels, rcond=None)[0] - pixels)
-
-
-def _rms(error: Array) -> float:
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
-
-
-def _scaled(points: Array) -> tuple[Array, Array]:
-    """Matrix that centres and scales points, and the scaled homogeneous points."""
-    centre = points.mean(axis=0)
-    size = float(np.sqrt(((points - centre) ** 2).mean())) or 1.0
-    d = points.shape[1]
-    T = np.eye(d + 1) / size
-    T[:d, d], T[d, d] = -centre / size, 1.0
-    return T, np.column_stack([(points - centre) / size, np.ones(len(points))])
-
 
 # tests/test_identity.py accepts and refuses rendered boards with these limits.
 _CLEARLY = 3.0  # ratio to the best rms error above which an arrangement is excluded
@@ -211,6 +123,25 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
     return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
 
 
+def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidate:
+    """Find the placements of a grid that its size, the board's ends and its colours allow."""
+    alone = len(board.planes) == 1
+    alike = [
+        k for k, plane in enumerate(board.planes) if sorted(grid.shape) == sorted((plane.cols, plane.rows))
+    ]
+    ends = board_ends(grey, grid) if alone or not alike else {}
+    if not alone:  # the pattern of another plane continues beyond a fold
+        ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
+    possible = [
+        placement
+        for k in alike or range(len(board.planes))
+        for placement in placements(grid, board.planes[k], k, ends, mirrored=not alone)
+    ]
+    if alone and (board.planes[0].cols + board.planes[0].rows) % 2 == 1:
+        possible = [placement for placement in possible if placement.first_square_is_dark(grid.dark)]
+    return _Candidate(grid, tuple(possible), bool(alike), ends)
+
+
 def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
     """Whether a grid may be a piece of a larger grid's board, which has another size."""
     ends_seen = candidate.whole and set(candidate.ends.values()) == {End.BOARD}
@@ -238,24 +169,6 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
             )
         kept += alike[:room]
     return sorted(kept, key=lambda c: -int(c.grid.seen.sum()))
-
-
-def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidate:
-    alone = len(board.planes) == 1
-    alike = [
-        k for k, plane in enumerate(board.planes) if sorted(grid.shape) == sorted((plane.cols, plane.rows))
-    ]
-    ends = board_ends(grey, grid) if alone or not alike else {}
-    if not alone:  # the pattern of another plane continues beyond a fold
-        ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
-    possible = [
-        placement
-        for k in alike or range(len(board.planes))
-        for placement in placements(grid, board.planes[k], k, ends, mirrored=not alone)
-    ]
-    if alone and (board.planes[0].cols + board.planes[0].rows) % 2 == 1:
-        possible = [placement for placement in possible if placement.first_square_is_dark(grid.dark)]
-    return _Candidate(grid, tuple(possible), bool(alike), ends)
 
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
@@ -296,6 +209,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement
 def _scored(
     board: Board, chosen: Sequence[_Candidate], arrangement: tuple[Placement, ...], front: Array | None
 ) -> _Arrangement:
+    """Fit a camera to some vertices of all grids; the error is infinite for a mirror image."""
     world, pixels = [], []
     for candidate, placement in zip(chosen, arrangement, strict=True):
         rows, columns = np.nonzero(candidate.grid.seen)
@@ -364,3 +278,82 @@ def _corners(plane: Plane) -> Array:
 def _box(cols: int, rows: int) -> list[list[int]]:
     """The four outermost vertices (c, r)."""
     return [[c, r] for r in (0, rows - 1) for c in (0, cols - 1)]
+
+
+def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
+    """R and t with ``second = first R^T + t`` for points (N, 3), R a rotation; None if no motion fits."""
+    a, b = first.mean(axis=0), second.mean(axis=0)
+    U, _, Vt = np.linalg.svd((first - a).T @ (second - b))
+    R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
+    t = b - R @ a
+    misses = np.abs(first @ R.T + t - second).max()
+    return (R, t) if misses <= _ROUNDING * max(float(np.ptp(first)), 1e-300) else None
+
+
+@frozen_dataclass
+class CameraFit:
+    """A projective camera fitted to points."""
+
+    rms: float  # [px]
+    # 1 for a camera, -1 for a mirror image, 0 if undetermined because of too little perspective or because
+    # all points lie in one plane
+    handed: int
+
+
+def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> CameraFit:
+    """Fit a camera to world points (N, 3) and pixels (N, 2) by the direct linear transform.
+
+    `front` (3,) is, for points in one plane, its normal that must point away from the camera.
+    """
+    flat = is_flat(world)
+    points = _plane_coordinates(world, front) if flat else world
+    P, rms = _linear_camera(points, pixels)
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    depth = homogeneous @ P[2]
+    if not np.isfinite(rms) or depth.min() < 0 < depth.max():
+        return CameraFit(np.inf, 0)
+    if flat:
+        undetermined = front is None
+    else:
+        affine = homogeneous @ np.linalg.lstsq(homogeneous, pixels, rcond=None)[0]
+        undetermined = _rms(affine - pixels) < _WEAK * rms
+    if undetermined:
+        return CameraFit(rms, 0)
+    return CameraFit(rms, int(np.sign(depth[0]) * np.sign(np.linalg.det(P[:, :3]))))
+
+
+def _plane_coordinates(world: Array, front: Array | None) -> Array:
+    """Coordinates within the points' plane; with `front`, their axes and `front` are right-handed."""
+    centred = world - world.mean(axis=0)
+    x, y, normal = np.linalg.svd(centred, full_matrices=False)[2]
+    if front is not None and normal @ front * np.linalg.det([x, y, normal]) < 0:
+        y = -y
+    return centred @ np.array([x, y]).T
+
+
+def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
+    """Projection matrix (3, d + 1) from points (N, d) to pixels, and its rms error [px]."""
+    T, x = _scaled(points)
+    S, d = _scaled(pixels)
+    zeros = np.zeros_like(x)
+    rows = np.concatenate([np.hstack([x, zeros, -d[:, :1] * x]), np.hstack([zeros, x, -d[:, 1:2] * x])])
+    normal = np.linalg.eigh(rows.T @ rows)[1][:, 0]
+    P = np.linalg.inv(S) @ normal.reshape(3, -1) @ T
+    seen = np.column_stack([points, np.ones(len(points))]) @ P.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = seen[:, :2] / seen[:, 2:] - pixels
+    return P, _rms(error)
+
+
+def _scaled(points: Array) -> tuple[Array, Array]:
+    """Matrix that centres and scales points, and the scaled homogeneous points."""
+    centre = points.mean(axis=0)
+    size = float(np.sqrt(((points - centre) ** 2).mean())) or 1.0
+    d = points.shape[1]
+    T = np.eye(d + 1) / size
+    T[:d, d], T[d, d] = -centre / size, 1.0
+    return T, np.column_stack([(points - centre) / size, np.ones(len(points))])
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt((error**2).sum(axis=1).mean()))

@@ -1,15 +1,14 @@
 """Placements of a grid on a plane of the board: rotated, mirrored if seen from behind, and shifted.
 
+The board's ends exclude most of them. `board_ends` decides whether the board ends at a side of a grid, or its
+pattern continues. One more ring of squares surrounds the outer vertices. If the board ends, the brightness
+beyond the ring is the same next to dark and light squares, and the change is where the next vertices would
+be. An occluder or the image border cuts the ring at another place.
+
 Before that, `trimmed` removes outer lines of a grid that are not lines of the board. False vertices occur
 where a corner of the paper lies near the outer squares, and at corners of squares on a fold.
 
-Decide whether the board ends at a side of a grid, or its pattern continues.
-
-One more ring of squares surrounds the outer vertices. If the board ends, the brightness beyond the ring is
-the same next to dark and light squares, and the change is where the next vertices would be. An occluder or
-the image border cuts the ring at another place.
-
-Error messages about images whose grids cannot be located on the board.
+A grid that cannot be placed gives a `NoBoardError`, whose message says what the image shows instead.
 """
 
 from __future__ import annotations
@@ -27,8 +26,12 @@ from neurocal_cli.detection.grid import TURNS, Grid
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.board import Board, Plane
 
+Matrix = tuple[tuple[int, int], tuple[int, int]]
+
 # Sides of a grid, named by their outward directions (c, r).
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_SIDES: tuple[tuple[slice | int, ...], ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
+_MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
 
 # With these limits tests/test_identity.py classifies ends of rendered boards, occluders and image borders.
 _STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
@@ -38,6 +41,106 @@ _SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark
 _AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
 _SHARE = 0.75  # least share of the squares along a side that must agree
 _FEWEST = 2  # least number of usable squares at a side
+
+# With these limits tests/test_identity.py removes false lines, and keeps those of larger boards.
+_FEW = 0.34  # a line may be removed if at most this share of its vertices was found
+_FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a camera afterwards
+
+# Least share of a grid's vertices that are found if it is a whole board. On photographs it is 0.89 and more
+# for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.
+_WHOLE = 0.8
+
+SYMMETRIC_BOARD = (
+    "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
+    "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
+    "an odd number on the other"
+)
+
+
+@frozen_dataclass
+class Placement:
+    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``."""
+
+    plane: int  # position among the board's planes
+    matrix: Matrix  # a rotation by a multiple of 90 degrees, with or without a reflection
+    offset: tuple[int, int]
+
+    def apply(self, grid: ArrayLike) -> Array:
+        """Plane coordinates (..., 2) of grid coordinates."""
+        return np.asarray(grid) @ np.array(self.matrix).T + np.array(self.offset)
+
+    def first_square_is_dark(self, dark: int) -> bool:
+        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark, by `Grid.dark`."""
+        centre = (np.array([0.5, 0.5]) - np.array(self.offset)) @ np.array(self.matrix)  # matrix^-1
+        return bool((np.floor(centre).sum() + dark) % 2 == 0)
+
+    def axis(self, grid: Grid) -> Array:
+        """Mean direction of the plane's x axis in the image of a grid; (2,) unit vector."""
+        steps = (np.diff(grid.pixels, axis=1), np.diff(grid.pixels, axis=0))  # along c, along r
+        along_c, along_r = (np.nanmean(step.reshape(-1, 2), axis=0) for step in steps)
+        axis = self.matrix[0][0] * along_c + self.matrix[0][1] * along_r
+        return np.asarray(axis / np.hypot(*axis))
+
+
+def placements(
+    grid: Grid, plane: Plane, index: int, ends: Mapping[tuple[int, int], End], *, mirrored: bool
+) -> Iterator[Placement]:
+    """Enumerate the placements of a grid on the plane of this index that agree with the board's ends.
+
+    The ends are given by the directions of the grid's sides; absent sides are unknown. The plane may be seen
+    from behind if `mirrored`.
+    """
+    last = plane.cols - 1, plane.rows - 1
+    cols, rows = grid.shape
+    for matrix in (*TURNS, *(_MIRRORED if mirrored else ())):
+        corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # the grid's, opposite to (0, 0)
+        size = abs(corner[0]), abs(corner[1])
+        for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
+            stop = start[0] + size[0], start[1] + size[1]
+            if _allowed(matrix, start, stop, last, ends):
+                yield Placement(index, matrix, (start[0] - min(corner[0], 0), start[1] - min(corner[1], 0)))
+
+
+def _allowed(
+    matrix: Matrix,
+    start: tuple[int, ...],
+    stop: tuple[int, ...],
+    last: tuple[int, int],
+    ends: Mapping[tuple[int, int], End],
+) -> bool:
+    """Whether a grid's sides lie at the ends of the plane, 0 and `last`, exactly where the board ends."""
+    for direction, end in ends.items():
+        if end is End.UNKNOWN:
+            continue
+        outwards = [a * direction[0] + b * direction[1] for a, b in matrix]
+        axis = 0 if outwards[0] else 1
+        at_end = start[axis] == 0 if outwards[axis] < 0 else stop[axis] == last[axis]
+        if at_end != (end is End.BOARD):
+            return False
+    return True
+
+
+def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
+    """Remove outer lines with few vertices from a grid that is too large for every plane.
+
+    The grid stays as it is if it fits, or if removing such lines does not make it fit.
+    """
+    left = grid
+    few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
+    sizes = [sorted((plane.cols, plane.rows)) for plane in planes]
+    while True:
+        short, long = sorted(left.shape)
+        if any(short <= narrow and long <= wide for narrow, wide in sizes):
+            return left
+        shares = [float(left.seen[side].mean()) for side in _SIDES]
+        if min(shares) > few or short <= 3:
+            return grid
+        pixels = left.pixels.copy()
+        pixels[_SIDES[shares.index(min(shares))]] = np.nan
+        # This removes the line, and lines beside it that are empty now.
+        seen = np.isfinite(pixels[..., 0])
+        (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
+        left = Grid(pixels[top : bottom + 1, west : east + 1], int(left.dark + top + west) % 2)
 
 
 class End(Enum):
@@ -147,125 +250,6 @@ def _sample(grey: NDArray[np.generic], places: Array) -> Array:
     return np.where(inside, (1 - b) * upper + b * lower, np.nan)
 
 
-Side = tuple[slice | int, ...]
-
-_SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
-
-# With these limits tests/test_identity.py removes false lines, and keeps those of larger boards.
-_FEW = 0.34  # a line may be removed if at most this share of its vertices was found
-_FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a camera afterwards
-
-
-def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
-    """Remove outer lines with few vertices from a grid that is too large for every plane.
-
-    The grid stays as it is if it fits, or if removing such lines does not make it fit.
-    """
-    left = grid
-    few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
-    while not _fits(left, planes):
-        shares = [float(left.seen[side].mean()) for side in _SIDES]
-        if min(shares) > few or min(left.shape) <= 3:
-            return grid
-        left = _without(left, _SIDES[shares.index(min(shares))])
-    return left
-
-
-def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
-    size = sorted(grid.shape)
-    return any(
-        size[0] <= min(plane.cols, plane.rows) and size[1] <= max(plane.cols, plane.rows) for plane in planes
-    )
-
-
-def _without(grid: Grid, side: Side) -> Grid:
-    """Remove the line of a side, and lines that are then empty."""
-    pixels = grid.pixels.copy()
-    pixels[side] = np.nan
-    seen = np.isfinite(pixels[..., 0])
-    (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
-    return Grid(pixels[top : bottom + 1, west : east + 1], int(grid.dark + top + west) % 2)
-
-
-Matrix = tuple[tuple[int, int], tuple[int, int]]
-
-_MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
-
-
-@frozen_dataclass
-class Placement:
-    """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``."""
-
-    plane: int  # position among the board's planes
-    matrix: Matrix  # a rotation by a multiple of 90 degrees, with or without a reflection
-    offset: tuple[int, int]
-
-    def apply(self, grid: ArrayLike) -> Array:
-        """Plane coordinates (..., 2) of grid coordinates."""
-        return np.asarray(grid) @ np.array(self.matrix).T + np.array(self.offset)
-
-    def first_square_is_dark(self, dark: int) -> bool:
-        """Whether the square between the plane's vertices (0, 0) and (1, 1) is dark, by `Grid.dark`."""
-        centre = (np.array([0.5, 0.5]) - np.array(self.offset)) @ np.array(self.matrix)  # matrix^-1
-        return bool((np.floor(centre).sum() + dark) % 2 == 0)
-
-    def axis(self, grid: Grid) -> Array:
-        """Mean direction of the plane's x axis in the image of a grid; (2,) unit vector."""
-        steps = (np.diff(grid.pixels, axis=1), np.diff(grid.pixels, axis=0))  # along c, along r
-        along_c, along_r = (np.nanmean(step.reshape(-1, 2), axis=0) for step in steps)
-        axis = self.matrix[0][0] * along_c + self.matrix[0][1] * along_r
-        return np.asarray(axis / np.hypot(*axis))
-
-
-def placements(
-    grid: Grid, plane: Plane, index: int, ends: Mapping[tuple[int, int], End], *, mirrored: bool
-) -> Iterator[Placement]:
-    """Enumerate the placements of a grid on the plane of this index that agree with the board's ends.
-
-    The ends are given by the directions of the grid's sides; absent sides are unknown. The plane may be seen
-    from behind if `mirrored`.
-    """
-    last = plane.cols - 1, plane.rows - 1
-    cols, rows = grid.shape
-    for matrix in (*TURNS, *(_MIRRORED if mirrored else ())):
-        corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # the grid's, opposite to (0, 0)
-        size = abs(corner[0]), abs(corner[1])
-        for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
-            stop = start[0] + size[0], start[1] + size[1]
-            if _allowed(matrix, start, stop, last, ends):
-                yield Placement(index, matrix, (start[0] - min(corner[0], 0), start[1] - min(corner[1], 0)))
-
-
-def _allowed(
-    matrix: Matrix,
-    start: tuple[int, ...],
-    stop: tuple[int, ...],
-    last: tuple[int, int],
-    ends: Mapping[tuple[int, int], End],
-) -> bool:
-    """Whether a grid's sides lie at the ends of the plane, 0 and `last`, exactly where the board ends."""
-    for direction, end in ends.items():
-        if end is End.UNKNOWN:
-            continue
-        outwards = [a * direction[0] + b * direction[1] for a, b in matrix]
-        axis = 0 if outwards[0] else 1
-        at_end = start[axis] == 0 if outwards[axis] < 0 else stop[axis] == last[axis]
-        if at_end != (end is End.BOARD):
-            return False
-    return True
-
-
-# Least share of a grid's vertices that are found if it is a whole board. On photographs it is 0.89 and more
-# for boards, and at most 0.77 for blinds, tiled floors and textures. It changes only a message.
-_WHOLE = 0.8
-
-SYMMETRIC_BOARD = (
-    "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
-    "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
-    "an odd number on the other"
-)
-
-
 class NoBoardError(NeurocalError):
     """The image does not show the board, or not enough of it to locate its points.
 
@@ -275,13 +259,6 @@ class NoBoardError(NeurocalError):
     def __init__(self, message: str, shown: tuple[int, int] | None = None) -> None:
         super().__init__(message)
         self.shown = shown
-
-
-def _in_order(shape: tuple[int, int], board: Board) -> tuple[int, int]:
-    """Columns and rows of a grid in the order of a board of one plane."""
-    if len(board.planes) == 1 and (shape[0] < shape[1]) != (board.planes[0].cols < board.planes[0].rows):
-        return shape[1], shape[0]
-    return shape
 
 
 def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
@@ -328,6 +305,13 @@ def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
         f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
         "axes, or take the image from nearer"
     )
+
+
+def _in_order(shape: tuple[int, int], board: Board) -> tuple[int, int]:
+    """Columns and rows of a grid in the order of a board of one plane."""
+    if len(board.planes) == 1 and (shape[0] < shape[1]) != (board.planes[0].cols < board.planes[0].rows):
+        return shape[1], shape[0]
+    return shape
 
 
 def _sizes(board: Board) -> str:
