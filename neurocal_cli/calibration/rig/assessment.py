@@ -230,7 +230,10 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if len(rig.pairs) == 1:
         yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
     if e.moved is not None:
-        yield _rig_moved(rig, e, e.moved)
+        parts = (e.names[: e.moved.at], e.names[e.moved.at :])
+        kept = [part for part in parts if not set(part).isdisjoint(rig.pairs)]
+        text, advice = describe_move(e.names, e.size, e.moved, kept[0] if len(kept) == 1 else ())
+        yield _CHANGE.grade(e.moved.gain), text, advice
     odd = {
         pair: why for pair, why in rig.left_out.items() if not (e.moved is not None and why.startswith(MOVED))
     }
@@ -257,13 +260,6 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         "the same moment, or the cameras are not fixed to each other",
         _MOMENT,
     )
-
-
-def _rig_moved(rig: Rig, e: _Evidence, found: Contradiction) -> Finding:
-    used = set(rig.pairs)
-    kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
-    text, advice = describe_move(e.names, e.size, found, kept[0] if len(kept) == 1 else ())
-    return _CHANGE.grade(found.gain), text, advice
 
 
 def _changed(e: _Evidence, found: Contradiction) -> Finding:
