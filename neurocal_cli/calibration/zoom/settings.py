@@ -1,6 +1,4 @@
-"""Known points and their images at many settings of one zoom lens.
-
-Normal matrices of the reprojection error at each setting.
+"""Known points at many settings of one zoom lens, and normal matrices of their reprojection error.
 
 The local parameters change with the setting: alpha_u, alpha_v, u0, v0, t_z and the distortion coefficients.
 All settings share the constants (the paper's zero-order terms): theta and, for a still camera, R, t_x, t_y.
@@ -33,6 +31,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences
 
 CONTROLS = ("zoom", "focus")
+_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 
 @frozen_dataclass(eq=False)
@@ -147,9 +146,6 @@ def far_value(controls: tuple[str, ...], settings: Array) -> str | None:
             if 0 < np.ptp(near) < np.abs(near - far).min():
                 return f"{name} {far:.10g} is far from the others, {near[0]:.10g} to {near[-1]:.10g}"
     return None
-
-
-_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 
 @frozen_dataclass(eq=False)
