@@ -154,6 +154,11 @@ class RigProblem:
         return estimated_parameters(left), estimated_parameters(right)
 
     @property
+    def estimated_shared(self) -> NDArray[np.bool_]:
+        """(n_shared,) which of the unknowns that all views share are estimated, of the rig's all."""
+        return np.concatenate([*self.estimated, np.ones(6, dtype=bool)])
+
+    @property
     def pairs(self) -> list[tuple[str, str]]:
         """Left and right names of the paired views."""
         left, right = self.names

@@ -66,22 +66,6 @@ _STEP = 1e-2  # standard deviations: small enough to be linear, large against ro
 _LEAST_STEP = 1e-9
 
 
-@frozen_dataclass(eq=False)
-class _Evidence:
-    """Measures of a rig's quality; nan and None if a view does not determine its pose."""
-
-    # Side of each camera, whether something of it was given, and the verdict by its own points.
-    cameras: list[tuple[str, bool, Verdict]]
-    names: tuple[tuple[str, str], ...]  # of all pairs, in order
-    size: Array  # (P,) of each pair's target [world unit]
-    moved: Contradiction | None = None  # of all pairs, if the rig moved
-    contradiction: Contradiction | None = None  # of the pairs that determine the rig
-    displacement: float = np.nan  # rms distance of the targets from their predicted positions [world unit]
-    held_out_px: float = np.nan  # five-fold cross-validation error over pairs, if any can be left out
-    depth: float = np.nan  # median depth of the points [world unit]
-    depth_share: float = np.nan  # median std of triangulated depth over the depth, for exact pixels
-
-
 def assess_rig(rig: Rig) -> Verdict | None:
     """Good, usable or poor, with reasons and advice; None for a rig without points of its own."""
     pairs = (*rig.pairs, *rig.left_out)
@@ -101,6 +85,22 @@ def assess_rig(rig: Rig) -> Verdict | None:
         "depth_share": evidence.depth_share,
     }
     return verdict_of(_findings(rig, evidence), measures)
+
+
+@frozen_dataclass(eq=False)
+class _Evidence:
+    """Measures of a rig's quality; nan and None if a view does not determine its pose."""
+
+    # Side of each camera, whether something of it was given, and the verdict by its own points.
+    cameras: list[tuple[str, bool, Verdict]]
+    names: tuple[tuple[str, str], ...]  # of all pairs, in order
+    size: Array  # (P,) of each pair's target [world unit]
+    moved: Contradiction | None = None  # of all pairs, if the rig moved
+    contradiction: Contradiction | None = None  # of the pairs that determine the rig
+    displacement: float = np.nan  # rms distance of the targets from their predicted positions [world unit]
+    held_out_px: float = np.nan  # five-fold cross-validation error over pairs, if any can be left out
+    depth: float = np.nan  # median depth of the points [world unit]
+    depth_share: float = np.nan  # median std of triangulated depth over the depth, for exact pixels
 
 
 def _evidence(rig: Rig) -> _Evidence:
@@ -171,7 +171,7 @@ def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array
     `covariance` (F, F) is that of the unknowns of the relative poses. That of given cameras is added. The
     points are evenly spaced over the pairs; nan for points that are behind a camera.
     """
-    estimated = np.append(np.concatenate(poses.problem.estimated), np.ones(6, dtype=bool))
+    estimated = poses.problem.estimated_shared
     state = poses.problem.start(rig.pose)
     given = covariance_by_given(poses.problem, state, poses.problem.normal(state)[0], estimated)
     shared = np.zeros((len(estimated), len(estimated)))

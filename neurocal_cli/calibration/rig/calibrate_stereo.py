@@ -272,7 +272,7 @@ def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[R
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     """Covariance of the shared parameters if that of independent points is too small; else None."""
-    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
+    estimated = fit.problem.estimated_shared
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None

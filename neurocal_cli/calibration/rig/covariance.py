@@ -203,8 +203,7 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
     if not is_flat(world) or not fit.variance > 0:
         return None
-    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
-    columns = fit.state.columns
+    estimated, columns = fit.problem.estimated_shared, fit.state.columns
     kept = np.append(np.flatnonzero(estimated), np.arange(columns.width - 1, columns.width + 2))
     whole = eliminate(_with_stretches(fit, stretches(world)), kept, columns.pose)[0].sum(axis=0)
     found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)

@@ -125,6 +125,8 @@ def evaluate_rig(
 
 
 class _Evaluator:
+    """Two cameras and the points of both, with the poses of views that the cameras do not have."""
+
     def __init__(
         self,
         cameras: tuple[Calibration, Calibration],
@@ -180,16 +182,16 @@ class _Evaluator:
                     f"and are left out of all averages{' of the rig' if error is through else ''}"
                 )
         return StereoEvaluation(
-            self.points[0].unit,
-            by_view,
-            through,
-            float("nan") if rig is None else rig.baseline,
-            pairs,
-            (self.views.left_only, self.views.right_only),
-            tuple(a for a, _ in self.new),
-            (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
-            tuple(self.warnings),
-            judgement,
+            unit=self.points[0].unit,
+            by_view=by_view,
+            rig=through,
+            baseline=float("nan") if rig is None else rig.baseline,
+            pairs=pairs,
+            alone=(self.views.left_only, self.views.right_only),
+            fitted=tuple(a for a, _ in self.new),
+            models=(self.cameras[0].distortion_model, self.cameras[1].distortion_model),
+            warnings=tuple(self.warnings),
+            judgement=judgement,
         )
 
     def _judgement(self) -> Verdict | None:

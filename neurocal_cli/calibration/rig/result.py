@@ -31,8 +31,8 @@ _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal 
 def assemble_rig(
     fit: RigFit,
     left_out: Mapping[tuple[str, str], str],
-    least: Array | None = None,
-    stretched: Array | None = None,
+    least: Array | None,
+    stretched: Array | None,
 ) -> Rig:
     """Convert an adjusted rig to the user's units.
 

@@ -157,8 +157,8 @@ def _all_shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str
         return ""
     for word in SHIFTED:
         moved = _neighbours(views.both, word)
-        agree = find_consensus(rig_problem(left, right, ViewPairs(moved))).agree
-        if agree.mean() > _AGREED:
+        faults = find_consensus(rig_problem(left, right, ViewPairs(moved))).reasons
+        if faults.count("") / len(faults) > _AGREED:
             return (
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
                 f"not that of its own; {PAIR_ANEW}"
@@ -252,7 +252,6 @@ class RigConsensus:
     """The rig that most pairs of views support."""
 
     rig: Pose  # X_right = R X_left + t [world unit]
-    agree: NDArray[np.bool_]  # (P,)
     reasons: tuple[str, ...]  # fault of each pair; empty for those that agree
 
 
@@ -262,11 +261,10 @@ def find_consensus(problem: RigProblem) -> RigConsensus:
     R, t = poses.rigs()
     agree = _distance(problem, poses, R, t) < 1
     best = int(np.argmax(agree.sum(axis=1)))
-    reasons = ("",) * len(problem.paired)
     if agree[best].all():
-        return RigConsensus(_mean_rig(poses, agree[best]), agree[best], reasons)
+        return RigConsensus(_mean_rig(poses, agree[best]), ("",) * len(problem.paired))
     R, t, sound = _common_fault(problem, poses, (R[best], t[best], agree[best]))
-    return RigConsensus(_mean_rig(poses, sound), sound, _reasons(problem, poses, R, t, sound))
+    return RigConsensus(_mean_rig(poses, sound), _reasons(problem, poses, R, t, sound))
 
 
 @frozen_dataclass(eq=False)

@@ -39,6 +39,7 @@ from neurocal_cli.calibration.zoom.settings import (
     Tables,
     local_names,
     scaled_controls,
+    symmetric,
 )
 from neurocal_cli.calibration.zoom.target import lens_target, on_target, target_coupling
 from neurocal_cli.calibration.zoom.zoom_lens import Member, ZoomLens
@@ -321,6 +322,5 @@ def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Norm
     """Inverse covariances of the given parameters, from the size of their errors."""
     outputs, by_local = local_to_outputs(members[0].scale, local)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[..., None])
-    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, like one read from a file
     S, L = local.shape
-    return Normal(H, np.zeros((S, L)), np.zeros(S), True)
+    return Normal(symmetric(H), np.zeros((S, L)), np.zeros(S), True)

@@ -180,6 +180,11 @@ class Normal:
         return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
 
 
+def symmetric(H: Array) -> Array:
+    """Matrices (S, n, n) of the upper halves of others: exactly symmetric, like those read from a file."""
+    return np.asarray(np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2))
+
+
 @frozen_dataclass(eq=False)
 class Tables:
     """Local parameters at each setting and the constants that go with them."""
@@ -253,8 +258,7 @@ class PixelData:
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
-        upper = np.triu(summed)  # exactly symmetric, like one read from a file
-        summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
+        summed = symmetric(summed)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
         return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
 
