@@ -155,7 +155,7 @@ class RigProblem:
 
     @property
     def estimated_shared(self) -> NDArray[np.bool_]:
-        """(n_shared,) which of the unknowns that all views share are estimated, of the rig's all."""
+        """(n_shared,) which unknowns that all views share are estimated; the six of the rig always are."""
         return np.concatenate([*self.estimated, np.ones(6, dtype=bool)])
 
     @property
