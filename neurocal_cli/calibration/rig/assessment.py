@@ -66,22 +66,6 @@ _STEP = 1e-2  # standard deviations: small enough to be linear, large against ro
 _LEAST_STEP = 1e-9
 
 
-@frozen_dataclass(eq=False)
-class _Evidence:
-    """Measures of a rig's quality; nan and None if a view does not determine its pose."""
-
-    # Side of each camera, whether something of it was given, and the verdict by its own points.
-    cameras: list[tuple[str, bool, Verdict]]
-    names: tuple[tuple[str, str], ...]  # of all pairs, in order
-    size: Array  # (P,) of each pair's target [world unit]
-    moved: Contradiction | None = None  # of all pairs, if the rig moved
-    contradiction: Contradiction | None = None  # of the pairs that determine the rig
-    displacement: float = np.nan  # rms distance of the targets from their predicted positions [world unit]
-    held_out_px: float = np.nan  # five-fold cross-validation error over pairs, if any can be left out
-    depth: float = np.nan  # median depth of the points [world unit]
-    depth_share: float = np.nan  # median std of triangulated depth over the depth, for exact pixels
-
-
 def assess_rig(rig: Rig) -> Verdict | None:
     """Good, usable or poor, with reasons and advice; None for a rig without points of its own."""
     pairs = (*rig.pairs, *rig.left_out)
@@ -101,6 +85,22 @@ def assess_rig(rig: Rig) -> Verdict | None:
         "depth_share": evidence.depth_share,
     }
     return verdict_of(_findings(rig, evidence), measures)
+
+
+@frozen_dataclass(eq=False)
+class _Evidence:
+    """Measures of a rig's quality; nan and None if a view does not determine its pose."""
+
+    # Side of each camera, whether something of it was given, and the verdict by its own points.
+    cameras: list[tuple[str, bool, Verdict]]
+    names: tuple[tuple[str, str], ...]  # of all pairs, in order
+    size: Array  # (P,) of each pair's target [world unit]
+    moved: Contradiction | None = None  # of all pairs, if the rig moved
+    contradiction: Contradiction | None = None  # of the pairs that determine the rig
+    displacement: float = np.nan  # rms distance of the targets from their predicted positions [world unit]
+    held_out_px: float = np.nan  # five-fold cross-validation error over pairs, if any can be left out
+    depth: float = np.nan  # median depth of the points [world unit]
+    depth_share: float = np.nan  # median std of triangulated depth over the depth, for exact pixels
 
 
 def _evidence(rig: Rig) -> _Evidence:
@@ -171,7 +171,7 @@ def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array
     `covariance` (F, F) is that of the unknowns of the relative poses. That of given cameras is added. The
     points are evenly spaced over the pairs; nan for points that are behind a camera.
     """
-    estimated = np.append(np.concatenate(poses.problem.estimated), np.ones(6, dtype=bool))
+    estimated = poses.problem.estimated_shared
     state = poses.problem.start(rig.pose)
     given = covariance_by_given(poses.problem, state, poses.problem.normal(state)[0], estimated)
     shared = np.zeros((len(estimated), len(estimated)))
@@ -230,7 +230,10 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if len(rig.pairs) == 1:
         yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
     if e.moved is not None:
-        yield _rig_moved(rig, e, e.moved)
+        parts = (e.names[: e.moved.at], e.names[e.moved.at :])
+        kept = [part for part in parts if not set(part).isdisjoint(rig.pairs)]
+        text, advice = describe_move(e.names, e.size, e.moved, kept[0] if len(kept) == 1 else ())
+        yield _CHANGE.grade(e.moved.gain), text, advice
     odd = {
         pair: why for pair, why in rig.left_out.items() if not (e.moved is not None and why.startswith(MOVED))
     }
@@ -257,13 +260,6 @@ def _pairs(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         "the same moment, or the cameras are not fixed to each other",
         _MOMENT,
     )
-
-
-def _rig_moved(rig: Rig, e: _Evidence, found: Contradiction) -> Finding:
-    used = set(rig.pairs)
-    kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
-    text, advice = describe_move(e.names, e.size, found, kept[0] if len(kept) == 1 else ())
-    return _CHANGE.grade(found.gain), text, advice
 
 
 def _changed(e: _Evidence, found: Contradiction) -> Finding:

@@ -1,6 +1,7 @@
-"""`calibrate_stereo`: calibration of a rig from the points of two cameras.
+"""Calibration of a rig: from the points of two cameras, or from two cameras calibrated already.
 
-The rig of two calibrated cameras: outlier views and the common bundle adjustment.
+`calibrate_stereo` calibrates each camera alone first. `fit_rig` leaves out the pairs of views that contradict
+most others, adjusts the rig together with the poses and, if wanted, the cameras, and finds its covariance.
 """
 
 from __future__ import annotations
@@ -41,6 +42,138 @@ from neurocal_cli.observations.target import Target
 # refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
 _SPOILS = 1.6
 _BASELINE_SIGMAS = 3.0  # a baseline below this number of standard deviations counts as 0
+_SIDES = ("left", "right")
+_ROUNDS = 2  # rounds of selecting lenses and target alternately
+_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
+
+
+def calibrate_stereo(
+    left: Correspondences,
+    right: Correspondences,
+    left_options: Mapping[str, Any] | None = None,
+    right_options: Mapping[str, Any] | None = None,
+    *,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Rig:
+    """Calibrate two cameras and their rig from random weights.
+
+    Each camera is calibrated alone, as by `calibrate`. The rig is then found from the views of both cameras,
+    which are paired by name. A common bundle adjustment refines both cameras, the rig and all poses. Views of
+    one camera alone contribute to that camera. If the distortion models are selected automatically, both
+    cameras get the same one unless the points contradict that.
+
+    Parameters
+    ----------
+    left, right : Correspondences
+        In one world unit. Views are paired by name, points by id, else by X, Y, Z (see `pairing`).
+    left_options, right_options : dict, optional
+        Arguments of `calibrate` for one camera, such as ``type=3, intrinsics=camera`` for a known one.
+    progress : callable, optional
+        Called with the name of a stage and the share of it that is done.
+    **options
+        Arguments of `calibrate` for both cameras. `outliers` also applies to pairs of views that contradict
+        the others.
+
+    Returns
+    -------
+    Rig
+        ``X_right = R X_left + t``.
+
+    Raises
+    ------
+    UsageError
+        As `calibrate`; an option that it does not have; type 4, where all poses are known.
+    InputError, DegenerateGeometryError
+        The points do not determine the rig; the message says why.
+    """
+    sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
+    unknown = set().union(*sides) - set(signature(calibrate).parameters)
+    if unknown:
+        raise UsageError(f"calibrate has no option {min(unknown)!r}; correct its name or leave it out")
+    if any(side.get("type", 1) == 4 for side in sides):
+        raise UsageError(
+            "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
+            "camera"
+        )
+    # Errors of pairing are reported before the training.
+    pair_points(left, right, pair_views(left.view_names, right.view_names))
+    cameras, kept = _cameras_on_one_target(left, right, sides, progress)
+    best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
+    outliers = options.get("outliers", "reject")
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=outliers, target_kept=kept)
+    warnings = [
+        f"{name}: {text}"
+        for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
+        for text in camera.warnings
+    ]
+    return replace(rig, warnings=(*rig.warnings, *warnings))
+
+
+def _cameras_on_one_target(
+    left: Correspondences,
+    right: Correspondences,
+    sides: Sequence[Mapping[str, Any]],
+    progress: Progress | None,
+) -> tuple[list[Calibration], bool]:
+    """Calibrate both cameras on one target, which is estimated from both if the points support that.
+
+    Also returns whether the given target was kept although it could have been estimated.
+    """
+    choice = sides[0].get("target", "auto")
+
+    def camera(side: int, target: str | Target, preferred: str = "") -> Calibration:
+        name, points = _SIDES[side], (left, right)[side]
+        options = {"camera_name": name, **sides[side], "target": target, "preferred": preferred}
+        return calibrate(points, **options, progress=_named(progress, name))
+
+    def calibrated(target: str | Target) -> list[Calibration]:
+        cameras = [camera(side, target) for side in (0, 1)]
+        for side in _others_model(cameras):
+            model = cameras[1 - side].distortion_model
+            alike = camera(side, target, model)
+            if alike.distortion_model == model:
+                cameras[side] = alike
+                break
+        return cameras
+
+    surveyed = left.world_std is not None or right.world_std is not None
+    cameras = calibrated(choice if surveyed else "given")
+    for _ in range(_ROUNDS):
+        target = common_target(cameras, choice)
+        if target is None:
+            break
+        before = [camera.distortion_model for camera in cameras]
+        cameras = calibrated(target)
+        if [camera.distortion_model for camera in cameras] == before:
+            break
+    kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
+    return cameras, kept
+
+
+def _others_model(cameras: Sequence[Calibration]) -> list[int]:
+    """Sides that could take the other camera's distortion model, first the one that loses less by it.
+
+    Both cameras of a rig are mostly of the same type, so their models differ only if the points require it.
+    """
+    models = [camera.distortion_model for camera in cameras]
+    choices = [camera.lens_choice for camera in cameras]
+    if models[0] == models[1] or not all(choices):
+        return []
+    cost = [
+        choices[side].get(models[1 - side], math.inf) / max(choices[side][models[side]], 1e-300)
+        for side in (0, 1)
+    ]
+    sides = [
+        side for side in (0, 1) if math.isfinite(cost[side]) and models[1 - side] in cameras[side].would_take
+    ]
+    return sorted(sides, key=lambda side: cost[side])
+
+
+def _named(progress: Progress | None, name: str) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda stage, share: progress(f"{name} camera: {stage}", share)
 
 
 def fit_rig(
@@ -130,8 +263,8 @@ def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[R
         for side in not_monotonic:
             moving[side] = False
             warnings.append(
-                f"after the common bundle adjustment the distortion model of the {('left', 'right')[side]} "
-                "camera is not monotonic (maps two directions to one pixel) inside the image, where there "
+                f"after the common bundle adjustment the distortion model of the {_SIDES[side]} camera "
+                "is not monotonic (maps two directions to one pixel) inside the image, where there "
                 "are no points; the result of its own views is kept; add views that show the board in the "
                 "image's corners"
             )
@@ -139,7 +272,7 @@ def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[R
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     """Covariance of the shared parameters if that of independent points is too small; else None."""
-    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
+    estimated = fit.problem.estimated_shared
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None
@@ -184,137 +317,3 @@ def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: Vie
     state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
     R, t = problem.world_poses(state, side=0)
     return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}
-
-
-_SIDES = ("left", "right")
-_ROUNDS = 2  # rounds of selecting lenses and target alternately
-_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
-
-
-def calibrate_stereo(
-    left: Correspondences,
-    right: Correspondences,
-    left_options: Mapping[str, Any] | None = None,
-    right_options: Mapping[str, Any] | None = None,
-    *,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Rig:
-    """Calibrate two cameras and their rig from random weights.
-
-    Each camera is calibrated alone, as by `calibrate`. The rig is then found from the views of both cameras,
-    which are paired by name. A common bundle adjustment refines both cameras, the rig and all poses. Views of
-    one camera alone contribute to that camera. If the distortion models are selected automatically, both
-    cameras get the same one unless the points contradict that.
-
-    Parameters
-    ----------
-    left, right : Correspondences
-        In one world unit. Views are paired by name, points by id, else by X, Y, Z (see `pairing`).
-    left_options, right_options : dict, optional
-        Arguments of `calibrate` for one camera, such as ``type=3, intrinsics=camera`` for a known one.
-    progress : callable, optional
-        Called with the name of a stage and the share of it that is done.
-    **options
-        Arguments of `calibrate` for both cameras. `outliers` also applies to pairs of views that contradict
-        the others.
-
-    Returns
-    -------
-    Rig
-        ``X_right = R X_left + t``.
-
-    Raises
-    ------
-    UsageError
-        As `calibrate`; an option that it does not have; type 4, where all poses are known.
-    InputError, DegenerateGeometryError
-        The points do not determine the rig; the message says why.
-    """
-    sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
-    unknown = set().union(*sides) - set(signature(calibrate).parameters)
-    if unknown:
-        raise UsageError(f"calibrate has no option {min(unknown)!r}; correct its name or leave it out")
-    if any(side.get("type", 1) == 4 for side in sides):
-        raise UsageError(
-            "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
-            "camera"
-        )
-    # Errors of pairing are reported before the training.
-    pair_points(left, right, pair_views(left.view_names, right.view_names))
-    cameras, kept = _on_one_target(left, right, sides, progress)
-    best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
-    outliers = options.get("outliers", "reject")
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=outliers, target_kept=kept)
-    warnings = [
-        f"{name}: {text}"
-        for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
-        for text in camera.warnings
-    ]
-    return replace(rig, warnings=(*rig.warnings, *warnings))
-
-
-def _on_one_target(
-    left: Correspondences,
-    right: Correspondences,
-    sides: Sequence[Mapping[str, Any]],
-    progress: Progress | None,
-) -> tuple[list[Calibration], bool]:
-    """Calibrate both cameras on one target, which is estimated from both if the points support that.
-
-    Also returns whether the given target was kept although it could have been estimated.
-    """
-    choice = sides[0].get("target", "auto")
-
-    def camera(side: int, target: str | Target, preferred: str = "") -> Calibration:
-        name, points = _SIDES[side], (left, right)[side]
-        options = {"camera_name": name, **sides[side], "target": target, "preferred": preferred}
-        return calibrate(points, **options, progress=_named(progress, name))
-
-    def calibrated(target: str | Target) -> list[Calibration]:
-        cameras = [camera(side, target) for side in (0, 1)]
-        for side in _others_model(cameras):
-            model = cameras[1 - side].distortion_model
-            alike = camera(side, target, model)
-            if alike.distortion_model == model:
-                cameras[side] = alike
-                break
-        return cameras
-
-    surveyed = left.world_std is not None or right.world_std is not None
-    cameras = calibrated(choice if surveyed else "given")
-    for _ in range(_ROUNDS):
-        target = common_target(cameras, choice)
-        if target is None:
-            break
-        before = [camera.distortion_model for camera in cameras]
-        cameras = calibrated(target)
-        if [camera.distortion_model for camera in cameras] == before:
-            break
-    kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
-    return cameras, kept
-
-
-def _others_model(cameras: Sequence[Calibration]) -> list[int]:
-    """Sides that could take the other camera's distortion model, first the one that loses less by it.
-
-    Both cameras of a rig are mostly of the same type, so their models differ only if the points require it.
-    """
-    models = [camera.distortion_model for camera in cameras]
-    choices = [camera.lens_choice for camera in cameras]
-    if models[0] == models[1] or not all(choices):
-        return []
-    cost = [
-        choices[side].get(models[1 - side], math.inf) / max(choices[side][models[side]], 1e-300)
-        for side in (0, 1)
-    ]
-    sides = [
-        side for side in (0, 1) if math.isfinite(cost[side]) and models[1 - side] in cameras[side].would_take
-    ]
-    return sorted(sides, key=lambda side: cost[side])
-
-
-def _named(progress: Progress | None, name: str) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda stage, share: progress(f"{name} camera: {stage}", share)

@@ -15,6 +15,7 @@ because smaller values arise by chance. Pairs that contradict most others are fo
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,22 +76,6 @@ class Contradiction:
         return is_significant(self.scatter**2 * self.degrees, self.degrees)
 
 
-@frozen_dataclass(eq=False)
-class _Explanation:
-    """One explanation: its gain in the sum of squares, its unknowns and their values."""
-
-    kind: str
-    at: int
-    gain: float
-    values: Array
-    shift: Array
-
-    @property
-    def unknowns(self) -> int:
-        """Unknowns that it costs. Both focal lengths mimic a small turn of the rig, so they cost as much."""
-        return 6 if self.kind == "both focal" else len(self.values)
-
-
 def is_significant(squares: float, degrees: int) -> bool:
     """Whether a sum of squares is larger than by chance: a chi-squared test at the level of 0.001.
 
@@ -111,19 +96,18 @@ def contradiction(
     pairs have been left out: some of the remaining ones would always be the oddest.
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
-    found = _best(poses, used)
-    if seek_odd and is_significant(_squares(poses, used), _degrees(used)):
+    whole = _OneRig(poses, used)
+    found = _best(whole)
+    if seek_odd and is_significant(whole.squares, whole.degrees):
         odd = odd_pairs(poses, used)
-        rest = used & ~odd
-        if odd.any() and _score(poses, rest, None, 6 * int(odd.sum())) < _score(poses, used, found):
-            return _as_contradiction(poses, rest, _best(poses, rest), odd)
-    return _as_contradiction(poses, used, found, np.zeros_like(used))
+        rest = _OneRig(poses, used & ~odd)
+        if odd.any() and rest.score(None, 6 * int(odd.sum())) < whole.score(found):
+            return _as_contradiction(rest, _best(rest), odd)
+    return _as_contradiction(whole, found, np.zeros_like(used))
 
 
-def _as_contradiction(
-    poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | None, odd: NDArray[np.bool_]
-) -> Contradiction:
-    n, squares = _degrees(used), _squares(poses, used)
+def _as_contradiction(one: _OneRig, found: _Explanation | None, odd: NDArray[np.bool_]) -> Contradiction:
+    poses, n, squares = one.poses, one.degrees, one.squares
     growth = float(np.sqrt((poses.spare + squares) / (poses.spare + n)))
     scatter = float(np.sqrt(squares / n)) if n else 0.0
     none = np.zeros((2, poses.design.shape[2]))
@@ -135,7 +119,7 @@ def _as_contradiction(
         size = 1.0 if found.kind == "both focal" else _focal(poses, FOCAL[found.kind][0])
         amount = float(np.mean(found.values / size))
     if found.kind == "size":
-        baseline = poses.reference + (poses.solution(used) - found.shift[0])[poses.rig[3:]]
+        baseline = poses.reference + (poses.solution(one.used) - found.shift[0])[poses.rig[3:]]
         amount = float(found.values[0] * (poses.reference @ baseline) / max(baseline @ baseline, 1e-300))
     gain = float(np.sqrt(found.gain / len(found.values)))
     return Contradiction(
@@ -143,46 +127,70 @@ def _as_contradiction(
     )
 
 
-def _degrees(used: NDArray[np.bool_]) -> int:
-    return max(6 * (int(used.sum()) - 1), 0)
+@frozen_dataclass(eq=False)
+class _OneRig:
+    """The common fit of the used pairs with one rig."""
+
+    poses: RelativePoses
+    used: NDArray[np.bool_]  # (P,)
+
+    @property
+    def degrees(self) -> int:
+        """Degrees of freedom of `squares`."""
+        return max(6 * (int(self.used.sum()) - 1), 0)
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of squares, over that of the cameras alone."""
+        poses = self.poses
+        S, g = poses.normal(self.used)
+        solved = solve_scaled(S, g[:, None])[:, 0]
+        alone = poses.cameras.g.sum(axis=0)[:-6]
+        own = solve_scaled(poses.cameras.S.sum(axis=0)[:-6, :-6], alone[:, None])[:, 0]
+        return max(float(poses.pairs.cost[self.used].sum() - g @ solved + alone @ own), 0.0)
+
+    def score(self, found: _Explanation | None, more: int = 0) -> float:
+        """The criterion with an explanation, or with `more` unknowns."""
+        n = 6 * len(self.poses)
+        gain, unknowns = (0.0, more) if found is None else (found.gain, found.unknowns)
+        spare = self.degrees - (0 if found is None else unknowns)
+        rest = (self.squares - gain) / spare if spare > 0 else np.inf
+        return float(n * np.log(max(rest, 1.0)) + unknowns * np.log(n))
+
+    def rest_is_small(self, found: _Explanation) -> bool:
+        """Whether the rest after an explanation is insignificant, or small compared with the whole."""
+        left, spare = self.squares - found.gain, self.degrees - len(found.values)
+        if spare < 1:
+            return False
+        return left / spare <= _LEFT**2 * self.squares / self.degrees or not is_significant(left, spare)
 
 
-def _squares(poses: RelativePoses, used: NDArray[np.bool_]) -> float:
-    """Sum of squares of the used pairs with one rig, over that of the cameras alone."""
-    S, g = poses.normal(used)
-    solved = solve_scaled(S, g[:, None])[:, 0]
-    alone = poses.cameras.g.sum(axis=0)[:-6]
-    own = solve_scaled(poses.cameras.S.sum(axis=0)[:-6, :-6], alone[:, None])[:, 0]
-    return max(float(poses.pairs.cost[used].sum() - g @ solved + alone @ own), 0.0)
+@frozen_dataclass(eq=False)
+class _Explanation:
+    """One explanation: its gain in the sum of squares, its unknowns and their values."""
+
+    kind: str
+    at: int
+    gain: float
+    values: Array
+    shift: Array
+
+    @property
+    def unknowns(self) -> int:
+        """Unknowns that it costs. Both focal lengths mimic a small turn of the rig, so they cost as much."""
+        return 6 if self.kind == "both focal" else len(self.values)
 
 
-def _score(poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | None, more: int = 0) -> float:
-    """The criterion of one rig for the used pairs, with an explanation or `more` unknowns."""
-    n = 6 * len(poses)
-    gain, unknowns = (0.0, more) if found is None else (found.gain, found.unknowns)
-    spare = _degrees(used) - (0 if found is None else unknowns)
-    rest = (_squares(poses, used) - gain) / spare if spare > 0 else np.inf
-    return float(n * np.log(max(rest, 1.0)) + unknowns * np.log(n))
-
-
-def _best(poses: RelativePoses, used: NDArray[np.bool_]) -> _Explanation | None:
+def _best(one: _OneRig) -> _Explanation | None:
     """The explanation with the lowest criterion, if the evidence for it is very strong."""
-    squares, n = _squares(poses, used), _degrees(used)
-    found = [one for one in (*_changes(poses, used), *_motions(poses, used)) if _explains(one, squares, n)]
+    every = (*_changes(one.poses, one.used), *_motions(one.poses, one.used))
+    found = [explanation for explanation in every if one.rest_is_small(explanation)]
     if not found:
         return None
-    best = min(found, key=lambda one: _score(poses, used, one))
+    best = min(found, key=one.score)
     # The search over all places of a change counts as one more unknown.
-    dear = _VERY_STRONG + (np.log(6 * len(poses)) if best.at else 0.0)
-    return best if _score(poses, used, best) < _score(poses, used, None) - dear else None
-
-
-def _explains(one: _Explanation, squares: float, n: int) -> bool:
-    """Whether the rest after an explanation is insignificant, or small compared with the whole."""
-    left, spare = squares - one.gain, n - len(one.values)
-    if spare < 1:
-        return False
-    return left / spare <= _LEFT**2 * squares / n or not is_significant(left, spare)
+    dear = _VERY_STRONG + (np.log(6 * len(one.poses)) if best.at else 0.0)
+    return best if one.score(best) < one.score(None) - dear else None
 
 
 def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
@@ -257,16 +265,14 @@ def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_
     """Find the pairs that contradict most of the used ones, (P,) bool; none where there is no majority."""
     none = np.zeros(len(poses), dtype=bool)
     places = np.flatnonzero(used)
-    half = len(places) // 2 + 1
     if len(places) < 3:
         return none
     starts = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_STARTS)).astype(int))]
     best, lowest = none, np.inf
     for start in starts:
-        distance, core = _concentrated(poses, places, half, _from_one(poses, start))
-        sum_of_core = float(np.sort(distance[places])[:half].sum())
-        if sum_of_core < lowest:
-            best, lowest = core, sum_of_core
+        total, core = _concentrated(poses, places, start)
+        if total < lowest:
+            best, lowest = core, total
     for _ in range(_STEPS):
         distance = _predicted(poses, best)
         limit = _SUSPECT * max(1.0, float(median(distance[places])) / _MEDIAN)
@@ -277,17 +283,17 @@ def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_
     return odd if 2 * odd.sum() < len(places) else none
 
 
-def _from_one(poses: RelativePoses, start: int) -> Array:
-    """(P,) squared distances of all relative poses from that of one pair."""
+def _concentrated(
+    poses: RelativePoses, places: NDArray[np.intp], start: int
+) -> tuple[float, NDArray[np.bool_]]:
+    """The half of the pairs that is nearest to its own rig, and the sum of its squared distances from it.
+
+    The search begins with the pairs nearest to one of them, and ends when the half stays the same.
+    """
+    half = len(places) // 2 + 1
     apart = poses.offset - poses.offset[start]
     together = poses.covariance + poses.covariance[start]
-    return np.asarray((apart * np.linalg.solve(together, apart[..., None])[..., 0]).sum(axis=1))
-
-
-def _concentrated(
-    poses: RelativePoses, places: NDArray[np.intp], half: int, distance: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Distances from the rig of the nearest half of the pairs, repeated until that half stays the same."""
+    distance = np.asarray((apart * np.linalg.solve(together, apart[..., None])[..., 0]).sum(axis=1))
     core = np.zeros(len(poses), dtype=bool)
     for _ in range(_STEPS):
         nearest = np.zeros_like(core)
@@ -296,7 +302,7 @@ def _concentrated(
             break
         core = nearest
         distance = _predicted(poses, core)
-    return distance, core
+    return float(np.sort(distance[places])[:half].sum()), core
 
 
 def _predicted(poses: RelativePoses, core: NDArray[np.bool_]) -> Array:

@@ -9,16 +9,14 @@
   single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
   `adjustment.open_coefficients`), and two stretches of the print if the given target was kept
   (`covariance_of_stretch`, see `adjustment.board.open_stretch`).
+* Cameras that were given with a covariance S of their own (`covariance_by_given`). The rig, a second camera
+  and the poses follow an error d of the given cameras as they would follow these parameters if they were
+  estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared unknowns x. So x has the
+  additional covariance N_ff^-1 N_fd S N_df N_ff^-1, and x and d are correlated. It does not fall with the
+  number of points.
 
 All views share the unknowns of both cameras and of the rig; poses and target points are eliminated. The
 derivatives by the rig's unknowns follow from those of each camera by the chain rule.
-
-Uncertainty of a rig that comes from the uncertainty of cameras that were given for it.
-
-The rig, a second camera and the poses follow an error d of the given cameras as they would follow these
-parameters if they were estimated: with the poses eliminated, N_ff x + N_fd d = 0 for the free shared unknowns
-x. With the covariance S of the given cameras, x has the additional covariance
-N_ff^-1 N_fd S N_df N_ff^-1, and x and d are correlated. It does not fall with the number of points.
 """
 
 from __future__ import annotations
@@ -43,7 +41,6 @@ from neurocal_cli.adjustment.open_coefficients import (
     spread_of_open,
 )
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
@@ -53,10 +50,8 @@ from neurocal_cli.observations.target import Target
 
 _LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
 
-Mask = NDArray[np.bool_]
 
-
-def rig_covariance(poses: RelativePoses, used: Mask, found: Contradiction) -> Array:
+def rig_covariance(poses: RelativePoses, used: NDArray[np.bool_], found: Contradiction) -> Array:
     """(F, F) covariance of the unknowns of the common fit of the used pairs, (P,) bool."""
     S, _ = poses.normal(used)
     model = solve_scaled(S, np.eye(len(S)))
@@ -65,20 +60,15 @@ def rig_covariance(poses: RelativePoses, used: Mask, found: Contradiction) -> Ar
         return np.asarray(model)
     if used.sum() < _LEAST_PAIRS:
         return np.asarray(found.scatter**2 * model)
-    moves = _moves(poses, used)
-    spread = moves - moves.mean(axis=0)
-    by_pairs = (len(moves) - 1) / len(moves) * spread.T @ spread + 0.5 * found.shift.T @ found.shift
-    return not_smaller(model, by_pairs)
-
-
-def _moves(poses: RelativePoses, used: Mask) -> Array:
-    """Moves of the unknowns when each frame is left out."""
+    # Moves of the unknowns when each frame is left out, from the minimum, where their formula holds.
     S, g = poses.cameras.S.copy(), poses.cameras.g.copy()
     S[poses.frame[used]] += poses.pairs.S[used]
     g[poses.frame[used]] += poses.pairs.g[used]
-    # Shifted to the minimum, where the formula for leaving out holds.
     moves = Quadratics(S, g - S @ poses.solution(used), poses.cameras.cost).moves_without_each()
-    return np.asarray(moves[np.isfinite(moves).all(axis=1)])
+    moves = moves[np.isfinite(moves).all(axis=1)]
+    spread = moves - moves.mean(axis=0)
+    by_pairs = (len(moves) - 1) / len(moves) * spread.T @ spread + 0.5 * found.shift.T @ found.shift
+    return not_smaller(model, by_pairs)
 
 
 def not_smaller(least: Array, other: Array) -> Array:
@@ -159,20 +149,17 @@ def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDAr
     return label if batches.whitening is None else np.where(batches.whitening[:, 0] == 0, -1, label)
 
 
-def _open_of(calibration: Calibration, k: Array, free: NDArray[np.bool_]) -> OpenCoefficients | None:
-    state = replace(calibration.state(calibration.points.view_names), k=k)
-    return open_at_points(state, calibration.points, free, tuple(calibration.lens_choice))
-
-
 def covariance_of_choice(fit: RigFit) -> Array | None:
     """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
     problem, before = fit.problem, fit.state
     own = [fit.free[place] for place in before.columns.cameras]
-    # A camera that the common bundle adjustment did not change has no open coefficients either.
-    opened = [
-        _open_of(calibration, camera.k, free) if free.any() else None
-        for calibration, free, camera in zip(problem.calibrations, own, before.cameras, strict=True)
-    ]
+    opened: list[OpenCoefficients | None] = [None, None]
+    for side, (calibration, free) in enumerate(zip(problem.calibrations, own, strict=True)):
+        # A camera that the common bundle adjustment did not change has no open coefficients either.
+        if free.any():
+            points, choice = calibration.points, tuple(calibration.lens_choice)
+            alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
+            opened[side] = open_at_points(alone, points, free, choice)
     if opened == [None, None]:
         return None
     left, right = (
@@ -197,7 +184,7 @@ def covariance_of_choice(fit: RigFit) -> Array | None:
     return added if np.isfinite(added).all() else None
 
 
-def _joined(is_open: Mask, left_out: Mask, priors: list[OpenPrior]) -> OpenPrior:
+def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: list[OpenPrior]) -> OpenPrior:
     """Both cameras' open coefficients, each with groups of its own."""
     starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
     groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
@@ -216,8 +203,7 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
     if not is_flat(world) or not fit.variance > 0:
         return None
-    estimated = np.concatenate([*fit.problem.estimated, np.ones(6, dtype=bool)])
-    columns = fit.state.columns
+    estimated, columns = fit.problem.estimated_shared, fit.state.columns
     kept = np.append(np.flatnonzero(estimated), np.arange(columns.width - 1, columns.width + 2))
     whole = eliminate(_with_stretches(fit, stretches(world)), kept, columns.pose)[0].sum(axis=0)
     found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)

@@ -1,4 +1,4 @@
-"""Errors of triangulated points of known position (paper, section 5.2).
+"""Evaluation of two cameras by the errors of triangulated points of known position (paper, section 5.2).
 
 The true positions are those of the target, transformed to the left camera's frame by the pose of the view.
 All errors are in that frame, with z along the optical axis.
@@ -12,6 +12,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import other_images, predict, refuse_another_size
@@ -124,6 +125,8 @@ def evaluate_rig(
 
 
 class _Evaluator:
+    """Two cameras and the points of both, with the poses of views that the cameras do not have."""
+
     def __init__(
         self,
         cameras: tuple[Calibration, Calibration],
@@ -162,7 +165,12 @@ class _Evaluator:
         by_view = self._error(*self._own_poses(pairs), np.ones(len(pairs), dtype=bool))
         judgement: Callable[[], Verdict | None] = self._judgement
         if rig is not None:
-            poses, used = self._poses_on(rig), np.array([pair not in rig.left_out for pair in pairs])
+            # The pose of each view in the left camera that fits both cameras best.
+            own = {name: view.pose for name, view in rig.left.views.items()}
+            if self.fitted is not None:
+                own.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
+            poses = [own[a] for a, _ in pairs]
+            used = np.array([pair not in rig.left_out for pair in pairs])
             # None if all views contradict the rig.
             through = self._error(poses, [rig.pose], used) if used.any() else None
             if self.given:
@@ -174,16 +182,16 @@ class _Evaluator:
                     f"and are left out of all averages{' of the rig' if error is through else ''}"
                 )
         return StereoEvaluation(
-            self.points[0].unit,
-            by_view,
-            through,
-            float("nan") if rig is None else rig.baseline,
-            pairs,
-            (self.views.left_only, self.views.right_only),
-            tuple(a for a, _ in self.new),
-            (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
-            tuple(self.warnings),
-            judgement,
+            unit=self.points[0].unit,
+            by_view=by_view,
+            rig=through,
+            baseline=float("nan") if rig is None else rig.baseline,
+            pairs=pairs,
+            alone=(self.views.left_only, self.views.right_only),
+            fitted=tuple(a for a, _ in self.new),
+            models=(self.cameras[0].distortion_model, self.cameras[1].distortion_model),
+            warnings=tuple(self.warnings),
+            judgement=judgement,
         )
 
     def _judgement(self) -> Verdict | None:
@@ -195,8 +203,6 @@ class _Evaluator:
 
     def _fit_new(self) -> tuple[Calibration, Calibration]:
         """Poses of the new views in each camera alone (type 3)."""
-        from neurocal_cli.calibration.calibrate import calibrate
-
         fits = []
         for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
             names = {pair[side] for pair in self.new}
@@ -220,13 +226,6 @@ class _Evaluator:
             first.append(left)
             rigs.append(Pose.exact(R, right.t - R @ left.t))
         return first, rigs
-
-    def _poses_on(self, rig: Rig) -> list[Pose]:
-        """The pose of each view in the left camera that fits both cameras best."""
-        poses = {name: view.pose for name, view in rig.left.views.items()}
-        if self.fitted is not None:
-            poses.update(poses_on_rig(rig.pose, self.fitted, ViewPairs(tuple(self.new))))
-        return [poses[a] for a, _ in self.views.both]
 
     def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""

@@ -62,7 +62,13 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     if not set(left).isdisjoint(right):
         keys = dict(zip(left, left, strict=True)), dict(zip(right, right, strict=True))
     else:
-        _refuse_swapped(left, right)
+        crossed = [name for name in left if _SIDES[1].search(name) and not _SIDES[0].search(name)]
+        other = [name for name in right if _SIDES[0].search(name) and not _SIDES[1].search(name)]
+        if len(crossed) == len(left) and len(other) == len(right):
+            raise InputError(
+                f"the cameras are swapped: the left one's views are {_listed(crossed)}, the right one's "
+                f"{_listed(other)}; give the left camera first"
+            )
         keys = _keys(left, _SIDES[0]), _keys(right, _SIDES[1])
     both = tuple((name, keys[1][key]) for key, name in keys[0].items() if key in keys[1])
     if not both:
@@ -94,16 +100,6 @@ def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
             )
         keys[key] = name
     return keys
-
-
-def _refuse_swapped(left: Sequence[str], right: Sequence[str]) -> None:
-    crossed = [name for name in left if _SIDES[1].search(name) and not _SIDES[0].search(name)]
-    other = [name for name in right if _SIDES[0].search(name) and not _SIDES[1].search(name)]
-    if len(crossed) == len(left) and len(other) == len(right):
-        raise InputError(
-            f"the cameras are swapped: the left one's views are {_listed(crossed)}, the right one's "
-            f"{_listed(other)}; give the left camera first"
-        )
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ R1, R2, P1, P2 and Q are those of OpenCV's ``stereoRectify`` (Bouguet), with zer
 camera is turned by half of the rig's rotation. Both are then turned together until the baseline is
 parallel to an axis, the one along its longer component.
 
-The two rectified cameras of a rig: points converted to them, the error of their rows, and pictures.
+`rectify` finds the matrices, and `rectified_pair` the cameras, for which points and pictures are converted.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ from neurocal_cli.observations.undistorted_points import map_points, shown
 
 _GRID = 9  # samples along each side of the image, as in OpenCV
 _WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
+_ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
+_LINES = 16  # over the images
+_COLOURS = ((255, 80, 60), (60, 200, 255), (120, 255, 120), (255, 220, 60))
 
 
 @frozen_dataclass(eq=False)
@@ -81,16 +84,6 @@ def _shortest_turn(a: Array, b: Array) -> Array:
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + a @ b))
 
 
-def _rectified(camera: Camera, R: Array, pixels: Array) -> Array:
-    """Normalised rectified points of pixels, (N, 2).
-
-    nan where the distortion does not reach a pixel, and where its ray is behind the rectified image plane.
-    """
-    rays = camera.unproject(pixels) @ R.T
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
-
-
 def _centre(camera: Camera, R: Array, f: float, size: tuple[int, int]) -> Array:
     """Principal point that centres the corners of the image in the rectified one, its middle if wide."""
     last = np.array(size, dtype=float) - 1
@@ -126,34 +119,33 @@ def _scale(
     return float((1 - alpha) * max(fill) + alpha * min(hold))
 
 
-_ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
-_LINES = 16  # over the images
-_COLOURS = ((255, 80, 60), (60, 200, 255), (120, 255, 120), (255, 220, 60))
+def _rectified(camera: Camera, R: Array, pixels: Array) -> Array:
+    """Normalised rectified points of pixels, (N, 2).
+
+    nan where the distortion does not reach a pixel, and where its ray is behind the rectified image plane.
+    """
+    rays = camera.unproject(pixels) @ R.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
 
 
 @frozen_dataclass(eq=False)
 class RectifiedPair:
-    """The rectified cameras of a rig."""
+    """The cameras of a rig, left and right, and the rectified ones."""
 
     matrices: Rectification
     originals: tuple[Camera, Camera]
     cameras: tuple[Camera, Camera]  # without distortion, in the frames of R1 and R2
-    rotations: tuple[Array, Array]  # R1 and R2, (3, 3) each
     axis: int  # 0: the cameras stand beside each other, and rows correspond; 1: above each other, and columns
 
-
-@frozen_dataclass
-class RowError:
-    """Distance between the rows (or columns) of corresponding points [px]."""
-
-    median_px: float
-    rms_px: float
-    max_px: float
-    n_points: int
+    @property
+    def rotations(self) -> tuple[Array, Array]:
+        """R1 and R2, (3, 3) each."""
+        return self.matrices.R1, self.matrices.R2
 
 
 def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
-    """Rectify the cameras of a rig, whose images must have one known size; see `rectification.rectify`."""
+    """Rectify the cameras of a rig, whose images must have one known size; see `rectify`."""
     matrices = rectify(rig, alpha)
     if matrices is None:
         raise InputError(
@@ -171,7 +163,7 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
         for camera, P in zip(originals, (matrices.P1, matrices.P2), strict=True)
     ]
     axis = 0 if matrices.P2[0, 3] != 0 else 1
-    return RectifiedPair(matrices, originals, (cameras[0], cameras[1]), (matrices.R1, matrices.R2), axis)
+    return RectifiedPair(matrices, originals, (cameras[0], cameras[1]), axis)
 
 
 def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
@@ -189,6 +181,16 @@ def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> C
     views = pair.originals[side], pair.cameras[side], pair.rotations[side]
     moved = map_points(points.select(shown(points, *views)), *views)
     return replace(moved, image_size=size)
+
+
+@frozen_dataclass
+class RowError:
+    """Distance between the rows (or columns) of corresponding points [px]."""
+
+    median_px: float
+    rms_px: float
+    max_px: float
+    n_points: int
 
 
 def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences) -> RowError:

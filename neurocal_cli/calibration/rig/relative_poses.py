@@ -48,7 +48,6 @@ class RelativePoses:
     cameras: Quadratics  # information of each frame's views about the cameras alone, V groups
     pairs: Quadratics  # the cost of the common fit beyond that of the cameras alone, P groups
     frame: NDArray[np.intp]  # (P,) of each pair
-    own: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of the left and the right camera's parameters
     rig: NDArray[np.intp]  # (6,) columns of the rig's step
     focal: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of alpha_u and alpha_v, if they are free
     reference: Array  # (3,) translation of the reference [`unit`]
@@ -123,13 +122,23 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     pairs = Quadratics(weighted @ design, (weighted @ offset[..., None])[..., 0], cost)
     counts = [observed.equations_by_view for observed in problem.observations]
     return RelativePoses(
-        problem, tuple(names), _both(problem, sides, places, len(columns)), pairs, first, places, rig,
-        (places[0][sides[0].focal], places[1][sides[1].focal]), reference.t / problem.unit,
-        offset, design, covariance, size, centre * scale[:, None],
-        _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
-        counts[0][first] + counts[1][second],
-        sum(side.spare for side in sides),
-    )  # fmt: skip
+        problem=problem,
+        names=tuple(names),
+        cameras=_both(problem, sides, places, len(columns)),
+        pairs=pairs,
+        frame=first,
+        rig=rig,
+        focal=(places[0][sides[0].focal], places[1][sides[1].focal]),
+        reference=reference.t / problem.unit,
+        offset=offset,
+        design=design,
+        covariance=covariance,
+        size=size,
+        centre=centre * scale[:, None],
+        motion=_motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
+        n_equations=counts[0][first] + counts[1][second],
+        spare=sum(side.spare for side in sides),
+    )
 
 
 class _Alone:

@@ -15,14 +15,13 @@ from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.adjustment.reprojection import POSE, residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
-from neurocal_cli.calibration.rig.adjust import Observations, RigFit
+from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.covariance import covariance_by_given, covariance_of_choice, not_smaller
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, euler_jacobian
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import ENTRIES
-from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.target import scale_of
 
@@ -32,8 +31,8 @@ _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal 
 def assemble_rig(
     fit: RigFit,
     left_out: Mapping[tuple[str, str], str],
-    least: Array | None = None,
-    stretched: Array | None = None,
+    least: Array | None,
+    stretched: Array | None,
 ) -> Rig:
     """Convert an adjusted rig to the user's units.
 
@@ -42,16 +41,6 @@ def assemble_rig(
     parameters are an error.
     """
     return _RigAssembly(fit, least, stretched).rig(left_out)
-
-
-def non_monotonic_sides(fit: RigFit) -> list[int]:
-    """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
-    return [
-        side
-        for side, (camera, given) in enumerate(zip(fit.state.cameras, fit.problem.calibrations, strict=True))
-        if fit.free[fit.state.columns.cameras[side]].any()
-        and where_not_monotonic(camera.distortion, _intrinsics(fit, side).A, given.points) is not None
-    ]
 
 
 class _RigAssembly:
@@ -86,15 +75,16 @@ class _RigAssembly:
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         """The rig in pixels and world units, with the pairs left out and why."""
         problem, state = self.problem, self.state
-        squares = [
-            _squared_errors(observed, problem.camera(state, side))
-            for side, observed in enumerate(problem.observations)
-        ]
-        sums = [
-            observed.batches.sum_by_view(part.sum(axis=1))
-            for observed, part in zip(problem.observations, squares, strict=True)
-        ]
-        left, right = (self._calibration(side, sums[side], float(squares[side].max())) for side in (0, 1))
+        sums, largest = [], []  # of the squared errors [px^2]
+        for side, observed in enumerate(problem.observations):
+            batches = observed.batches
+            errors = residuals(batches, problem.camera(state, side))
+            squares = (errors**2).sum(axis=1) * observed.pixel_scale**2
+            if batches.whitening is not None:  # those of padding are 0
+                squares = np.where(batches.whitening[:, 0] > 0, squares, 0.0)
+            sums.append(batches.sum_by_view(squares.sum(axis=1)))
+            largest.append(float(squares.max()))
+        left, right = (self._calibration(side, sums[side], largest[side]) for side in (0, 1))
         pose = Pose(state.R, state.t * problem.unit)
         covariance, std = self._rig_covariance(pose)
         n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
@@ -112,12 +102,6 @@ class _RigAssembly:
             stop_reason=left.stop_reason,
             iterations=self.fit.iterations,
         )
-
-    def _stop_reason(self) -> str:
-        for calibration in self.problem.calibrations:
-            if not calibration.converged:
-                return calibration.stop_reason
-        return (StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS).value
 
     def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
         """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
@@ -142,7 +126,10 @@ class _RigAssembly:
     def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
         """One camera after the common bundle adjustment, with its squared errors [px^2] by view."""
         given, observed = self.problem.calibrations[side], self.problem.observations[side]
-        intrinsics, batches, reason = _intrinsics(self.fit, side), observed.batches, self._stop_reason()
+        intrinsics, batches = _intrinsics(self.fit, side), observed.batches
+        alone = [camera.stop_reason for camera in self.problem.calibrations if not camera.converged]
+        together = StopReason.CONVERGED if self.fit.converged else StopReason.MAX_ITERATIONS
+        reason = alone[0] if alone else together.value
         changes: dict[str, Any] = {}
         if self.fit.free[self.columns.cameras[side]].any():
             changes = self._intrinsic_changes(side, intrinsics)
@@ -216,6 +203,16 @@ def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
     return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
 
 
+def non_monotonic_sides(fit: RigFit) -> list[int]:
+    """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
+    return [
+        side
+        for side, (camera, given) in enumerate(zip(fit.state.cameras, fit.problem.calibrations, strict=True))
+        if fit.free[fit.state.columns.cameras[side]].any()
+        and where_not_monotonic(camera.distortion, _intrinsics(fit, side).A, given.points) is not None
+    ]
+
+
 def _intrinsics(fit: RigFit, side: int) -> Intrinsics:
     """Intrinsic parameters of one camera [px]; given entries of A keep their exact values."""
     given = fit.problem.calibrations[side]
@@ -251,10 +248,3 @@ def _network(
         refine_iterations=record.refine_iterations + iterations,
         rmse_after=rmse,
     )
-
-
-def _squared_errors(observed: Observations, camera: CameraState) -> Array:
-    """Squared pixel errors, (T, n) [px^2]; 0 for padding."""
-    squares = (residuals(observed.batches, camera) ** 2).sum(axis=1) * observed.pixel_scale**2
-    whitening = observed.batches.whitening
-    return np.asarray(squares if whitening is None else np.where(whitening[:, 0] > 0, squares, 0.0))

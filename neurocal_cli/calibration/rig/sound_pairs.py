@@ -83,32 +83,6 @@ class SoundPairs:
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
-def describe_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
-    """Describe pairs that are left out: their number, and the faults with the pairs of each, most first."""
-    by_reason: dict[str, list[str]] = {}
-    for pair, reason in left_out.items():
-        by_reason.setdefault(reason, []).append(pair_name(pair))
-    most_first = sorted(by_reason.items(), key=lambda item: -len(item[1]))
-    parts = [f"{name_some(names)}: {reason}" for reason, names in most_first]
-    return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
-
-
-def shifted(left_out: Mapping[Pair, str]) -> bool:
-    """Whether left views fit the right views of other pairs than their own."""
-    return any(reason in SHIFTED.values() for reason in left_out.values())
-
-
-def pair_name(pair: Pair) -> str:
-    """The name of a pair of views for messages."""
-    return pair[0] if pair[0] == pair[1] else f"{pair[0]}/{pair[1]}"
-
-
-def span(pairs: Sequence[Pair]) -> str:
-    """The names of pairs in a row, by the first and the last left view."""
-    first, last = pairs[0][0], pairs[-1][0]
-    return first if len(pairs) == 1 else f"{first} to {last}"
-
-
 def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> SoundPairs:
     """Find the pairs that determine the rig; an error if half of them or more contradict each other."""
     problem = rig_problem(left, right, views)
@@ -119,24 +93,21 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     if poses is not None:
         # A fault that has a name is certain. The others may belong to a rig that moved.
         used = np.array([reasons[pair] in ("", UNSYNCHRONISED) for pair in poses.names])
-        found = _explained(poses, used, found)
+        why = contradiction(poses, used)
+        odd = {pair: UNSYNCHRONISED for pair, is_odd in zip(poses.names, why.odd, strict=True) if is_odd}
+        if why.kind in TWO_GEOMETRIES:
+            found = replace(found, left_out={**found.left_out, **odd})
+            found = _larger_part(poses, used & ~why.odd, why, found)
+        else:
+            left_out = {**odd, **found.left_out}
+            found = replace(found, left_out=left_out, by_chance=not why.is_significant)
     found = _with_shifted(left, right, found)
     if not found.moved and 2 * len(found.left_out) >= len(views.both):
-        why = "" if shifted(found.left_out) else _shifted(left, right, views)
-        if not why and UNSYNCHRONISED in found.left_out.values():
-            why = _poor_camera(left, right, found)
-        raise DegenerateGeometryError(why or found.contradiction())
+        message = "" if shifted(found.left_out) else _all_shifted(left, right, views)
+        if not message and UNSYNCHRONISED in found.left_out.values():
+            message = _poor_camera(left, right, found)
+        raise DegenerateGeometryError(message or found.contradiction())
     return found
-
-
-def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs) -> SoundPairs:
-    """Leave out the pairs that contradict most others, or the smaller part if the rig moved."""
-    why = contradiction(poses, used)
-    odd = {pair: UNSYNCHRONISED for pair, is_odd in zip(poses.names, why.odd, strict=True) if is_odd}
-    if why.kind in TWO_GEOMETRIES:
-        found = replace(found, left_out={**found.left_out, **odd})
-        return _larger_part(poses, used & ~why.odd, why, found)
-    return replace(found, left_out={**odd, **found.left_out}, by_chance=not why.is_significant)
 
 
 def _larger_part(
@@ -152,13 +123,76 @@ def _larger_part(
     between = f"between {pair_name(poses.names[at - 1])} and {pair_name(poses.names[at])}"
     what = "the size of the target changed" if why.kind == "size" else "the rig moved"
     reason = f"{MOVED} {('after', 'before')[kept]} {what} {between}"
-    left_out = {pair: why for pair, why in found.left_out.items() if pair not in members}
+    left_out = {pair: fault for pair, fault in found.left_out.items() if pair not in members}
     left_out |= dict.fromkeys(others, reason)
     start = poses.solution(sides[kept])[-6:]
     rig = Pose(rotation_step(start[:3]) @ found.rig.R, found.rig.t + start[3:] * poses.unit)
     own = poses.names[at:] if kept else poses.names[:at]
     text, advice = describe_move(poses.names, poses.size, why, own)
     return SoundPairs(found.problem, rig, left_out, f"{text}; {advice}")
+
+
+def _with_shifted(left: Calibration, right: Calibration, found: SoundPairs) -> SoundPairs:
+    """Name pairs whose left views fit the right views of the next pairs, or of the previous ones.
+
+    From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
+    """
+    odd = {a: b for (a, b), reason in found.left_out.items() if reason == UNSYNCHRONISED}
+    for word in SHIFTED:
+        moved = tuple(pair for pair in _neighbours(found.problem.pairs, word) if pair[0] in odd)
+        if len(moved) < _LEAST_AGREED:
+            continue
+        problem = rig_problem(left, right, ViewPairs(moved))
+        fits = _distance(problem, _poses(problem), found.rig.R[None], found.rig.t[None])[0] < 1
+        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
+            names = [a for (a, _), one in zip(problem.pairs, fits, strict=True) if one]
+            reasons = {(a, odd[a]): SHIFTED[word] for a in names}
+            return replace(found, left_out={**found.left_out, **reasons})
+    return found
+
+
+def _all_shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
+    """Message if the pairs agree on a rig once the right views are shifted by one; otherwise empty."""
+    if len(views.both) < 2 * _LEAST_AGREED:
+        return ""
+    for word in SHIFTED:
+        moved = _neighbours(views.both, word)
+        faults = find_consensus(rig_problem(left, right, ViewPairs(moved))).reasons
+        if faults.count("") / len(faults) > _AGREED:
+            return (
+                f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
+                f"not that of its own; {PAIR_ANEW}"
+            )
+    return ""
+
+
+def _neighbours(pairs: Sequence[Pair], word: str) -> tuple[Pair, ...]:
+    """Each left view with the right view of the next, or of the previous, pair."""
+    ordered = in_order(pairs)
+    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
+    return tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
+
+
+def _poor_camera(left: Calibration, right: Calibration, found: SoundPairs) -> str:
+    """Message if the pairs contradict each other, and a camera is poor by itself; otherwise empty."""
+    for side, camera in (("left", left), ("right", right)):
+        verdict = camera.verdict
+        if verdict is not None and verdict.word == "poor":
+            return (
+                f"{len(found.left_out)} of {len(found.problem.paired)} pairs of views contradict the rig, "
+                f"and the {side} camera is poor by itself: {verdict.reasons[0]}; {verdict.advice[0]}"
+            )
+    return ""
+
+
+def describe_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
+    """Describe pairs that are left out: their number, and the faults with the pairs of each, most first."""
+    by_reason: dict[str, list[str]] = {}
+    for pair, reason in left_out.items():
+        by_reason.setdefault(reason, []).append(pair_name(pair))
+    most_first = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+    parts = [f"{name_some(names)}: {reason}" for reason, names in most_first]
+    return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
 
 
 def describe_move(
@@ -197,57 +231,20 @@ def describe_move(
     )
 
 
-def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
-    """Message if the pairs agree on a rig once the right views are shifted by one; otherwise empty."""
-    if len(views.both) < 2 * _LEAST_AGREED:
-        return ""
-    for word in SHIFTED:
-        moved = _neighbours(views.both, word)
-        agree = find_consensus(rig_problem(left, right, ViewPairs(moved))).agree
-        if agree.mean() > _AGREED:
-            return (
-                f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
-                f"not that of its own; {PAIR_ANEW}"
-            )
-    return ""
+def shifted(left_out: Mapping[Pair, str]) -> bool:
+    """Whether left views fit the right views of other pairs than their own."""
+    return any(reason in SHIFTED.values() for reason in left_out.values())
 
 
-def _with_shifted(left: Calibration, right: Calibration, found: SoundPairs) -> SoundPairs:
-    """Name pairs whose left views fit the right views of the next pairs, or of the previous ones.
-
-    From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
-    """
-    odd = {a: b for (a, b), reason in found.left_out.items() if reason == UNSYNCHRONISED}
-    for word in SHIFTED:
-        moved = tuple(pair for pair in _neighbours(found.problem.pairs, word) if pair[0] in odd)
-        if len(moved) < _LEAST_AGREED:
-            continue
-        problem = rig_problem(left, right, ViewPairs(moved))
-        fits = _distance(problem, _poses(problem), found.rig.R[None], found.rig.t[None])[0] < 1
-        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
-            names = [a for (a, _), one in zip(problem.pairs, fits, strict=True) if one]
-            reasons = {(a, odd[a]): SHIFTED[word] for a in names}
-            return replace(found, left_out={**found.left_out, **reasons})
-    return found
+def pair_name(pair: Pair) -> str:
+    """The name of a pair of views for messages."""
+    return pair[0] if pair[0] == pair[1] else f"{pair[0]}/{pair[1]}"
 
 
-def _neighbours(pairs: Sequence[Pair], word: str) -> tuple[Pair, ...]:
-    """Each left view with the right view of the next, or of the previous, pair."""
-    ordered = in_order(pairs)
-    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
-    return tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
-
-
-def _poor_camera(left: Calibration, right: Calibration, found: SoundPairs) -> str:
-    """Message if the pairs contradict each other, and a camera is poor by itself; otherwise empty."""
-    for side, camera in (("left", left), ("right", right)):
-        verdict = camera.verdict
-        if verdict is not None and verdict.word == "poor":
-            return (
-                f"{len(found.left_out)} of {len(found.problem.paired)} pairs of views contradict the rig, "
-                f"and the {side} camera is poor by itself: {verdict.reasons[0]}; {verdict.advice[0]}"
-            )
-    return ""
+def span(pairs: Sequence[Pair]) -> str:
+    """The names of pairs in a row, by the first and the last left view."""
+    first, last = pairs[0][0], pairs[-1][0]
+    return first if len(pairs) == 1 else f"{first} to {last}"
 
 
 @frozen_dataclass(eq=False)
@@ -255,8 +252,19 @@ class RigConsensus:
     """The rig that most pairs of views support."""
 
     rig: Pose  # X_right = R X_left + t [world unit]
-    agree: NDArray[np.bool_]  # (P,)
     reasons: tuple[str, ...]  # fault of each pair; empty for those that agree
+
+
+def find_consensus(problem: RigProblem) -> RigConsensus:
+    """Find the rig that most pairs of views support."""
+    poses = _poses(problem)
+    R, t = poses.rigs()
+    agree = _distance(problem, poses, R, t) < 1
+    best = int(np.argmax(agree.sum(axis=1)))
+    if agree[best].all():
+        return RigConsensus(_mean_rig(poses, agree[best]), ("",) * len(problem.paired))
+    R, t, sound = _common_fault(problem, poses, (R[best], t[best], agree[best]))
+    return RigConsensus(_mean_rig(poses, sound), _reasons(problem, poses, R, t, sound))
 
 
 @frozen_dataclass(eq=False)
@@ -272,19 +280,6 @@ class _Poses:
         some = np.linspace(0, n - 1, min(n, _MOST_HYPOTHESES)).astype(int)
         R = self.R[1][some] @ np.swapaxes(self.R[0][some], 1, 2)
         return R, self.m[1][some] - (R @ self.m[0][some][..., None])[..., 0]
-
-
-def find_consensus(problem: RigProblem) -> RigConsensus:
-    """Find the rig that most pairs of views support."""
-    poses = _poses(problem)
-    R, t = poses.rigs()
-    agree = _distance(problem, poses, R, t) < 1
-    best = int(np.argmax(agree.sum(axis=1)))
-    reasons = ("",) * len(problem.paired)
-    if agree[best].all():
-        return RigConsensus(_mean_rig(poses, agree[best]), agree[best], reasons)
-    R, t, sound = _common_fault(problem, poses, (R[best], t[best], agree[best]))
-    return RigConsensus(_mean_rig(poses, sound), sound, _reasons(problem, poses, R, t, sound))
 
 
 def _poses(problem: RigProblem) -> _Poses:

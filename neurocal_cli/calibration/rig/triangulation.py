@@ -6,7 +6,8 @@ point for Gaussian noise.
 `linear` takes the smallest singular vector of the four image equations, and `midpoint` the middle of the
 shortest segment between both rays. Both use undistorted pixels (Hartley and Sturm 1997).
 
-What is wrong with matches that do not fit a rig: the common mistakes, of which one makes them fit.
+`fault_of_matches` tells what is wrong with matches that do not fit a rig: it undoes the common mistakes, one
+at a time, until they fit.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ METHODS = ("optimal", "linear", "midpoint")
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
 _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
+_FIT = 0.8  # least share of the matches that fit once the mistake is undone
+_FEWEST = 5  # matches; fewer may fit by chance
+_NORMALISED = 2.0  # normalised coordinates are smaller, pixels larger
+
+_Try = tuple[str, tuple[Camera, Camera], Pose, Array, Array]
 
 
 @frozen_dataclass(eq=False)
@@ -55,11 +61,6 @@ class Triangulated:
     def off(self, limit: float) -> NDArray[np.bool_]:
         """(N,) which epipolar errors exceed a limit [px]."""
         return np.asarray(~(self.epipolar <= limit))
-
-
-def epipolar_limit(sigma: float) -> float:
-    """Epipolar error [px] of outliers, for pixels of a standard deviation [px]."""
-    return _EPIPOLAR_SIGMAS * sigma
 
 
 def triangulate(
@@ -128,6 +129,13 @@ def triangulate(
     return Triangulated(points, covariance, epipolar, behind)
 
 
+def _pixels(values: Array) -> Array:
+    pixels = real_array("pixels", values)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
+    return pixels
+
+
 def _sees_sideways(camera: Camera, pixels: Array) -> bool:
     """Whether any ray is too far from the axis for the faster parametrisation (x, y, 1) / w."""
     if not camera.distortion.wide or not len(pixels):
@@ -138,18 +146,9 @@ def _sees_sideways(camera: Camera, pixels: Array) -> bool:
     return not bool((camera.unproject(pixels[farthest])[:, 2] > _LEAST_DEPTH).all())
 
 
-def _pixels(values: Array) -> Array:
-    pixels = real_array("pixels", values)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
-    return pixels
-
-
-_FIT = 0.8  # least share of the matches that fit once the mistake is undone
-_FEWEST = 5  # matches; fewer may fit by chance
-_NORMALISED = 2.0  # normalised coordinates are smaller, pixels larger
-
-_Try = tuple[str, tuple[Camera, Camera], Pose, Array, Array]
+def epipolar_limit(sigma: float) -> float:
+    """Epipolar error [px] of outliers, for pixels of a standard deviation [px]."""
+    return _EPIPOLAR_SIGMAS * sigma
 
 
 def fault_of_matches(rig: Rig, left: Array, right: Array, limit: float) -> str:

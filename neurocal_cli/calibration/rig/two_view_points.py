@@ -1,14 +1,13 @@
 """Triangulation of some thousand points at a time, by least squares and by simpler methods.
 
-Gauss-Newton estimates the point as (x, y, 1) / w. Its left image depends on x and y alone, and its right
-image is nearly linear in w at any distance up to infinity, so two or three steps are enough. The iteration is
-not that of `least_squares`: each point has three unknowns, and their equations are written out over all
-points.
+`PointBatch`: Gauss-Newton estimates the point as (x, y, 1) / w. Its left image depends on x and y alone, and
+its right image is nearly linear in w at any distance up to infinity, so two or three steps are enough. The
+iteration is not that of `adjustment.levenberg_marquardt`: each point has three unknowns, and their equations
+are written out over all points.
 
-Triangulation with a wide lens, whose rays may be 90 degrees and more from the axis.
-
-As `two_view_points`, but the point is B (x, y, 1) / w, where the third column of B is the ray of its left
-pixel: x and y stay small wherever the ray points, and w is one over the distance.
+`WidePointBatch` is for wide lenses, whose rays may be 90 degrees and more from the axis. The point is
+B (x, y, 1) / w, where the third column of B is the ray of its left pixel: x and y stay small wherever the ray
+points, and w is one over the distance.
 """
 
 from __future__ import annotations
@@ -23,9 +22,11 @@ from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.monotonic import nearly_undistorted
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 
-MAX_STEPS = 30
-SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
-RISE, ROUNDING = 1 + 1e-9, 1e-18  # a rise of the squared error by less, as a factor and in px^2, is rounding
+_MAX_STEPS = 30
+_HALVINGS = 10  # most of one step
+_SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
+# A rise of the squared error by less, as a factor and in px^2, is rounding.
+_RISE, _ROUNDING = 1 + 1e-9, 1e-18
 
 
 class PointBatch:
@@ -73,14 +74,14 @@ class PointBatch:
         left_out = ~np.isfinite(x + w)
         x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # any finite values
         N, cost = self._normal(x, y, w)
-        for _ in range(MAX_STEPS):
+        for _ in range(_MAX_STEPS):
             step = _solve(N)
             moved = _step_length(N, step)
-            if not moved.max(initial=0.0) > SMALL_STEP:
+            if not moved.max(initial=0.0) > _SMALL_STEP:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
         points = np.stack([x / w, y / w, 1 / w], axis=1)
-        covariance = _point_covariance(inverse_entries(N), x, y, w)
+        covariance = _point_covariance(_inverse_entries(N), x, y, w)
         depth = self._depth(x, y, w)
         behind = left_out | ~(w > 0) | ~(depth > 0)
         epipolar = np.sqrt(cost)
@@ -94,7 +95,7 @@ class PointBatch:
         x, y, w = (value + change for value, change in zip(state, step, strict=True))
         N_new, new = self._normal(x, y, w)
         length = 1.0
-        while (worse := ~(new <= cost * RISE + ROUNDING)).any() and length > 1e-3:
+        while (worse := ~(new <= cost * _RISE + _ROUNDING)).any() and length > 1e-3:
             length *= 0.5
             x, y, w = (
                 np.where(worse, value + length * change, now)
@@ -170,7 +171,7 @@ class PointBatch:
         equations[:, 0, 2], equations[:, 1, 2] = rays[0]
         for row, ray in enumerate(rays[1]):
             equations[:, 2 + row] = ray[:, None] * P[:, 2] - P[:, row]
-        return nearest_solution(equations)
+        return _nearest_solution(equations)
 
     def midpoint(self) -> Array:
         """(n, 3) midpoints of the shortest segments between the rays."""
@@ -193,16 +194,6 @@ class PointBatch:
         _, cost = self._normal(x, y, w)
         behind = ~(Z > 0) | ~(self._depth(x, y, w) > 0) | ~np.isfinite(cost)
         return np.sqrt(cost), behind
-
-
-def nearest_solution(equations: Array) -> Array:
-    """(n, 3) points whose (X, Y, Z, 1) solve equations (n, m, 4) best: smallest singular vectors."""
-    nowhere = ~np.isfinite(equations).all(axis=(1, 2))
-    equations[nowhere] = np.eye(equations.shape[1], 4)
-    last = np.linalg.svd(equations)[2][:, 3]
-    points = last[:, :3] / last[:, 3:]
-    points[nowhere] = np.nan
-    return np.asarray(points)
 
 
 def _solve(N: list[Array]) -> list[Array]:
@@ -231,14 +222,6 @@ def _step_length(N: list[Array], step: list[Array]) -> Array:
     return np.sqrt(np.abs(x * (a * x + 2 * (b * y + c * w)) + y * (d * y + 2 * e * w) + f * w * w))
 
 
-def inverse_entries(N: list[Array]) -> list[Array]:
-    """Entries xx, xy, xw, yy, yw, ww of the inverse of each symmetric 3 x 3 matrix."""
-    a, b, c, d, e, f = N[:6]
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * A + b * B + c * C
-    return [A / det, B / det, C / det, (a * f - c * c) / det, (b * c - a * e) / det, (a * d - b * b) / det]
-
-
 def _point_covariance(inverse: list[Array], x: Array, y: Array, w: Array) -> Array:
     """(n, 6) covariance of (x, y, 1) / w from that of x, y, w."""
     xx, xy, xw, yy, yw, ww = inverse
@@ -257,9 +240,6 @@ def _point_covariance(inverse: list[Array], x: Array, y: Array, w: Array) -> Arr
         ],
         axis=1,
     )
-
-
-_HALVINGS = 10
 
 
 class WidePointBatch:
@@ -289,14 +269,17 @@ class WidePointBatch:
         q = np.column_stack([np.zeros((len(w), 2)), np.where(lost, 1.0, w)])
         J, r, seen = self._linearised(basis, q)
         cost = (r * r).sum(axis=1)
-        for _ in range(MAX_STEPS):
-            step = _solved(J, r)
-            if not np.linalg.norm((J @ step[..., None])[..., 0], axis=1).max(initial=0.0) > SMALL_STEP:
+        for _ in range(_MAX_STEPS):
+            Jt = np.swapaxes(J, 1, 2)
+            step = (_inverse(Jt @ J) @ (Jt @ r[..., None]))[..., 0]
+            # A point whose equations are singular stays where it is.
+            step = np.where(np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
+            if not np.linalg.norm((J @ step[..., None])[..., 0], axis=1).max(initial=0.0) > _SMALL_STEP:
                 break
             for _ in range(_HALVINGS):
                 trial = self._linearised(basis, q + step)
                 new = (trial[1] ** 2).sum(axis=1)
-                worse = ~(new <= cost * RISE + ROUNDING)
+                worse = ~(new <= cost * _RISE + _ROUNDING)
                 if not worse.any():
                     break
                 step[worse] *= 0.5
@@ -354,7 +337,7 @@ class WidePointBatch:
     def linear(self) -> Array:
         """(n, 3) smallest singular vectors of the equations that each ray is parallel to its point."""
         rows = [cross_matrix(self.left) @ np.eye(3, 4), cross_matrix(self.right) @ self.P]
-        return nearest_solution(np.concatenate(rows, axis=1))
+        return _nearest_solution(np.concatenate(rows, axis=1))
 
     def midpoint(self) -> Array:
         """(n, 3) midpoints of the shortest segments between the rays."""
@@ -394,14 +377,25 @@ def _upper(factors: Array) -> Array:
     return out
 
 
-def _solved(J: Array, r: Array) -> Array:
-    """Gauss-Newton steps (n, 3); none where the equations are singular."""
-    Jt = np.swapaxes(J, 1, 2)
-    step = (_inverse(Jt @ J) @ (Jt @ r[..., None]))[..., 0]
-    return np.where(np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
-
-
 def _inverse(N: Array) -> Array:
     """Inverses (n, 3, 3) of symmetric matrices; not finite where they are singular."""
     upper = [N[:, j, k] for j in range(3) for k in range(j, 3)]
-    return np.stack(inverse_entries(upper), axis=1)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+    return np.stack(_inverse_entries(upper), axis=1)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+
+
+def _inverse_entries(N: list[Array]) -> list[Array]:
+    """Entries xx, xy, xw, yy, yw, ww of the inverse of each symmetric 3 x 3 matrix."""
+    a, b, c, d, e, f = N[:6]
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * A + b * B + c * C
+    return [A / det, B / det, C / det, (a * f - c * c) / det, (b * c - a * e) / det, (a * d - b * b) / det]
+
+
+def _nearest_solution(equations: Array) -> Array:
+    """(n, 3) points whose (X, Y, Z, 1) solve equations (n, m, 4) best: smallest singular vectors."""
+    nowhere = ~np.isfinite(equations).all(axis=(1, 2))
+    equations[nowhere] = np.eye(equations.shape[1], 4)
+    last = np.linalg.svd(equations)[2][:, 3]
+    points = last[:, :3] / last[:, 3:]
+    points[nowhere] = np.nan
+    return np.asarray(points)

@@ -47,14 +47,6 @@ def error_variances(members: Sequence[LensNets], x: Array, outputs: Array) -> Ar
     return np.asarray(variances * _sizes(members[0].scale, outputs) ** 2)
 
 
-def _sizes(scale: str, outputs: Array) -> Array:
-    """Relative sizes (S, L) of the targets' errors, with a mean square of 1."""
-    sizes = np.ones_like(outputs)
-    alpha, derivative = from_scale(scale, outputs[:, 0])
-    sizes[:, 0] = np.abs(alpha / derivative)
-    return sizes / np.sqrt((sizes**2).mean(axis=0))
-
-
 def odd_camera(members: Sequence[LensNets], x: Array, outputs: Array) -> int | None:
     """The camera whose deletion makes all others agree far better, or None; see `error_variances`."""
     S = len(x)
@@ -86,6 +78,7 @@ def _errors(members: Sequence[LensNets], x: Array, outputs: Array) -> tuple[Arra
 
 
 def _error(net: ParameterNet, x: Array, targets: Array, sizes: Array) -> tuple[float, float]:
+    """sigma^2 and nu of one network, for targets whose errors have relative sizes."""
     y, J = net.output_with_jacobian(x)
     J = J / (net.spread * sizes[:, None])
     w, functions = np.linalg.eigh((J / net.prior) @ J.T)  # P: the precisions of the prior
@@ -98,3 +91,11 @@ def _error(net: ParameterNet, x: Array, targets: Array, sizes: Array) -> tuple[f
     freedom = q.sum(axis=1) ** 2 / (q * q).sum(axis=1)
     k = min(int((freedom < wanted).sum()), len(tau2) - 1)
     return float((q[k] * parts**2).sum() / q[k].sum()) * net.spread**2, float(freedom[k])
+
+
+def _sizes(scale: str, outputs: Array) -> Array:
+    """Relative sizes (S, L) of the targets' errors, with a mean square of 1."""
+    sizes = np.ones_like(outputs)
+    alpha, derivative = from_scale(scale, outputs[:, 0])
+    sizes[:, 0] = np.abs(alpha / derivative)
+    return sizes / np.sqrt((sizes**2).mean(axis=0))

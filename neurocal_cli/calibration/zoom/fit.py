@@ -1,6 +1,8 @@
-"""`fit_lens`: calibration of a zoom lens from points, the three steps of the paper's section 4.2.
+"""Calibration of a zoom lens: `fit_lens` from points, `fit_lens_cameras` from known cameras.
 
-`fit_lens_cameras`: a zoom lens from known cameras, step 2 of the paper only.
+`fit_lens` takes the three steps of the paper's section 4.2: a calibration at each setting (`initialisation`),
+networks for each parameter alone (`parameter_networks`), and the training of all of them together
+(`joint_training`). Known cameras need the second step only.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from neurocal_cli.calibration.zoom.settings import (
     Tables,
     local_names,
     scaled_controls,
+    symmetric,
 )
 from neurocal_cli.calibration.zoom.target import lens_target, on_target, target_coupling
 from neurocal_cli.calibration.zoom.zoom_lens import Member, ZoomLens
@@ -46,7 +49,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError, check_choice, check_seed
 from neurocal_cli.network.options import Progress
-from neurocal_cli.observations.target import TARGETS, Target
+from neurocal_cli.observations.target import TARGETS
 
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
@@ -54,6 +57,8 @@ CAMERAS = ("auto", "still", "moving")
 # A network follows each coefficient; of the wide models a fisheye alone has coefficients that are linear.
 _TOO_MANY = {*WIDE, *WITH_PRISM} - {"fisheye"}
 DISTORTIONS = ("auto", *(model for model in MODELS if model not in _TOO_MANY))
+# Of known cameras; test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach.
+_MEMBERS = 4
 
 
 def fit_lens(
@@ -126,20 +131,19 @@ def fit_lens(
         start = choose_model(lens, options)
     else:
         start = calibrate_settings(lens, distortion, options)
-    start, joints = _train(start, options)
+    start, joints = _train_and_reject(start, options)
     fitted = assemble(start, joints, options)
-    return fitted if found is None else _with_target(fitted, start, found)
-
-
-def _with_target(fitted: ZoomLens, start: CalibratedSettings, found: Target) -> ZoomLens:
-    """Add the target to the lens, with the effect of its uncertainty."""
+    if found is None:
+        return fitted
     coupling = None
     with suppress(np.linalg.LinAlgError):  # an undetermined pose
         coupling = target_coupling(start.data, start.tables, found, start.variance)
     return replace(fitted, target=found, target_coupling=coupling)
 
 
-def _train(start: CalibratedSettings, options: FitOptions) -> tuple[CalibratedSettings, list[Joint]]:
+def _train_and_reject(
+    start: CalibratedSettings, options: FitOptions
+) -> tuple[CalibratedSettings, list[Joint]]:
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
         joints = _trained(start, options)
@@ -188,9 +192,6 @@ def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
         )
     joints.sort(key=lambda joint: -joint.evidence)
     return joints
-
-
-_MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach
 
 
 @frozen_dataclass(eq=False)
@@ -321,6 +322,5 @@ def _error_normal(members: tuple[LensNets, ...], x: Array, local: Array) -> Norm
     """Inverse covariances of the given parameters, from the size of their errors."""
     outputs, by_local = local_to_outputs(members[0].scale, local)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / error_variances(members, x, outputs)[..., None])
-    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, like one read from a file
     S, L = local.shape
-    return Normal(H, np.zeros((S, L)), np.zeros(S), True)
+    return Normal(symmetric(H), np.zeros((S, L)), np.zeros(S), True)

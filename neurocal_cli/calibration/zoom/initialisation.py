@@ -1,12 +1,11 @@
-"""Step 1: a calibration at each setting, without settings whose pixels do not fit, and the distortion model.
-
-The distortion model is the simplest whose cross-validation error no richer one lowers.
-
-Step 1: a calibration at each setting, then tables of local parameters with common constants.
+"""Step 1: a calibration at each setting, then tables of local parameters with common constants.
 
 The static calibrations are independent and start from random weights. Their constants are then made equal.
 The local parameters of all settings and the constants together minimise the reprojection error. This is the
 smallest error that any model of the local parameters can reach at the settings.
+
+Settings whose pixels do not fit are left out. The distortion model is the simplest whose cross-validation
+error no richer one lowers.
 """
 
 from __future__ import annotations
@@ -42,124 +41,6 @@ from neurocal_cli.observations.points import Correspondences
 
 # The static calibrations are near the minimum, but not at it.
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
-
-
-@frozen_dataclass(eq=False)
-class StaticFit:
-    """Independent calibrations."""
-
-    local: Array  # (S, L)
-    theta: Array  # (S,)
-    R: Array  # (V, 3, 3) and (V, 3): pose of each view
-    t: Array
-    good: NDArray[np.bool_]  # (S,) calibrated; the values elsewhere are those of the nearest good setting
-    reasons: dict[int, str]  # of the failures, by setting
-
-
-def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
-    """Calibrate each setting alone, from random weights; at least 3 and half of them must succeed."""
-    S, V = lens.n_settings, lens.points.n_views
-    local = np.zeros((S, len(data.names)))
-    theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))
-    good, reasons = np.zeros(S, dtype=bool), {}
-    number = {name: k for k, name in enumerate(lens.points.view_names)}
-    rows = lens.point_setting
-    for s in range(S):
-        progress("calibrating each setting", s / S)
-        try:
-            cal = _calibrate(lens.points.select(rows == s), data.model, seed, skew)
-        except NeurocalError as error:
-            reasons[s] = str(error)
-            continue
-        K = cal.intrinsics
-        for name, view in cal.views.items():
-            R[number[name]], t[number[name]] = view.pose.R, view.pose.t
-        t_z = [float(np.mean([view.pose.t[2] for view in cal.views.values()]))] if data.still else []
-        local[s, : 4 + data.still] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z]
-        if cal.distortion_model == data.model:
-            local[s, 4 + data.still :] = cal.distortion
-        theta[s], good[s] = K.theta, np.isfinite(cal.rmse_px)
-    if good.sum() < max(3, (S + 1) // 2):
-        first = next(iter(reasons))
-        raise DegenerateGeometryError(
-            f"{int((~good).sum())} of {S} settings cannot be calibrated, the first at "
-            f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
-        )
-    nearest = _nearest_good(lens, good)
-    for v, s in enumerate(lens.view_setting):
-        if not good[s]:
-            donor = int(np.flatnonzero(lens.view_setting == nearest[s])[0])
-            R[v], t[v] = R[donor], t[donor]
-    return StaticFit(local[nearest], theta[nearest], R, t, good, reasons)
-
-
-def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
-    """One setting; without distortion where its points do not determine it."""
-    try:
-        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
-    except DegenerateGeometryError:
-        if model == "none":
-            raise
-        return _calibrate(points, "none", seed, skew)
-
-
-def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(S,) the setting itself, or the nearest one that was calibrated."""
-    x = lens.settings / np.maximum(np.ptp(lens.settings, axis=0), 1e-300)
-    distance = ((x[:, None] - x[None]) ** 2).sum(axis=-1)
-    distance[:, ~good] = np.inf
-    return np.where(good, np.arange(len(good)), distance.argmin(axis=1))
-
-
-def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
-    """Starting values of the constants: medians over the settings."""
-    theta = float(np.median(fit.theta[fit.good]))
-    if not still:
-        return Constants(theta, fit.R, fit.t)
-    views = np.flatnonzero(fit.good[lens.view_setting])
-    # The median rotation: the one nearest to all others.
-    chords = ((fit.R[views][:, None] - fit.R[views][None]) ** 2).sum(axis=(-2, -1))
-    middle = views[int(np.sqrt(chords).sum(axis=1).argmin())]
-    return Constants(theta, fit.R[middle], np.median(fit.t[views, :2], axis=0))
-
-
-def common_tables(
-    data: PixelData,
-    local: Array,
-    constants: Constants,
-    progress: Progress | None = None,
-    *,
-    fixed: bool = False,
-) -> Tables:
-    """Minimise the reprojection error over the local parameters and, if they are not fixed, the constants."""
-    tried = count()
-
-    def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
-        # Valid if all points are in front and the distortion is monotonic.
-        if progress is not None:
-            progress("common constants", (done := next(tried)) / (done + 10))
-        constants = before.constants if fixed else before.constants.moved(by_shared)
-        tables = _linearised(data, before.local + by_local, constants)
-        return tables, tables.normal.sensible
-
-    L, start = local.shape[1], _linearised(data, local, constants)
-    shared = np.arange(L, L + (0 if fixed else data.n_shared))
-    problem = SharedAndOwn(start, lambda tables: tables.normal.blocks, moved, shared, np.arange(L))
-    settled = minimise(problem, _OPTIONS).settled[0]
-    return replace(problem.state, converged=bool(settled))
-
-
-def _linearised(data: PixelData, local: Array, constants: Constants) -> Tables:
-    normal, constants = data.linearise(local, constants)
-    return Tables(local, constants, normal)
-
-
-def local_covariance(normal: Normal, L: int, variance: float) -> Array:
-    """Covariance of each setting's local parameters (S, L, L)."""
-    found = schur_covariance(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
-    return variance * found.own
-
-
 _QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 # A richer model must lower the cross-validation error to this share and the residual variance by so many
 # standard deviations. The tests of the choice in tests/test_zoom_lens.py have both outcomes.
@@ -181,6 +62,18 @@ class FitOptions:
     budget: Budget
     seed: int
     report: Progress
+
+
+@frozen_dataclass(eq=False)
+class StaticFit:
+    """Independent calibrations."""
+
+    local: Array  # (S, L)
+    theta: Array  # (S,)
+    R: Array  # (V, 3, 3) and (V, 3): pose of each view
+    t: Array
+    good: NDArray[np.bool_]  # (S,) calibrated; the values elsewhere are those of the nearest good setting
+    reasons: dict[int, str]  # of the failures, by setting
 
 
 @frozen_dataclass(eq=False)
@@ -241,57 +134,6 @@ class CalibratedSettings:
         return replace(self, rejected=(*self.rejected, rejected))
 
 
-def free_pose_variance(start: CalibratedSettings) -> float:
-    """Variance of the noise if each view of a still camera had a pose of its own [px^2].
-
-    nan if the camera moves, or if some setting does not determine camera and pose by itself.
-    """
-    if not start.data.still or not start.static.good.all():
-        return np.nan
-    t_z = start.data.names.index("t_z")
-    static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
-    free = CalibratedSettings.of(start.lens, replace(start.data, still=False), static)
-    sensible = free.tables.normal.sensible and np.isfinite(free.variance)
-    return free.variance if sensible else np.nan
-
-
-def check_settings(count: int, controls: int, source: str) -> None:
-    """Refuse too few settings (`InputError`)."""
-    least = controls + 2
-    if count < least:
-        raise InputError(
-            f"{source}: {count} settings are too few for {controls} control{'s' * (controls > 1)}; give at "
-            f"least {least} settings, better 5 values of each control"
-        )
-
-
-def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
-    """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
-    data = PixelData.of(lens, options.still, model, options.free_theta)
-    static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
-    start = CalibratedSettings.of(lens, data, static, options.report)
-    while True:
-        normal = start.tables.normal
-        if not normal.sensible or not np.isfinite(normal.cost).all():
-            raise DegenerateGeometryError(
-                f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
-                "moved, give several views of the board at each setting, and --camera moving"
-            )
-        bad = _bad_pixels(np.sqrt(normal.cost / start.data.counts)) if options.reject else None
-        if bad is None or not start.may_reject:
-            return start
-        setting, reason = start.lens.settings[bad[0]], bad[1]
-        start = start.without(bad[0], options.report).with_rejected(setting, reason)
-
-
-def _bad_pixels(rms: Array) -> tuple[int, str] | None:
-    """The setting that fits far worse than the others and the reason to reject it; rms is (S,) in px."""
-    worst, typical = int(rms.argmax()), float(np.median(rms))
-    if rms[worst] <= _WRONG_PIXELS * typical:
-        return None
-    return worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
-
-
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
     best: CalibratedSettings | None = None
@@ -306,7 +148,8 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
         if best is None:
             best = start
             continue
-        if not _explains_more(start, best):
+        noise = np.sqrt(2 / start.data.views.n_equations)  # of a variance, as a share of it
+        if not start.variance < best.variance * (1 - _SIGMAS * noise):
             continue
         options.report(f"trying distortion model {model}", 0.5)
         best_px = _held_out(best, options) if best_px is None else best_px
@@ -317,12 +160,6 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
         assert failure is not None
         raise failure
     return best
-
-
-def _explains_more(rich: CalibratedSettings, simple: CalibratedSettings) -> bool:
-    """Whether the residual variance decreases significantly."""
-    freedom = rich.data.views.n_equations
-    return rich.variance < simple.variance * (1 - _SIGMAS * np.sqrt(2 / freedom))
 
 
 def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
@@ -340,3 +177,148 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
         there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
         squares += float(there.cost[~part].sum()) if np.isfinite(there.cost).all() else np.inf
     return float(np.sqrt(squares / len(start.lens.points)))
+
+
+def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
+    """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
+    data = PixelData.of(lens, options.still, model, options.free_theta)
+    static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
+    start = CalibratedSettings.of(lens, data, static, options.report)
+    while True:
+        normal = start.tables.normal
+        if not normal.sensible or not np.isfinite(normal.cost).all():
+            raise DegenerateGeometryError(
+                f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
+                "moved, give several views of the board at each setting, and --camera moving"
+            )
+        rms = np.sqrt(normal.cost / start.data.counts)
+        worst, typical = int(rms.argmax()), float(np.median(rms))
+        if not options.reject or rms[worst] <= _WRONG_PIXELS * typical or not start.may_reject:
+            return start
+        reason = f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
+        setting = start.lens.settings[worst]
+        start = start.without(worst, options.report).with_rejected(setting, reason)
+
+
+def check_settings(count: int, controls: int, source: str) -> None:
+    """Refuse too few settings (`InputError`)."""
+    least = controls + 2
+    if count < least:
+        raise InputError(
+            f"{source}: {count} settings are too few for {controls} control{'s' * (controls > 1)}; give at "
+            f"least {least} settings, better 5 values of each control"
+        )
+
+
+def free_pose_variance(start: CalibratedSettings) -> float:
+    """Variance of the noise if each view of a still camera had a pose of its own [px^2].
+
+    nan if the camera moves, or if some setting does not determine camera and pose by itself.
+    """
+    if not start.data.still or not start.static.good.all():
+        return np.nan
+    t_z = start.data.names.index("t_z")
+    static = replace(start.static, local=np.delete(start.static.local, t_z, axis=1))
+    free = CalibratedSettings.of(start.lens, replace(start.data, still=False), static)
+    sensible = free.tables.normal.sensible and np.isfinite(free.variance)
+    return free.variance if sensible else np.nan
+
+
+def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Progress) -> StaticFit:
+    """Calibrate each setting alone, from random weights; at least 3 and half of them must succeed."""
+    S, V = lens.n_settings, lens.points.n_views
+    local = np.zeros((S, len(data.names)))
+    theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))
+    good, reasons = np.zeros(S, dtype=bool), {}
+    number = {name: k for k, name in enumerate(lens.points.view_names)}
+    rows = lens.point_setting
+    for s in range(S):
+        progress("calibrating each setting", s / S)
+        try:
+            cal = _calibrate(lens.points.select(rows == s), data.model, seed, skew)
+        except NeurocalError as error:
+            reasons[s] = str(error)
+            continue
+        K = cal.intrinsics
+        for name, view in cal.views.items():
+            R[number[name]], t[number[name]] = view.pose.R, view.pose.t
+        t_z = [float(np.mean([view.pose.t[2] for view in cal.views.values()]))] if data.still else []
+        local[s, : 4 + data.still] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z]
+        if cal.distortion_model == data.model:
+            local[s, 4 + data.still :] = cal.distortion
+        theta[s], good[s] = K.theta, np.isfinite(cal.rmse_px)
+    if good.sum() < max(3, (S + 1) // 2):
+        first = next(iter(reasons))
+        raise DegenerateGeometryError(
+            f"{int((~good).sum())} of {S} settings cannot be calibrated, the first at "
+            f"{describe(lens.controls, lens.settings[first])}: {reasons[first]}"
+        )
+    # Of each setting: itself, or the nearest one that was calibrated.
+    x = lens.settings / np.maximum(np.ptp(lens.settings, axis=0), 1e-300)
+    distance = ((x[:, None] - x[None]) ** 2).sum(axis=-1)
+    distance[:, ~good] = np.inf
+    nearest = np.where(good, np.arange(S), distance.argmin(axis=1))
+    for v, s in enumerate(lens.view_setting):
+        if not good[s]:
+            donor = int(np.flatnonzero(lens.view_setting == nearest[s])[0])
+            R[v], t[v] = R[donor], t[donor]
+    return StaticFit(local[nearest], theta[nearest], R, t, good, reasons)
+
+
+def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
+    """One setting; without distortion where its points do not determine it."""
+    try:
+        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
+    except DegenerateGeometryError:
+        if model == "none":
+            raise
+        return _calibrate(points, "none", seed, skew)
+
+
+def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
+    """Starting values of the constants: medians over the settings."""
+    theta = float(np.median(fit.theta[fit.good]))
+    if not still:
+        return Constants(theta, fit.R, fit.t)
+    views = np.flatnonzero(fit.good[lens.view_setting])
+    # The median rotation: the one nearest to all others.
+    chords = ((fit.R[views][:, None] - fit.R[views][None]) ** 2).sum(axis=(-2, -1))
+    middle = views[int(np.sqrt(chords).sum(axis=1).argmin())]
+    return Constants(theta, fit.R[middle], np.median(fit.t[views, :2], axis=0))
+
+
+def common_tables(
+    data: PixelData,
+    local: Array,
+    constants: Constants,
+    progress: Progress | None = None,
+    *,
+    fixed: bool = False,
+) -> Tables:
+    """Minimise the reprojection error over the local parameters and, if they are not fixed, the constants."""
+    tried = count()
+
+    def moved(before: Tables, by_shared: Array, by_local: Array) -> tuple[Tables, bool]:
+        # Valid if all points are in front and the distortion is monotonic.
+        if progress is not None:
+            progress("common constants", (done := next(tried)) / (done + 10))
+        constants = before.constants if fixed else before.constants.moved(by_shared)
+        tables = _linearised(data, before.local + by_local, constants)
+        return tables, tables.normal.sensible
+
+    L, start = local.shape[1], _linearised(data, local, constants)
+    shared = np.arange(L, L + (0 if fixed else data.n_shared))
+    problem = SharedAndOwn(start, lambda tables: tables.normal.blocks, moved, shared, np.arange(L))
+    settled = minimise(problem, _OPTIONS).settled[0]
+    return replace(problem.state, converged=bool(settled))
+
+
+def _linearised(data: PixelData, local: Array, constants: Constants) -> Tables:
+    normal, constants = data.linearise(local, constants)
+    return Tables(local, constants, normal)
+
+
+def local_covariance(normal: Normal, L: int, variance: float) -> Array:
+    """Covariance of each setting's local parameters (S, L, L)."""
+    found = schur_covariance(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
+    return variance * found.own

@@ -47,19 +47,15 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
     if lens.known:
         findings = (*_of_known_cameras(lens, everywhere), uncertain, *_large_error(lens, elsewhere_px))
         return verdict_of(findings, measures)
-    measures = {"held_out_px": lens.left_out_px, "precision_px": lens.noise_floor_px, **measures}
-    return verdict_of((*_findings(lens), uncertain, _elsewhere(lens, elsewhere_px)), measures)
-
-
-def _elsewhere(lens: ZoomLens, px: float) -> Finding:
-    """Finding about the error at other points, such as at settings in between."""
     floor = lens.noise_floor_px
-    return (
-        _BETWEEN.grade(px / max(floor, 1e-9)),
-        f"the error at the given points is {px:.3g} px, but the noise floor {floor:.3g} px",
+    elsewhere = (
+        _BETWEEN.grade(elsewhere_px / max(floor, 1e-9)),
+        f"the error at the given points is {elsewhere_px:.3g} px, but the noise floor {floor:.3g} px",
         "check that target and camera are where they were, the unit of X,Y,Z and the names of the settings, "
         "or add settings where the parameters change most",
     )
+    measures = {"held_out_px": lens.left_out_px, "precision_px": floor, **measures}
+    return verdict_of((*_findings(lens), uncertain, elsewhere), measures)
 
 
 def _findings(lens: ZoomLens) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ denominator stays -1 or 1, so that extrapolation does not reach the pole.
 
 B networks of one topology are computed together: weights are (B, P).
 
-Training of the networks of one parameter: least squares with Bayesian regularisation.
+`train` fits them to the targets d_s of one parameter, by least squares with Bayesian regularisation:
 
     E = 1/2 sum_s (y(x_s) - d_s)^2 / (c_s + tau^2) + 1/2 sum_g a_g |w_g|^2
 
@@ -42,6 +42,19 @@ from neurocal_cli.camera.geometry import Array
 # Keeps the pole 1 % of half the range outside it or farther. The poles of
 # test_plane_and_rational_unit_are_any_homographic_function come as near as 2 %.
 _LARGEST_TILT = 0.99
+# Precisions of priors in units of the targets' spread; see `updated_precision`. The training tests in
+# tests/test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
+_FLAT = 1e-4  # of free weights: a standard deviation of 100
+_MOST = 1e4
+_LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
+_ENOUGH_VALUES = 4
+# The descent has no criterion to stop: the priors are updated until the schedule ends.
+_OPTIONS = DescentOptions(
+    damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
+    tolerance=0.0, flat=0.0, max_iterations=1_000_000,
+)  # fmt: skip
+
+_Trial = tuple[Array, Array, Array, Array]  # weights, outputs, their derivatives, the cost
 
 
 @frozen_dataclass
@@ -144,14 +157,6 @@ def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple
     return y, J
 
 
-def _products(topology: Topology, weights: Array) -> Array:
-    """M (B, 2 D, 2 D), symmetric."""
-    M = np.zeros((len(weights), 2 * topology.controls, 2 * topology.controls))
-    first, second = topology.pairs
-    M[:, first, second] = M[:, second, first] = weights[:, topology.parts["m"]]
-    return M
-
-
 def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array]:
     """Output (B, n), controls and first hidden layer (B, n, R), second hidden layer (B, n, H)."""
     part = topology.parts
@@ -171,17 +176,12 @@ def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array,
     return y, r, g
 
 
-# Precisions of priors in units of the targets' spread; see `updated_precision`. The training tests in
-# tests/test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
-_FLAT = 1e-4  # of free weights: a standard deviation of 100
-_MOST = 1e4
-_LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
-_ENOUGH_VALUES = 4
-# The descent has no criterion to stop: the priors are updated until the schedule ends.
-_OPTIONS = DescentOptions(
-    damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
-    tolerance=0.0, flat=0.0, max_iterations=1_000_000,
-)  # fmt: skip
+def _products(topology: Topology, weights: Array) -> Array:
+    """M (B, 2 D, 2 D), symmetric."""
+    M = np.zeros((len(weights), 2 * topology.controls, 2 * topology.controls))
+    first, second = topology.pairs
+    M[:, first, second] = M[:, second, first] = weights[:, topology.parts["m"]]
+    return M
 
 
 @frozen_dataclass
@@ -202,39 +202,6 @@ class TrainedNets:
     precision: Array  # (B, G) of the prior of each kind of weights
     scatter: Array  # (B,) tau^2, in squared units of the targets
     evidence: Array  # (B,) log of the probability of the targets, up to a constant of all topologies
-
-
-def sparse_controls(x: Array) -> NDArray[np.bool_]:
-    """(D,) which controls have too few distinct values in the settings (S, D) for tanh units."""
-    return np.array([len(np.unique(column)) < _ENOUGH_VALUES for column in x.T])
-
-
-def updated_precision(
-    topology: Topology, precision: Array, leverage: Array, weights: Array, x: Array
-) -> Array:
-    """Precision of each prior (..., G) by MacKay's formula, half the way to it on a logarithmic scale.
-
-    `leverage` (..., P) is the diagonal of A^-1. Data do not shrink weights along directions that they do not
-    determine. The standard deviation of a prior is therefore at most 6. It is at most 1 for weights from a
-    control of three values, where a unit could turn between two of them without any effect on the data, and
-    for the weights a of the rational units, as tanh(a) saturates. It is exactly 1 for a where a control has
-    three values, as these leave the tilt open.
-    """
-    kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
-    least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
-    least[2 : 2 + D][sparse] = _LEAST_SPARSE
-    least[6 + D] = _LEAST_TILT
-    if sparse.any():
-        most[6 + D] = _LEAST_TILT
-    effective = np.maximum(kinds.sum(axis=1) - precision * (leverage @ kinds.T), 1e-3)
-    squares = np.maximum((weights * weights) @ kinds.T, 1e-12)
-    return np.sqrt(precision * np.clip(effective / squares, least, most))
-
-
-def prior_precision(topology: Topology, precision: Array) -> Array:
-    """Precision of each weight's prior, (..., G) -> (..., P)."""
-    group = topology.groups
-    return np.where(group < 0, _FLAT, np.asarray(precision)[..., np.maximum(group, 0)])
 
 
 def train(
@@ -262,11 +229,8 @@ def train(
     return learner.result()
 
 
-_Trial = tuple[Array, Array, Array, Array]  # weights, outputs, their derivatives, the cost
-
-
 class _NetworkStack:
-    """Networks in training as a problem of `least_squares`: each network is a group of cost 2 E."""
+    """Networks in training as a problem of `LevenbergMarquardt`: each network is a group of cost 2 E."""
 
     def __init__(self, topology: Topology, x: Array, targets: Array, variance: Array, weights: Array) -> None:
         self.topology, self.x, self.targets, self.variance = topology, x, targets, variance
@@ -345,3 +309,36 @@ class _NetworkStack:
         evidence = -0.5 * self.cost - 0.5 * volume + log_prior - 0.5 * noise
         evidence = np.where(np.isfinite(evidence), evidence, -np.inf)
         return TrainedNets(self.w, self.a, self.tau2, evidence)
+
+
+def updated_precision(
+    topology: Topology, precision: Array, leverage: Array, weights: Array, x: Array
+) -> Array:
+    """Precision of each prior (..., G) by MacKay's formula, half the way to it on a logarithmic scale.
+
+    `leverage` (..., P) is the diagonal of A^-1. Data do not shrink weights along directions that they do not
+    determine. The standard deviation of a prior is therefore at most 6. It is at most 1 for weights from a
+    control of three values, where a unit could turn between two of them without any effect on the data, and
+    for the weights a of the rational units, as tanh(a) saturates. It is exactly 1 for a where a control has
+    three values, as these leave the tilt open.
+    """
+    kinds, D, sparse = topology.membership, topology.controls, sparse_controls(x)
+    least, most = np.full(len(kinds), _LEAST), np.full(len(kinds), _MOST)
+    least[2 : 2 + D][sparse] = _LEAST_SPARSE
+    least[6 + D] = _LEAST_TILT
+    if sparse.any():
+        most[6 + D] = _LEAST_TILT
+    effective = np.maximum(kinds.sum(axis=1) - precision * (leverage @ kinds.T), 1e-3)
+    squares = np.maximum((weights * weights) @ kinds.T, 1e-12)
+    return np.sqrt(precision * np.clip(effective / squares, least, most))
+
+
+def prior_precision(topology: Topology, precision: Array) -> Array:
+    """Precision of each weight's prior, (..., G) -> (..., P)."""
+    group = topology.groups
+    return np.where(group < 0, _FLAT, np.asarray(precision)[..., np.maximum(group, 0)])
+
+
+def sparse_controls(x: Array) -> NDArray[np.bool_]:
+    """(D,) which controls have too few distinct values in the settings (S, D) for tanh units."""
+    return np.array([len(np.unique(column)) < _ENOUGH_VALUES for column in x.T])

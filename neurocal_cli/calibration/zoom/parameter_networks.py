@@ -4,10 +4,9 @@ The outputs are centred and scaled. alpha_u is on a logarithmic, linear or recip
 highest evidence. Instead of alpha_v there is log(alpha_v / alpha_u), as the pixels' shape hardly changes with
 the setting. u0, v0, t_z and the distortion coefficients are used as they are.
 
-Step 2: networks for each parameter alone, with several topologies and starts.
-
-The parameters are fitted in an order, like the polynomials of Willson (1994). t_z comes first, as it is the
-least certain. The others are then estimated with t_z held at the output of its networks. alpha_u, which is
+`fit_committee` is step 2: networks for each parameter alone, with several topologies and starts. The
+parameters are fitted in an order, like the polynomials of Willson (1994). t_z comes first, as it is the least
+certain. The others are then estimated with t_z held at the output of its networks. alpha_u, which is
 correlated with t_z, compensates for the remaining error of these networks, and its targets are precise.
 
 Evidence ranks networks of all topologies. The noise is far smaller than the variation of the parameters, so
@@ -40,51 +39,16 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import UsageError
 
 SCALES = ("log", "linear", "inverse")
-
-
-def to_scale(scale: str, alpha: Array) -> tuple[Array, Array]:
-    """Values on one of `SCALES`, and their derivatives by the value; of the shape of alpha."""
-    if scale == "log":
-        return np.log(alpha), 1 / alpha
-    if scale == "inverse":
-        return 1 / alpha, -1 / alpha**2
-    return np.asarray(alpha, dtype=float), np.ones_like(alpha)
-
-
-def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
-    """Values from one of `SCALES`, and their derivatives by y; of the shape of y."""
-    if scale == "log":
-        alpha = np.exp(y)
-        return alpha, alpha
-    if scale == "inverse":
-        return 1 / y, -1 / y**2
-    return np.asarray(y, dtype=float), np.ones_like(y)
-
-
-@frozen_dataclass(eq=False)
-class ParameterNet:
-    """One network with the scaling of its output: centre + spread y."""
-
-    topology: Topology
-    weights: Array  # (P,)
-    precision: Array  # (G,) of the weights' priors
-    centre: float
-    spread: float
-    scatter: float = 0.0  # variance of the output from setting to setting that the network does not explain
-
-    def output(self, x: Array) -> Array:
-        """(n,) outputs at scaled controls (n, D)."""
-        return self.centre + self.spread * respond(self.topology, self.weights[None], x)[0]
-
-    def output_with_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Outputs (n,) and their derivatives by the weights (n, P)."""
-        y, J = respond_with_jacobian(self.topology, self.weights[None], x)
-        return self.centre + self.spread * y[0], self.spread * J[0]
-
-    @property
-    def prior(self) -> Array:
-        """(P,) precision of each weight's prior."""
-        return prior_precision(self.topology, self.precision)
+# Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
+# these choices, `Budget` and `Schedule` reach between settings.
+# (own, hidden): tanh units of the first layer for each control, units of the second.
+TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
+# Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
+_SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
+_WEIGHTS_PER_SETTING = 2.0
+_LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
+_AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
+_GRID = 13  # values of each control at which networks are compared
 
 
 @frozen_dataclass(eq=False)
@@ -137,9 +101,49 @@ class LensNets:
         return scatter
 
 
-def are_cameras(local: Array) -> NDArray[np.bool_]:
-    """(...) which local parameters (..., L) are finite, with positive scale factors."""
-    return np.asarray(np.isfinite(local).all(axis=-1) & (local[..., :2] > 0).all(axis=-1))
+@frozen_dataclass(eq=False)
+class ParameterNet:
+    """One network with the scaling of its output: centre + spread y."""
+
+    topology: Topology
+    weights: Array  # (P,)
+    precision: Array  # (G,) of the weights' priors
+    centre: float
+    spread: float
+    scatter: float = 0.0  # variance of the output from setting to setting that the network does not explain
+
+    def output(self, x: Array) -> Array:
+        """(n,) outputs at scaled controls (n, D)."""
+        return self.centre + self.spread * respond(self.topology, self.weights[None], x)[0]
+
+    def output_with_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Outputs (n,) and their derivatives by the weights (n, P)."""
+        y, J = respond_with_jacobian(self.topology, self.weights[None], x)
+        return self.centre + self.spread * y[0], self.spread * J[0]
+
+    @property
+    def prior(self) -> Array:
+        """(P,) precision of each weight's prior."""
+        return prior_precision(self.topology, self.precision)
+
+
+def to_scale(scale: str, alpha: Array) -> tuple[Array, Array]:
+    """Values on one of `SCALES`, and their derivatives by the value; of the shape of alpha."""
+    if scale == "log":
+        return np.log(alpha), 1 / alpha
+    if scale == "inverse":
+        return 1 / alpha, -1 / alpha**2
+    return np.asarray(alpha, dtype=float), np.ones_like(alpha)
+
+
+def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
+    """Values from one of `SCALES`, and their derivatives by y; of the shape of y."""
+    if scale == "log":
+        alpha = np.exp(y)
+        return alpha, alpha
+    if scale == "inverse":
+        return 1 / y, -1 / y**2
+    return np.asarray(y, dtype=float), np.ones_like(y)
 
 
 def outputs_to_local(scale: str, outputs: Array) -> tuple[Array, Array]:
@@ -163,16 +167,9 @@ def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
     return outputs, by_local
 
 
-# Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
-# these choices, `Budget` and `Schedule` reach between settings.
-# (own, hidden): tanh units of the first layer for each control, units of the second.
-TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
-# Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
-_SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
-_WEIGHTS_PER_SETTING = 2.0
-_LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
-_AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
-_GRID = 13  # values of each control at which networks are compared
+def are_cameras(local: Array) -> NDArray[np.bool_]:
+    """(...) which local parameters (..., L) are finite, with positive scale factors."""
+    return np.asarray(np.isfinite(local).all(axis=-1) & (local[..., :2] > 0).all(axis=-1))
 
 
 @frozen_dataclass
@@ -245,13 +242,6 @@ def fit_committee(
     return tuple(LensNets(scale, tuple(chosen[j][k] for j in range(L))) for k in range(budget.members))
 
 
-def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
-    """Topologies for settings (S, D): at most two weights a setting, as the priors make most of them idle."""
-    limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
-    choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
-    return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
-
-
 def _given(
     local: Array, values: Array, H: Array | None, variance: float, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
@@ -292,7 +282,7 @@ def _fit(
     spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
     scaled = (targets - centre) / spread
     nets, evidence = [], []
-    for own, hidden in budget.topologies or suitable_topologies(x):
+    for own, hidden in budget.topologies or _suitable_topologies(x):
         topology = Topology(x.shape[1], own, hidden)
         start = topology.random_weights(budget.starts if own + hidden else 1, rng)
         trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
@@ -303,6 +293,13 @@ def _fit(
             evidence.append(float(e))
     order = np.argsort(-np.array(evidence), kind="stable")
     return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
+
+
+def _suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
+    """Topologies for settings (S, D): at most two weights a setting, as the priors make most of them idle."""
+    limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
+    choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
+    return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
 
 
 def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:

@@ -83,7 +83,7 @@ class QuadraticError:
 
 
 class _Problem(Generic[Model]):
-    """2 E as a problem of `least_squares` with one group."""
+    """2 E as a problem of `minimise` with one group."""
 
     def __init__(self, error: QuadraticError, model: Model, shared: Array) -> None:
         self.error, self.model, self.shared = error, model, shared

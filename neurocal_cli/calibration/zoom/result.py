@@ -27,7 +27,6 @@ from neurocal_cli.calibration.zoom.settings import Constants, Tables, describe, 
 from neurocal_cli.calibration.zoom.zoom_lens import Member, ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.observations.points import Correspondences
 
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
 # stay within 1.04 of the noise floor even between settings (slow tests in tests/test_zoom_lens.py).
@@ -83,7 +82,14 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     lens = provisional(start, joints, options)
     x = start.controls
     each = np.array([member.nets.local(x) for member in lens.members])
-    _refuse_contradiction(lens, each, start.lens.points)
+    valid = are_cameras(each).all(axis=0)
+    if not valid.all():
+        where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
+        why = view_of_another_unit(start.lens.points) or f"the networks give no camera at {where}"
+        raise DegenerateGeometryError(
+            f"no lens fits all the settings: {why}; check the names, the unit of X,Y,Z and the image size of "
+            "every setting"
+        )
     refuse_gaps(lens, start.lens.points.source)
     local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
@@ -96,19 +102,6 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     free_pose = float(np.sqrt(2 * free_pose_variance(start)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out, free_pose_px=free_pose)
     return replace(finished, warnings=_warnings(finished, start))
-
-
-def _refuse_contradiction(lens: ZoomLens, each: Array, points: Correspondences) -> None:
-    """Refuse networks with outputs (M, S, L) that are no valid camera at one of their own settings."""
-    valid = are_cameras(each).all(axis=0)
-    if valid.all():
-        return
-    where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
-    why = view_of_another_unit(points) or f"the networks give no camera at {where}"
-    raise DegenerateGeometryError(
-        f"no lens fits all the settings: {why}; check the names, the unit of X,Y,Z and the image size of "
-        "every setting"
-    )
 
 
 def refuse_gaps(lens: ZoomLens, source: str) -> None:

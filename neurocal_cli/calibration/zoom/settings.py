@@ -1,6 +1,4 @@
-"""Known points and their images at many settings of one zoom lens.
-
-Normal matrices of the reprojection error at each setting.
+"""Known points at many settings of one zoom lens, and normal matrices of their reprojection error.
 
 The local parameters change with the setting: alpha_u, alpha_v, u0, v0, t_z and the distortion coefficients.
 All settings share the constants (the paper's zero-order terms): theta and, for a still camera, R, t_x, t_y.
@@ -33,6 +31,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences
 
 CONTROLS = ("zoom", "focus")
+_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 
 @frozen_dataclass(eq=False)
@@ -149,9 +148,6 @@ def far_value(controls: tuple[str, ...], settings: Array) -> str | None:
     return None
 
 
-_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
-
-
 @frozen_dataclass(eq=False)
 class Constants:
     """Parameters that all settings share: theta, and the pose of a still camera or of each view."""
@@ -182,6 +178,11 @@ class Normal:
         """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
         g = self.g[..., None]
         return np.block([[self.H, g], [np.swapaxes(g, 1, 2), self.cost[:, None, None]]])
+
+
+def symmetric(H: Array) -> Array:
+    """Matrices (S, n, n) of the upper halves of others: exactly symmetric, like those read from a file."""
+    return np.asarray(np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2))
 
 
 @frozen_dataclass(eq=False)
@@ -257,8 +258,7 @@ class PixelData:
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
-        upper = np.triu(summed)  # exactly symmetric, like one read from a file
-        summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
+        summed = symmetric(summed)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
         return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
 

@@ -1,7 +1,4 @@
-"""A calibrated zoom lens: camera parameters at any setting, with their uncertainty.
-
-The calibrated camera at one setting of a zoom lens.
-"""
+"""A calibrated zoom lens: camera parameters at any setting with their uncertainty, and one camera of it."""
 
 from __future__ import annotations
 
@@ -29,38 +26,8 @@ from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
+_VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 _LEAST_INFORMATION = 0.02  # least share of a direction of the target's offsets that remains
-
-
-@frozen_dataclass(eq=False)
-class Member:
-    """One member of the committee: its networks and constants."""
-
-    nets: LensNets
-    constants: Constants
-
-
-@frozen_dataclass
-class RejectedSetting:
-    """A setting that was left out, and the reason."""
-
-    setting: tuple[float, ...]
-    reason: str
-
-
-@frozen_dataclass(eq=False)
-class Prediction:
-    """Predicted parameters at some settings."""
-
-    local: Array  # (n, L)
-    constants: Constants
-    # (n, L + Q, L + Q) of the local parameters and of theta; of omega, t_x, t_y as well for a still camera
-    covariance: Array
-
-    @property
-    def std(self) -> Array:
-        """(n, L + Q) standard deviations."""
-        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
 
 @frozen_dataclass(eq=False)
@@ -261,6 +228,37 @@ class ZoomLens:
         return Prediction(locals_.mean(axis=0), constants, covariance)
 
 
+@frozen_dataclass(eq=False)
+class Member:
+    """One member of the committee: its networks and constants."""
+
+    nets: LensNets
+    constants: Constants
+
+
+@frozen_dataclass
+class RejectedSetting:
+    """A setting that was left out, and the reason."""
+
+    setting: tuple[float, ...]
+    reason: str
+
+
+@frozen_dataclass(eq=False)
+class Prediction:
+    """Predicted parameters at some settings."""
+
+    local: Array  # (n, L)
+    constants: Constants
+    # (n, L + Q, L + Q) of the local parameters and of theta; of omega, t_x, t_y as well for a still camera
+    covariance: Array
+
+    @property
+    def std(self) -> Array:
+        """(n, L + Q) standard deviations."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+
 def _spread(J: Array, covariance: Array, Q: int) -> Array:
     """Covariance of local parameters and constants (n, L + Q, L + Q) from that of the weights."""
     n, L, P = J.shape
@@ -298,9 +296,6 @@ def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance
     values, vectors = np.linalg.eigh(np.eye(K.shape[1]) - K.T @ follow)
     follow = follow @ (vectors / np.sqrt(np.maximum(values, _LEAST_INFORMATION)))
     return covariance + follow @ follow.T
-
-
-_VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 
 
 def camera_at(
