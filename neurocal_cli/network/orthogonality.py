@@ -3,9 +3,7 @@
 Each view's network has learnt a product B_k = W V_k up to scale. All views share W, and the rotation part of
 V_k is orthonormal, so the columns of W^-1 B_k must be perpendicular and of equal length. A view of a solid
 target gives five conditions, a view of a flat board two (Zhang 2000). Levenberg-Marquardt solves them for W's
-five entries from random values.
-
-Stage 2: the trained products become cameras, one W for all views and a pose for each.
+five entries from random values. W^-1 B_k is then the pose of a view.
 """
 
 from __future__ import annotations
@@ -37,6 +35,22 @@ _APART = 1e-2  # largest difference of any entry from which on two minima are di
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
 _STARTS = 8  # random starts, trained side by side
 _ENOUGH = 3  # starts at the same, lowest loss with which training ends
+# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
+# which depths keep all points in front of the first camera.
+_MOST_CANDIDATES = 4
+_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
+
+
+def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
+    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
+    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
+    for group in groups:
+        if group.flat:
+            flat = group.product[:, :, :2]
+        else:
+            solid = group.product[:, :, :3]
+    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
+    return shared.entries[:_MOST_CANDIDATES, None]
 
 
 @frozen_dataclass(eq=False)
@@ -188,56 +202,16 @@ def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
         while descent.active.size:
             descent.step()
-            if _same_lowest(starts.loss, descent.active) >= _ENOUGH:
+            same = np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min())
+            same[descent.active] = False
+            if same.sum() >= _ENOUGH:
                 break
     return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
-
-
-def _same_lowest(loss: Array, active: NDArray[np.intp]) -> int:
-    """Number of starts that have ended at the lowest of all losses (B,)."""
-    same = np.abs(loss - loss.min()) <= _tie(loss.min())
-    same[active] = False
-    return int(same.sum())
 
 
 def _tie(loss: float) -> float:
     """Tolerance within which another loss equals this one."""
     return 1e-3 * loss + 1e-16
-
-
-def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
-    """Poses R (K, 3, 3), t (K, 3) whose D = [R | t] is nearest to W^-1 times the products (K, 3, I).
-
-    The products are those of solid targets (I = 4) or flat boards (I = 3; the third column of R is not
-    observed and is r1 x r2), up to scale and sign. t_z is positive, because the normalised origin is the
-    points' centroid, which lies in front.
-    """
-    D = cast("Array", np.linalg.solve(W, product))
-    D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]
-    M = D[:, :, :-1]
-    scale: Array = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
-    if M.shape[2] == 2:
-        third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
-        M = np.concatenate([M, third], axis=2)
-    return nearest_rotation(M), D[:, :, -1] / scale[:, None]
-
-
-# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
-# which depths keep all points in front of the first camera.
-_MOST_CANDIDATES = 4
-_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
-
-
-def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
-    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
-    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
-    for group in groups:
-        if group.flat:
-            flat = group.product[:, :, :2]
-        else:
-            solid = group.product[:, :, :3]
-    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
-    return shared.entries[:_MOST_CANDIDATES, None]
 
 
 def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:
@@ -255,6 +229,23 @@ def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Ar
             rotation = rotation @ np.swapaxes(views.basis[group.views], 1, 2)
         R[group.views] = rotation
     return CameraState(entries, R, _in_front(views, R, t))
+
+
+def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
+    """Poses R (K, 3, 3), t (K, 3) whose D = [R | t] is nearest to W^-1 times the products (K, 3, I).
+
+    The products are those of solid targets (I = 4) or flat boards (I = 3; the third column of R is not
+    observed and is r1 x r2), up to scale and sign. t_z is positive, because the normalised origin is the
+    points' centroid, which lies in front.
+    """
+    D = cast("Array", np.linalg.solve(W, product))
+    D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]
+    M = D[:, :, :-1]
+    scale: Array = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
+    if M.shape[2] == 2:
+        third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
+        M = np.concatenate([M, third], axis=2)
+    return nearest_rotation(M), D[:, :, -1] / scale[:, None]
 
 
 def _in_front(views: Views, R: Array, t: Array) -> Array:

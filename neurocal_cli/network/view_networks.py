@@ -1,6 +1,4 @@
-"""Stage 1: each view's network learns its product W V from random weights.
-
-One step of all networks together with a radial distortion that they share.
+"""Stage 1: each view's network learns its product W V from random weights, and all tell a lens's distortion.
 
 The networks model a pinhole. A bent lens leaves errors in them that are alike in all views, and these errors
 tell its distortion before there is a camera. Undistortion by
@@ -36,6 +34,9 @@ from neurocal_cli.network.starts import learn
 # Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
 _NO_CONDITION = 1e-13
 _SMALL = 1500  # number of patterns below which subsampling saves no time (tests/benchmarks/test_speed.py)
+_RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular
+_STRONGEST = 0.5  # largest change of the farthest point's radius for which one step is near enough
+_RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients of a model are fitted
 
 
 @frozen_dataclass(eq=False)
@@ -162,14 +163,9 @@ def _squared_error(product: Array, patterns: Patterns) -> Array:
     return np.where(patterns.weights > 0, patterns.weights * error, 0.0).sum(axis=1)
 
 
-_RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular
-_STRONGEST = 0.5  # largest change of the farthest point's radius for which one step is near enough
-_RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients of a model are fitted
-
-
 @frozen_dataclass(eq=False)
 class RadialStep:
-    """Networks after the step, and the distortion."""
+    """Networks after one step together with a radial distortion that they share."""
 
     groups: tuple[Group, ...]
     strength: Array  # (2,) kappa_1 and kappa_2
