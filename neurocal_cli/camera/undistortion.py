@@ -209,7 +209,9 @@ def undistorted_view(
         if fov is None:
             plain = Camera(plane_like(camera), Distortion(), size, camera.name)
             return plain.rescaled((float(factors[0]), float(factors[1]))) if new_size != size else plain
-        f = _scale_of_plane(left, right, np.radians(fov))
+        # atan(left / f) + atan(right / f) = fov: with the tangent of the sum, a quadratic equation.
+        half = 0.5 * (left + right) / np.tan(np.radians(fov))
+        f = float(half + np.sqrt(half * half + left * right))
         return Camera(Intrinsics(f, f, float(u0), float(v0)), Distortion(), new_size, camera.name)
     if fov is None:
         field = field_of_view(camera, size)
@@ -218,12 +220,6 @@ def undistorted_view(
         f = new_size[0] / np.radians(fov)
         u0, v0 = 0.5 * (np.array(new_size) - 1.0)
     return Panorama(shape, float(f), float(u0), float(v0), new_size, camera.name)
-
-
-def _scale_of_plane(left: float, right: float, fov: float) -> float:
-    """Find f with atan(left / f) + atan(right / f) = fov: the tangent of the sum, a quadratic equation."""
-    half = 0.5 * (left + right) / np.tan(fov)
-    return float(half + np.sqrt(half * half + left * right))
 
 
 def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:

@@ -76,9 +76,18 @@ def shared_intrinsics(
     # The logarithms of W11 and W22 keep them positive.
     random, known = np.log(np.abs(p[:, [0, 2]]) + 1e-3), np.log(np.maximum(given[[0, 2]], 1e-300))
     p[:, [0, 2]] = np.where(free[[0, 2]], random, known)
-    p, loss = _minimum(conditions, p)
+    starts = _Starts(conditions, p)
+    descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
+    with np.errstate(all="ignore"):
+        while descent.active.size:
+            descent.step()
+            ended = np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min())
+            ended[descent.active] = False
+            if ended.sum() >= _ENOUGH:
+                break
+    loss = np.where(np.isfinite(starts.loss), starts.loss, np.inf)
     order = np.argsort(loss, kind="stable")
-    p, loss = p[order], loss[order]
+    p, loss = starts.p[order], loss[order]
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
     agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
@@ -88,6 +97,11 @@ def shared_intrinsics(
         if apart[n, distinct].all():
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
+
+
+def _tie(loss: float) -> float:
+    """Tolerance within which another loss equals this one."""
+    return 1e-3 * loss + 1e-16
 
 
 class _Conditions:
@@ -193,25 +207,6 @@ class _Starts:
         """Accept the trial for the starts that improved."""
         kept = active[better]
         self.p[kept], self.r[kept], self.J[kept], self.loss[kept] = (values[better] for values in trial)
-
-
-def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
-    """Train parameter sets (B, 5) until all have ended, or enough of them at the same, lowest loss (B,)."""
-    starts = _Starts(conditions, p)
-    descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
-    with np.errstate(all="ignore"):
-        while descent.active.size:
-            descent.step()
-            same = np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min())
-            same[descent.active] = False
-            if same.sum() >= _ENOUGH:
-                break
-    return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
-
-
-def _tie(loss: float) -> float:
-    """Tolerance within which another loss equals this one."""
-    return 1e-3 * loss + 1e-16
 
 
 def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:

@@ -126,12 +126,12 @@ class Correspondences:
             )
         if self.world_std is not None:
             std = _matrix("world_std", self.world_std, 3)
-            good = ((std >= 0) & (std <= _LARGEST)).all(axis=1)  # False for nan as well
+            good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
             problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
             self._set_rows("world_std", std, good, problem)
         if self.across is not None:
             across = _matrix("across", self.across, 2)
-            good = np.abs(across).max(axis=1) <= _LARGEST  # False for nan as well
+            good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
             problem = "the direction nu,nv in which the point was measured must be two finite numbers"
             self._set_rows("across", across, good, problem)
         if self.image_size is not None:

@@ -145,19 +145,16 @@ def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Genera
     corners = np.concatenate([plane.vertices().reshape(-1, 3) for plane in board.planes])
     centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     facing = sum((plane.normal for plane in board.planes), np.zeros(3))
-    upright = _facing(facing / np.linalg.norm(facing))
+    normal = facing / np.linalg.norm(facing)
+    # A rotation that shows the board from the front, with its mean normal along the camera's z axis.
+    x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(normal, x), normal])
     return {
         f"view{k + 1:02d}": _random_pose(camera, corners - centre, centre, upright, k / count, rng)
         for k in range(count)
     }
-
-
-def _facing(normal: Array) -> Array:
-    """Rotation that shows a target from the front, with its mean normal along the camera's z axis."""
-    x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = x - (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(normal, x), normal])
 
 
 def _random_pose(
