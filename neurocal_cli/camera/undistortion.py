@@ -172,6 +172,7 @@ def undistorted_camera(
 
 
 def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
+    """The size of the images; an InputError if it is not known."""
     if size is None:
         raise InputError(
             f"{what} needs the size of the images, which neither the camera nor the points have; add "

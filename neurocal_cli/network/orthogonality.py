@@ -3,7 +3,7 @@
 Each view's network has learnt a product B_k = W V_k up to scale. All views share W, and the rotation part of
 V_k is orthonormal, so the columns of W^-1 B_k must be perpendicular and of equal length. A view of a solid
 target gives five conditions, a view of a flat board two (Zhang 2000). Levenberg-Marquardt solves them for W's
-five entries from random values. W^-1 B_k is then the pose of a view.
+five entries from random values. W^-1 B_k is then the pose of its view.
 """
 
 from __future__ import annotations
