@@ -88,7 +88,7 @@ def map_points(
     if points.covariance is not None or points.across is not None:
         inverse = distorted_by_undistorted(camera, new, pixels, R)
         if points.covariance is not None:
-            # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
+            # To first order C' = M C M^T, with the derivative M of the undistorted pixel by the other one.
             M = np.linalg.inv(inverse)
             C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
             C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
