@@ -10,8 +10,6 @@ Conventions
 * A point in front of the camera has positive depth.
 
 Arrays of rotations carry leading batch axes: ``(..., 3, 3)``.
-
-The median, where a command's start counts: `numpy.median` and `numpy.quantile` import numpy.ma, 10 ms.
 """
 
 from __future__ import annotations
@@ -165,26 +163,19 @@ def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int
     The same as `numpy.unique` along the first axis, in a twentieth of the time. Only the first rows are
     sorted if all others repeat them in order, as where every view shows the whole target.
     """
-    period = _period(table)
-    if period < len(table):
-        first, label = distinct_rows(table[:period])
-        return first, np.tile(label, len(table) // period)
-    order = np.lexsort(table.T[::-1])
-    ordered = table.take(order, axis=0)
-    new = np.ones(len(table), dtype=bool)
-    new[1:] = ~_equal(ordered[1:], ordered[:-1])
-    label = np.empty(len(table), dtype=np.intp)
-    label[order] = np.cumsum(new) - 1
-    return order[new], label
-
-
-def _period(table: NDArray[Any]) -> int:
-    """The number of rows (N, m) that all other rows repeat in order; N if there is none."""
     n = len(table)
     again = np.flatnonzero(_equal(table[1:], table[:1]))
     period = int(again[0]) + 1 if again.size else n
-    whole = period < n and n % period == 0 and np.array_equal(table[period:], table[:-period])
-    return period if whole else n
+    if period < n and n % period == 0 and np.array_equal(table[period:], table[:-period]):
+        first, label = distinct_rows(table[:period])
+        return first, np.tile(label, n // period)
+    order = np.lexsort(table.T[::-1])
+    ordered = table.take(order, axis=0)
+    new = np.ones(n, dtype=bool)
+    new[1:] = ~_equal(ordered[1:], ordered[:-1])
+    label = np.empty(n, dtype=np.intp)
+    label[order] = np.cumsum(new) - 1
+    return order[new], label
 
 
 def _equal(rows: NDArray[Any], others: NDArray[Any]) -> NDArray[np.bool_]:
@@ -207,6 +198,9 @@ def similarity(points: Array) -> tuple[Array, float]:
 
 
 def median(values: Array) -> Array:
-    """Median along the first axis; of no values or with nan, not what NumPy makes of them."""
+    """Median along the first axis; of no values or with nan, not what NumPy makes of them.
+
+    `numpy.median` imports numpy.ma, which would add 10 ms to the start of a command.
+    """
     ordered = np.sort(values, axis=0)
     return np.asarray((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)

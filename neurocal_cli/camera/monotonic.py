@@ -38,7 +38,6 @@ _SMALL_STEP = 0.02  # Newton step in the image plane after which the next one wo
 # Radii at which a slope is sampled; between them it changes by far less than the margin.
 _RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
 
-
 _Three = tuple[Array, Array, Array]
 
 
@@ -55,7 +54,8 @@ def monotonic_radius(distortion: Distortion) -> float:
     k1, k2, _, _, k3, k4, k5, k6 = first_eight(k)
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
-    slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
+    twice = 2.0 * np.arange(4)  # 2 s d/ds of a power of s
+    slope = np.convolve(top + twice * top, bottom) - np.convolve(top, twice * bottom)
     return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
 
 
@@ -121,10 +121,6 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
     by_bottom = -((u + up) * powers + u * growths) / v**2 + 2 * u * vp * powers / v**3
     none = np.zeros((len(r), 6))
     return slope, np.column_stack([by_top[:, :2], none[:, :2], by_top[:, 2:], by_bottom, none])[:, : len(k)]
-
-
-def _twice_s_slope(p: Array) -> Array:
-    return 2.0 * np.arange(len(p)) * p
 
 
 def reaches(distortion: Distortion, farthest: float) -> bool:

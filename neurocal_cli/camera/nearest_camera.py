@@ -62,20 +62,6 @@ def with_model(distortion: Distortion, model: str) -> Distortion | None:
     return Distortion(model, np.array([kept.get(name, 0.0) for name in target]))
 
 
-def image_rays(camera: Camera) -> tuple[Array, Array]:
-    """A grid of pixels over the image, (N, 2), and their rays, (N, 3), without pixels that have no ray.
-
-    Raises InputError if nearly no pixel has one.
-    """
-    pixels, rays = _grid(camera, np.linspace(0, 1, _GRID))
-    seen = np.isfinite(rays).all(axis=1)
-    if seen.sum() < _FEWEST:
-        raise InputError(
-            "the distortion model maps nearly no pixel of the image to a ray; correct the camera"
-        )
-    return pixels[seen], rays[seen]
-
-
 def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None = None) -> NearestCamera:
     """Fit a camera of another model, which keeps the skew of the old one or has perpendicular image axes.
 
@@ -83,16 +69,20 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
     InputError if nearly no pixel of the camera has a ray, or if the model can represent nearly none of the
     rays.
     """
-    pixels, rays = image_rays(camera)
+    pixels, rays = _grid(camera, np.linspace(0, 1, _GRID))
+    seen = np.isfinite(rays).all(axis=1)
+    if seen.sum() < _FEWEST:
+        raise InputError(
+            "the distortion model maps nearly no pixel of the image to a ray; correct the camera"
+        )
+    pixels, rays = pixels[seen], rays[seen]
     ahead = _reached(model, rays)
     if ahead.sum() < _FEWEST:
         raise InputError(
             f"the model {model} covers nearly nothing of this camera's field of view; choose a wide one"
         )
-    found = [
-        _descended(camera, model, start, skew, rays[ahead], pixels[ahead])
-        for start in _starts(camera, model, rays[ahead])
-    ]
+    pixels, rays = pixels[ahead], rays[ahead]
+    found = [_descended(camera, model, start, skew, rays, pixels) for start in _starts(camera, model, rays)]
     best = min((one for one in found if one is not None), key=lambda one: one[1], default=None)
     if best is None:
         raise InputError(f"no camera of the model {model} is near this one; choose another model")
@@ -103,7 +93,9 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
         good = np.isfinite(towards).all(axis=1)
         good &= _shown(near, towards)
         at_points = _distance(near, towards[good], points[good]) if good.any() else None
-    return NearestCamera(near, _distance(near, rays[ahead], pixels[ahead]), at_points, _lost(camera, near))
+    fine = _grid(camera, (np.arange(_FINE) + 0.5) / _FINE)[1]
+    lost = float(1 - _shown(near, fine[np.isfinite(fine[:, 0])]).mean())
+    return NearestCamera(near, _distance(near, rays, pixels), at_points, lost)
 
 
 def _reached(model: str, rays: Array) -> NDArray[np.bool_]:
@@ -114,14 +106,8 @@ def _reached(model: str, rays: Array) -> NDArray[np.bool_]:
 
 
 def _shown(near: Camera, rays: Array) -> NDArray[np.bool_]:
+    """Which rays the new camera represents."""
     return np.asarray(near.sees(rays) & _reached(near.distortion.model, rays))
-
-
-def _lost(camera: Camera, near: Camera) -> float:
-    """Share of the image that the new camera cannot represent."""
-    rays = _grid(camera, (np.arange(_FINE) + 0.5) / _FINE)[1]
-    seen = np.isfinite(rays[:, 0])
-    return float(1 - _shown(near, rays[seen]).mean())
 
 
 def _grid(camera: Camera, share: Array) -> tuple[Array, Array]:

@@ -1,10 +1,8 @@
 """The pinhole camera of the paper's section 2: A, D, P = A D and its 11 parameters.
 
 A has five intrinsic parameters, D = [R | t] six extrinsic ones. The estimators work with the five free
-entries of A, which are the network's output weights; the paper's alpha_v and theta follow from them. For
-conventions see `geometry`.
-
-The image of the absolute conic, ``omega = A^-T A^-1``, whose entries are linear unknowns of a camera.
+entries of A, which are the network's output weights; the paper's alpha_v and theta follow from them. Linear
+methods solve for the image of the absolute conic, ``omega = A^-T A^-1``. For conventions see `geometry`.
 """
 
 from __future__ import annotations
@@ -25,6 +23,9 @@ POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
 
 # A given matrix counts as a rotation if R R^T is the identity to this accuracy.
 _ROTATION_TOLERANCE = 1e-4
+
+# Rows and columns of omega's entries 11, 12, 22, 13, 23, 33.
+_ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
 @frozen_dataclass
@@ -185,10 +186,6 @@ def in_cameras(poses: Sequence[Pose], world: Array, view: NDArray[np.intp]) -> A
     """World points (N, 3) in the camera's frame of their views; `view` (N,) are indices of poses."""
     R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
     return np.asarray((R[view] @ world[..., None])[..., 0] + t[view])
-
-
-# Rows and columns of omega's entries.
-_ROW, _COLUMN = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
 def product_of(a: Array, b: Array) -> Array:

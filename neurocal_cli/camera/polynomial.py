@@ -83,7 +83,7 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     cross = xy * twice
     if count <= 2:
         return (x * R, y * R), (R + x2 * twice, cross, cross, R + y2 * twice), by_radial
-    Q, distorted = _tangential(k, x, y, r2, R)
+    Q, point = _tangential(k, x, y, r2, R)
     cross = cross + (2 * p1) * x + (2 * p2) * y
     xx, yy = Q + x2 * twice + (4 * p2) * x, Q + y2 * twice + (4 * p1) * y
     xy2 = 2 * xy
@@ -92,21 +92,19 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
         lower = -R
         by += [(lower * dx, lower * dy) for dx, dy in by_radial]
     if count <= 8:
-        return distorted, (xx, cross, cross, yy), by
+        return point, (xx, cross, cross, yy), by
     s1, s2, s3, s4 = k[8:12]
     along, across = 2 * s1 + (4 * s2) * r2, 2 * s3 + (4 * s4) * r2
     by_point = xx + along * x, cross + along * y, cross + across * x, yy + across * y
     none = np.zeros_like(r2)
     by += [(r2, none), (r4, none), (none, r2), (none, r4)]
-    found = _behind_prism(k, distorted, r2), by_point, by
-    return found if count == 12 else _on_tilted_sensor(k, found)
-
-
-def _on_tilted_sensor(k: Coefficients, before: Distorted) -> Distorted:
-    point, (xx, xy, yx, yy), by_k = before
+    point = _behind_prism(k, point, r2)
+    if count <= 12:
+        return point, by_point, by
+    xx, xy, yx, yy = by_point
     point, (a, b, c, d), by_tau = _tilted_with_jacobian(k[12], k[13], *point)
     by_point = a * xx + b * yx, a * xy + b * yy, c * xx + d * yx, c * xy + d * yy
-    return point, by_point, [*((a * dx + b * dy, c * dx + d * dy) for dx, dy in by_k), *by_tau]
+    return point, by_point, [*((a * dx + b * dy, c * dx + d * dy) for dx, dy in by), *by_tau]
 
 
 def first_eight(k: Coefficients) -> list[Any]:

@@ -97,10 +97,15 @@ def project_with_jacobian(
     `by_coefficient` (..., K, 2, n). Returns u, v and where the distortion is monotonic and, unless the lens
     is wide, the point in front of the camera; (..., n) each.
     """
+    a, s, b, u0, v0 = entries
     X, Y, Z = points
+    by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
     if model in WIDE:
-        return _project_wide(entries, model, k, points, by_entries, by_point, by_coefficient)
-    s = entries[1]
+        x, y, by_x, by_y, by_k, seen = project_directions(model, k, X, Y, Z)
+        by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = x, y, y
+        _through_matrix(entries, list(zip(by_x, by_y, strict=True)), by_point)
+        _through_matrix(entries, by_k, by_coefficient)
+        return a * x + s * y + u0, b * y + v0, seen
     q = 1.0 / Z
     x, y = X * q, Y * q
     image = image_points_with_jacobian(entries, model, k, x, y)
@@ -109,7 +114,6 @@ def project_with_jacobian(
     if model != "none":
         valid &= ux * vy > uy * vx
     by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = image.x, image.y, image.y
-    by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
     by_X, by_Y, by_Z = (by_point[..., n, :, :] for n in range(3))
     np.multiply(ux, q, out=by_X[..., 0, :])
     np.multiply(vy, q, out=by_Y[..., 1, :])
@@ -124,20 +128,6 @@ def project_with_jacobian(
         by_Z -= y[..., None, :] * by_Y
     _through_matrix(entries, image.by_coefficient, by_coefficient)
     return image.u, image.v, valid
-
-
-def _project_wide(
-    entries: Entries, model: str, k: Coefficients, points: Sequence[Array],
-    by_entries: Array, by_point: Array, by_coefficient: Array,
-) -> tuple[Array, Array, NDArray[np.bool_]]:  # fmt: skip
-    a, s, b, u0, v0 = entries
-    X, Y, Z = points
-    image = project_directions(model, k, X, Y, Z)
-    by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = image.x, image.y, image.y
-    by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
-    _through_matrix(entries, list(zip(image.by_x, image.by_y, strict=True)), by_point)
-    _through_matrix(entries, image.by_coefficient, by_coefficient)
-    return a * image.x + s * image.y + u0, b * image.y + v0, image.seen
 
 
 def _through_matrix(entries: Entries, changes: Sequence[tuple[Array, Array]], out: Array) -> None:

@@ -7,8 +7,8 @@ s = (X, Y) / (d + Z), d = |(X, Y, Z)|, whose length is tan(theta / 2), it is
 
 with the cubic B-spline B. The first term is a radial profile, odd and so smooth on the axis; the second is a
 field on a grid around the axis. They cover |s| <= reach, |sx| <= reach_x and |sy| <= reach_y, and fall to 0
-within two or three node spacings beyond.
-Schoeps et al. (2020) calibrate with such fields of directions, mrcal with stereographic ones.
+within two or three node spacings beyond. Schoeps et al. (2020) calibrate with such fields of directions,
+mrcal with stereographic ones.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
         none = np.zeros(len(r))
         ox, oy = sx / r, sy / r
         grows = -radial.slope * r / reach
-        columns = [(ox * grows, oy * grows)]
-        columns += [
+        columns = [
+            (ox * grows, oy * grows),
             (-fx_x * sx / reach_x, -fy_x * sx / reach_x),
             (-fx_y * sy / reach_y, -fy_y * sy / reach_y),
         ]

@@ -144,6 +144,7 @@ def _lowest(error: Array, part: NDArray[Any]) -> list[int]:
 
 
 def _with(state: CameraState, model: str, scale: float, nonlinear: Array, linear: Array) -> CameraState:
+    """The state with another model, its coefficients as in `_grid` and `_linear_names`, and A scaled."""
     old = dict(zip(coefficient_names(state.model), np.asarray(state.k).tolist(), strict=True))
     names = coefficient_names(model)
     found = dict(zip([name for name in names if name in ("xi", "alpha", "beta")], nonlinear, strict=True))

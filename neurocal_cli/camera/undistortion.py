@@ -1,18 +1,13 @@
-"""Undistorted pixels, and the source pixels of undistorted images.
+"""The projection of undistorted images, their pixels, and the source pixels of these.
 
-A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere
-(`undistorted_view`). On a plane, with A' without distortion, that is
+A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere. On a
+plane, with A' without distortion, that is
 
     x = undistort(A^-1 m),   m' = A' x
 
-A' is A itself, skew included, unless alpha is given (`new_matrix`) or the lens is wide (`undistorted_view`).
-
-The projection of undistorted images: plane, cylinder or sphere, and field of view.
-
-The optical axis keeps its pixel, scaled if the image size changes. In a panorama with a given field of view
-it lies in the middle. A plane shows less than 180 degrees, and its scale grows outwards with 1 / cos^2 of the
-angle. On a panorama, a ray (X, Y, Z) has the longitude lambda = atan2(X, Z) and the latitude
-phi = atan2(Y, hypot(X, Z)):
+A' is A itself, skew included, unless alpha is given (`new_matrix`) or the lens is wide (`plane_like`).
+A plane shows less than 180 degrees, and its scale grows outwards with 1 / cos^2 of the angle. On a panorama,
+a ray (X, Y, Z) has the longitude lambda = atan2(X, Z) and the latitude phi = atan2(Y, hypot(X, Z)):
 
     cylinder          u = f lambda + u0,  v = f tan(phi) + v0
     equirectangular   u = f lambda + u0,  v = f phi + v0
@@ -22,7 +17,8 @@ and back, with lambda = (u - u0) / f:
     cylinder          (sin lambda, (v - v0) / f, cos lambda)
     equirectangular   (cos phi sin lambda, sin phi, cos phi cos lambda),  phi = (v - v0) / f
 
-On both, lines parallel to the camera's y axis are vertical. f is in pixels a radian.
+On both, lines parallel to the camera's y axis are vertical. f is in pixels a radian. The optical axis keeps
+its pixel, scaled if the image size changes. In a panorama with a given field of view it lies in the middle.
 """
 
 from __future__ import annotations
@@ -41,12 +37,16 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.projection import image_points_with_jacobian, project_points
 from neurocal_cli.errors import InputError
 
-SHAPES = UNDISTORTED
-PANORAMAS = SHAPES[1:]
+PANORAMAS = UNDISTORTED[1:]
 
 _ALONG = 1001  # pixels along a row and a column
 _WIDEST_PLANE = 170.0  # degrees
 _NARROW = 1e-3  # rad
+# With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
+_BORDER = 401  # samples along each side of the image
+_GRID = 41  # samples along each axis inside it
+_HALF_PIXEL = 0.5
+_WIDEST = 5.0  # tangent of 79 degrees: the widest angle from the axis in an undistorted image
 
 
 @frozen_dataclass
@@ -135,6 +135,94 @@ class Field(NamedTuple):
         )  # fmt: skip
 
 
+def chosen_view(
+    camera: Camera,
+    alpha: float | None,
+    to: str,
+    fov: float | None,
+    size: tuple[int, int] | None,
+    new_size: tuple[int, int] | None = None,
+) -> Undistorted:
+    """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
+
+    Raises InputError for both of them, and if there is no image size where one is needed.
+    """
+    if to == "plane" and fov is None and new_size is None:
+        return undistorted_camera(camera, alpha, size)
+    if alpha is not None:
+        raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
+    size = _known("a field of view", size or camera.image_size)
+    return undistorted_view(camera, size, to, fov, new_size)
+
+
+def undistorted_camera(
+    camera: Camera, alpha: float | None = None, size: tuple[int, int] | None = None
+) -> Camera:
+    """The camera of undistorted pixels.
+
+    alpha is that of `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
+    The size of the images is needed for alpha, and is by default the camera's. Raises InputError if there is
+    none, or if the distortion leaves no picture.
+    """
+    size = size or camera.image_size
+    intrinsics = plane_like(camera)
+    if alpha is not None:
+        intrinsics = new_matrix(camera, _known("alpha", size), alpha)
+    return Camera(intrinsics, Distortion(), size, camera.name)
+
+
+def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
+    """The size of the images; an InputError if it is not known."""
+    if size is None:
+        raise InputError(
+            f"{what} needs the size of the images, which neither the camera nor the points have; add "
+            "image_size"
+        )
+    return size
+
+
+def undistorted_view(
+    camera: Camera,
+    size: tuple[int, int],
+    shape: str = "plane",
+    fov: float | None = None,
+    new_size: tuple[int, int] | None = None,
+) -> Undistorted:
+    """Choose the projection of undistorted images, one of `UNDISTORTED`, for images of some size [px].
+
+    The field of view is from left to right [degrees]. By default a plane keeps the scale of the image centre;
+    the other shapes show the whole field of view. The undistorted images have the same size, unless a new one
+    is given. Raises InputError if the shape does not exist, or cannot show that field of view.
+    """
+    if shape not in UNDISTORTED:
+        raise InputError(f"the shape must be one of {', '.join(UNDISTORTED)}, not {shape[:40]!r}")
+    most = _WIDEST_PLANE if shape == "plane" else 360.0
+    if fov is not None and not 0 < fov <= most:
+        raise InputError(
+            f"a {shape} shows at most {most:g} degrees, not {fov:g}"
+            + ("; use a cylinder" if shape == "plane" and 0 < fov <= 360 else "")
+        )
+    new_size = new_size or size
+    factors = np.array(new_size) / size
+    u0, v0 = (_axis(camera, size) + 0.5) * factors - 0.5
+    left, right = float(u0 + 0.5), float(new_size[0] - 0.5 - u0)  # of the axis
+    if shape == "plane":
+        if fov is None:
+            plain = Camera(plane_like(camera), Distortion(), size, camera.name)
+            return plain.rescaled((float(factors[0]), float(factors[1]))) if new_size != size else plain
+        # atan(left / f) + atan(right / f) = fov: with the tangent of the sum, a quadratic equation.
+        half = 0.5 * (left + right) / np.tan(np.radians(fov))
+        f = float(half + np.sqrt(half * half + left * right))
+        return Camera(Intrinsics(f, f, float(u0), float(v0)), Distortion(), new_size, camera.name)
+    if fov is None:
+        field = field_of_view(camera, size)
+        f = min(left / max(-field.left, _NARROW), right / max(field.right, _NARROW))
+    else:
+        f = new_size[0] / np.radians(fov)
+        u0, v0 = 0.5 * (np.array(new_size) - 1.0)
+    return Panorama(shape, float(f), float(u0), float(v0), new_size, camera.name)
+
+
 def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
     """The field of view of images of some size; an InputError if that row or column has no rays."""
     ends = []
@@ -164,136 +252,6 @@ def plane_like(camera: Camera) -> Intrinsics:
     A[:2, :2] = camera.project_jacobian(np.array([[0.0, 0.0, 1.0]]))[1][0, :, :2]
     A[1, 0] = 0.0  # up to rounding
     return Intrinsics.from_matrix(A)
-
-
-def undistorted_view(
-    camera: Camera,
-    size: tuple[int, int],
-    shape: str = "plane",
-    fov: float | None = None,
-    new_size: tuple[int, int] | None = None,
-) -> Undistorted:
-    """Choose the projection of undistorted images, one of `SHAPES`, for images of some size [px].
-
-    The field of view is from left to right [degrees]. By default a plane keeps the scale of the image centre;
-    the other shapes show the whole field of view. The undistorted images have the same size, unless a new one
-    is given. Raises InputError if the shape does not exist, or cannot show that field of view.
-    """
-    if shape not in SHAPES:
-        raise InputError(f"the shape must be one of {', '.join(SHAPES)}, not {shape[:40]!r}")
-    most = _WIDEST_PLANE if shape == "plane" else 360.0
-    if fov is not None and not 0 < fov <= most:
-        raise InputError(
-            f"a {shape} shows at most {most:g} degrees, not {fov:g}"
-            + ("; use a cylinder" if shape == "plane" and 0 < fov <= 360 else "")
-        )
-    new_size = new_size or size
-    factors = np.array(new_size) / size
-    u0, v0 = (_axis(camera, size) + 0.5) * factors - 0.5
-    left, right = float(u0 + 0.5), float(new_size[0] - 0.5 - u0)  # of the axis
-    if shape == "plane":
-        if fov is None:
-            plain = Camera(plane_like(camera), Distortion(), size, camera.name)
-            return plain.rescaled((float(factors[0]), float(factors[1]))) if new_size != size else plain
-        f = _scale_of_plane(left, right, np.radians(fov))
-        return Camera(Intrinsics(f, f, float(u0), float(v0)), Distortion(), new_size, camera.name)
-    if fov is None:
-        field = field_of_view(camera, size)
-        f = min(left / max(-field.left, _NARROW), right / max(field.right, _NARROW))
-    else:
-        f = new_size[0] / np.radians(fov)
-        u0, v0 = 0.5 * (np.array(new_size) - 1.0)
-    return Panorama(shape, float(f), float(u0), float(v0), new_size, camera.name)
-
-
-def _scale_of_plane(left: float, right: float, fov: float) -> float:
-    """Find f with atan(left / f) + atan(right / f) = fov: the tangent of the sum, a quadratic equation."""
-    half = 0.5 * (left + right) / np.tan(fov)
-    return float(half + np.sqrt(half * half + left * right))
-
-
-# With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
-_BORDER = 401  # samples along each side of the image
-_GRID = 41  # samples along each axis inside it
-_HALF_PIXEL = 0.5
-_WIDEST = 5.0  # tangent of 79 degrees: the widest angle from the axis in an undistorted image
-
-
-def undistorted_camera(
-    camera: Camera, alpha: float | None = None, size: tuple[int, int] | None = None
-) -> Camera:
-    """The camera of undistorted pixels.
-
-    alpha is that of `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
-    The size of the images is needed for alpha, and is by default the camera's. Raises InputError if there is
-    none, or if the distortion leaves no picture.
-    """
-    size = size or camera.image_size
-    intrinsics = plane_like(camera)
-    if alpha is not None:
-        intrinsics = new_matrix(camera, _known("alpha", size), alpha)
-    return Camera(intrinsics, Distortion(), size, camera.name)
-
-
-def _known(what: str, size: tuple[int, int] | None) -> tuple[int, int]:
-    if size is None:
-        raise InputError(
-            f"{what} needs the size of the images, which neither the camera nor the points have; add "
-            "image_size"
-        )
-    return size
-
-
-def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array | None = None) -> Array:
-    """Undistorted pixels, (N, 2); ``nan`` where there are none.
-
-    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
-    """
-    rays = camera.unproject(pixels)
-    return new.project(rays if R is None else rays @ R.T)[0]
-
-
-def sources(
-    camera: Camera, new: Undistorted, u: Array, v: Array, R: Array | None = None
-) -> tuple[Array, Array]:
-    """Source pixels of pixels u, v, arrays of one shape, of an undistorted image; ``nan`` where none is.
-
-    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
-    """
-    X, Y, Z = _directions(new, u, v)
-    if R is not None:
-        X, Y, Z = np.tensordot(R.T, np.stack([X, Y, Z]), axes=1)
-    with np.errstate(all="ignore"):
-        if camera.distortion.wide:
-            u, v, seen = project_points(camera.entries, camera.model, camera.distortion.coefficients, X, Y, Z)
-            valid = seen & (np.arctan2(np.hypot(X, Y), Z) < largest_angle(camera.distortion))
-        else:
-            x, y = X / Z, Y / Z
-            u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
-                camera.entries, camera.model, camera.distortion.coefficients, x, y
-            )
-            valid = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx) & (Z > 0)
-    return np.where(valid, u, np.nan), np.where(valid, v, np.nan)
-
-
-def _directions(new: Undistorted, u: Array, v: Array) -> tuple[Array, Array, Array]:
-    if not isinstance(new, Camera):
-        return new.directions(u, v)
-    x, y = new.normalised_points(u, v)
-    return x, y, np.ones_like(x)
-
-
-def distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R: Array | None) -> Array:
-    """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
-    u, v = pixels.T
-    rays = np.column_stack(_directions(new, u, v))
-    if isinstance(new, Camera):
-        slopes = np.vstack([np.linalg.inv(new.A[:2, :2]), np.zeros(2)])
-    else:
-        slopes = new.slopes(u, v)
-    if R is not None:
-        rays, slopes = rays @ R, R.T @ slopes
-    return np.asarray(camera.project_jacobian(rays)[1] @ slopes)
 
 
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
@@ -364,21 +322,53 @@ def _outer(camera: Camera, corner: Array) -> tuple[Array, Array]:
     return points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
 
 
-def chosen_view(
-    camera: Camera,
-    alpha: float | None,
-    to: str,
-    fov: float | None,
-    size: tuple[int, int] | None,
-    new_size: tuple[int, int] | None = None,
-) -> Undistorted:
-    """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
+def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array | None = None) -> Array:
+    """Undistorted pixels, (N, 2); ``nan`` where there are none.
 
-    Raises InputError for both of them, and if there is no image size where one is needed.
+    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
     """
-    if to == "plane" and fov is None and new_size is None:
-        return undistorted_camera(camera, alpha, size)
-    if alpha is not None:
-        raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
-    size = _known("a field of view", size or camera.image_size)
-    return undistorted_view(camera, size, to, fov, new_size)
+    rays = camera.unproject(pixels)
+    return new.project(rays if R is None else rays @ R.T)[0]
+
+
+def sources(
+    camera: Camera, new: Undistorted, u: Array, v: Array, R: Array | None = None
+) -> tuple[Array, Array]:
+    """Source pixels of pixels u, v, arrays of one shape, of an undistorted image; ``nan`` where none is.
+
+    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
+    """
+    X, Y, Z = _directions(new, u, v)
+    if R is not None:
+        X, Y, Z = np.tensordot(R.T, np.stack([X, Y, Z]), axes=1)
+    with np.errstate(all="ignore"):
+        if camera.distortion.wide:
+            u, v, seen = project_points(camera.entries, camera.model, camera.distortion.coefficients, X, Y, Z)
+            valid = seen & (np.arctan2(np.hypot(X, Y), Z) < largest_angle(camera.distortion))
+        else:
+            x, y = X / Z, Y / Z
+            u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
+                camera.entries, camera.model, camera.distortion.coefficients, x, y
+            )
+            valid = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx) & (Z > 0)
+    return np.where(valid, u, np.nan), np.where(valid, v, np.nan)
+
+
+def _directions(new: Undistorted, u: Array, v: Array) -> tuple[Array, Array, Array]:
+    if not isinstance(new, Camera):
+        return new.directions(u, v)
+    x, y = new.normalised_points(u, v)
+    return x, y, np.ones_like(x)
+
+
+def distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R: Array | None) -> Array:
+    """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
+    u, v = pixels.T
+    rays = np.column_stack(_directions(new, u, v))
+    if isinstance(new, Camera):
+        slopes = np.vstack([np.linalg.inv(new.A[:2, :2]), np.zeros(2)])
+    else:
+        slopes = new.slopes(u, v)
+    if R is not None:
+        rays, slopes = rays @ R, R.T @ slopes
+    return np.asarray(camera.project_jacobian(rays)[1] @ slopes)

@@ -109,8 +109,17 @@ class _Run:
 
     def __init__(self, task: Task, options: BackpropOptions) -> None:
         self.task, self.options = task, options
-        networks = len(task.W)
-        self._order(task.patterns)
+        # The order of presentation; patterns of weight 0 are last and never presented.
+        patterns, weights = task.patterns, task.patterns.weights
+        self.used = np.count_nonzero(weights > 0, axis=1).astype(np.int64)
+        shuffled = np.random.default_rng(0).permutation(weights.shape[1])
+        self.order = shuffled[np.argsort(weights[:, shuffled] <= 0, axis=1, kind="stable")]
+        inputs = np.broadcast_to(patterns.inputs, (len(weights), *patterns.inputs.shape[1:]))
+        self.Z = _four_inputs(np.take_along_axis(inputs, self.order[..., None], axis=1))
+        self.d = _contiguous(np.take_along_axis(patterns.targets, self.order[..., None], axis=1))
+        # The largest weight is 1, so that the rates do not depend on the scale of the weights.
+        largest = np.maximum(weights.max(axis=1, keepdims=True), 1e-300)
+        self.w = _contiguous(np.take_along_axis(weights / largest, self.order, axis=1))
         self.W, self.V = _contiguous(task.W), _four_inputs(task.V)
         self.gamma = np.ones(self.w.shape)
         if options.resting_gamma:
@@ -118,6 +127,7 @@ class _Run:
         self.start = self.W.copy(), self.V.copy(), self.gamma.copy()
         self.present, self.bound = _presenter(options.method)
         self.epoch = 0
+        networks = len(task.W)
         self.active = np.ones(networks, dtype=bool)
         self.settled = np.zeros(networks, dtype=bool)
         self.iterations = np.zeros(networks, dtype=np.int64)
@@ -136,19 +146,6 @@ class _Run:
         self.limit = _DIVERGED * np.maximum(self.curve[0], silent)
         self.floor = 0.5 * options.floor**2 * self.w.sum(-1)
 
-    def _order(self, patterns: Patterns) -> None:
-        """Put the patterns in the order of presentation; those of weight 0 are last and never presented."""
-        weights = patterns.weights
-        self.used = np.count_nonzero(weights > 0, axis=1).astype(np.int64)
-        shuffled = np.random.default_rng(0).permutation(weights.shape[1])
-        self.order = shuffled[np.argsort(weights[:, shuffled] <= 0, axis=1, kind="stable")]
-        inputs = np.broadcast_to(patterns.inputs, (len(weights), *patterns.inputs.shape[1:]))
-        self.Z = _four_inputs(np.take_along_axis(inputs, self.order[..., None], axis=1))
-        self.d = _contiguous(np.take_along_axis(patterns.targets, self.order[..., None], axis=1))
-        # The largest weight is 1, so that the rates do not depend on the scale of the weights.
-        largest = np.maximum(weights.max(axis=1, keepdims=True), 1e-300)
-        self.w = _contiguous(np.take_along_axis(weights / largest, self.order, axis=1))
-
     def loss(self) -> Array:
         """The loss that is minimised, eq. (14), summed over the patterns; (G,)."""
         with np.errstate(all="ignore"):
@@ -162,10 +159,13 @@ class _Run:
         options = self.options
         epochs = min(max(_FIRST_CHECK, self.epoch // _CHECKS_PER_LIFE), options.epochs - self.epoch)
         with np.errstate(all="ignore"):
+            rate = np.full(len(self.W), options.rate_weights)
+            if self.bound is not None:
+                rate = np.fmin(rate, self.bound(self.Z, self.w, self.W, self.V, self.gamma, self.used))
             self.present(
                 self.Z, self.d, self.w, self.W, self.V, self.gamma,
                 np.ascontiguousarray(self.task.free_W), _four_inputs(self.task.free_V),
-                self._rates(), self.scale * options.rate_gamma,
+                self.scale * rate, self.scale * options.rate_gamma,
                 options.beta, options.a, epochs, self.used, self.active,
             )  # fmt: skip
         self.epoch += epochs
@@ -174,13 +174,6 @@ class _Run:
         self._restart(self.active & ~(loss <= self.limit), loss)
         self.curve.append(loss)
         self._judge(loss)
-
-    def _rates(self) -> Array:
-        """Rate of W and V of each network, proportional to its scale."""
-        rate = np.full(len(self.W), self.options.rate_weights)
-        if self.bound is not None:
-            rate = np.fmin(rate, self.bound(self.Z, self.w, self.W, self.V, self.gamma, self.used))
-        return self.scale * rate
 
     def _restart(self, diverged: NDArray[np.bool_], loss: Array) -> None:
         """Restart networks that diverged at their initial weights, with half the rates."""

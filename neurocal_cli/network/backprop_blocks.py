@@ -8,7 +8,6 @@ networks of a stack are trained together.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -24,12 +23,6 @@ BLOCK = 8
 _STABLE = 1.5
 
 Mask = NDArray[np.bool_]
-
-
-def _blocks(used: int) -> Iterator[slice]:
-    """Slices of nearly equal length, none above `BLOCK`."""
-    edges = np.linspace(0, used, -(-used // BLOCK) + 1).astype(int)
-    return (slice(start, stop) for start, stop in pairwise(edges))
 
 
 def stable_rate(Z: Array, w: Array, W: Array, V: Array, gamma: Array, used: NDArray[np.int64]) -> Array:
@@ -50,10 +43,11 @@ def present(
     W_, V_, gamma_ = W[active], V[active], gamma[active]
     rate, rate_factor = rate_weights[active, None, None], rate_gamma[active, None]
     move_W, move_V = rate * free_W, rate * free_V
-    parts = [
-        (Z[active, s], d[active, s], w[active, s, None], gamma_[:, s], s.stop - s.start)
-        for s in _blocks(int(used[active].max()))
-    ]
+    # Blocks of nearly equal length, none above `BLOCK`.
+    most = int(used[active].max())
+    edges = np.linspace(0, most, -(-most // BLOCK) + 1).astype(int)
+    blocks = (slice(start, stop) for start, stop in pairwise(edges))
+    parts = [(Z[active, s], d[active, s], w[active, s, None], gamma_[:, s], s.stop - s.start) for s in blocks]
     for _ in range(epochs):
         for z, target, weight, factor, size in parts:
             Y = z @ np.swapaxes(V_, 1, 2)  # eq. (6)

@@ -69,13 +69,13 @@ def find_consensus(views: Views, rng: np.random.Generator) -> Consensus:
         members = np.flatnonzero((views.nearly_flat == flat) & (views.distinct >= _FEWEST[flat]))
         for first in range(0, len(members), _AT_ONCE):
             some = members[first : first + _AT_ONCE]
-            search = _Search(views, some, flat, rng)
-            search.run()
-            hopeless[some] = search.judge(kept)
+            patterns = patterns_of(views, some, flat, _MOST_SEEN, rng)
+            seen = np.where((patterns.weights > 0)[..., None], patterns.targets, np.nan)
+            spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
+            product, scale = _search(patterns, spread, flat, views.rays is not None, rng)
+            hopeless[some] = _judge(views, some, flat, product, scale, kept)
             # If all pixels of a view coincide, its scatter is undefined.
-            loose[some] = np.divide(
-                search.scale, search.spread, np.full(len(some), np.inf), where=search.spread > 0
-            )
+            loose[some] = np.divide(scale, spread, np.full(len(some), np.inf), where=spread > 0)
     # Distortion increases the scatter of all views; a view far above the others is wrong.
     told = loose[~np.isnan(loose)]
     if len(told) > 2:
@@ -107,121 +107,76 @@ def find_consensus_through_wide_lens(
     return pinhole if best is None or best.hopeless.sum() > pinhole.hopeless.sum() else best
 
 
-class _Search:
-    """Search with starts on a few points each, for K views of one kind, flat or solid."""
+def _search(
+    patterns: Patterns, spread: Array, flat: bool, rays: bool, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Products (K, 3, I) of the robust networks of K views of one kind, flat or solid, and their `_scatter`.
 
-    def __init__(self, views: Views, members: NDArray[np.intp], flat: bool, rng: np.random.Generator) -> None:
-        self.views, self.members, self.flat, self.rng = views, members, flat, rng
-        self.patterns = patterns_of(views, members, flat, _MOST_SEEN, rng)
-        self.real = self.patterns.weights > 0
-        K, n = self.real.shape
-        self.product = np.zeros((K, 3, self.patterns.n_inputs))
-        self.scale = np.full(K, np.inf)
-        self.near = np.zeros((K, n), dtype=bool)
-        self.agreed = np.zeros(K, dtype=np.int64)
-        seen = np.where(self.real[..., None], self.patterns.targets, np.nan)
-        self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
+    The rounds of a view end when two of its starts agree on the same points. `spread` (K,) is the size of
+    each view; `rays` tells that the targets are rays, not pixels.
+    """
+    real = patterns.weights > 0
+    K, n = real.shape
+    product, scale = np.zeros((K, 3, patterns.n_inputs)), np.full(K, np.inf)
+    near, agreed = np.zeros((K, n), dtype=bool), np.zeros(K, dtype=np.int64)
+    which = np.arange(K)
+    for _ in range(_ROUNDS):
+        if not which.size:
+            break
+        some = patterns.take(which)
+        starts = _few_points(some, flat, rng)
+        order = np.argsort(_scatter(some, starts, rays)[0], axis=1, kind="stable")[:, :_FINALISTS]
+        finalists = np.take_along_axis(starts, order[..., None, None], axis=1)
+        finalists, scales, nears = _learn_on_near(some, finalists, rays)
+        # Compare each finalist with the best so far, and keep the one with the lower median.
+        for start in range(finalists.shape[1]):
+            new_scale, new_near = scales[:, start], nears[:, start]
+            same = ((new_near == near[which]) | ~real[which]).sum(1) >= _AGREED * n
+            # Two failed starts with a large scatter also agree, because then all points are near.
+            same &= scale[which] < _TIGHT * spread[which]
+            better = new_scale < scale[which]
+            agreed[which] = np.where(same, agreed[which] + 1, np.where(better, 1, agreed[which]))
+            won = which[better]
+            product[won], scale[won], near[won] = (
+                finalists[better, start],
+                new_scale[better],
+                new_near[better],
+            )
+        which = which[agreed[which] < 2]
+    return product, scale
 
-    def run(self) -> None:
-        """Search until two starts of each view agree, for a few rounds at most."""
-        open_views = np.arange(len(self.members))
-        for _ in range(_ROUNDS):
-            if not open_views.size:
-                return
-            self._round(open_views)
-            open_views = open_views[self.agreed[open_views] < 2]
 
-    def _round(self, which: NDArray[np.intp]) -> None:
-        product = self._few_points(which)  # (K', S, 3, I)
-        scale, _ = self._near(which, product)
-        order = np.argsort(scale, axis=1, kind="stable")[:, :_FINALISTS]
-        product = np.take_along_axis(product, order[..., None, None], axis=1)
-        product, scale, near = self._learn_on(which, product)
-        for start in range(product.shape[1]):
-            self._enter(which, product[:, start], scale[:, start], near[:, start])
+def _few_points(patterns: Patterns, flat: bool, rng: np.random.Generator) -> Array:
+    """Products (K, S, 3, I) of S starts of each view, from random weights on a few points each."""
+    real, seen = patterns.weights > 0, _SEEN[flat]
+    K = len(real)
+    key = rng.random((K, _STARTS, real.shape[1])) + 2.0 * ~real[:, None]
+    slots = np.argpartition(key, seen, axis=2)[..., :seen].reshape(K, -1)
+    chosen = (
+        np.take_along_axis(patterns.inputs, slots[..., None], axis=1),
+        np.take_along_axis(patterns.targets, slots[..., None], axis=1),
+        np.ones(slots.shape),
+    )
+    few = Patterns(*(a.reshape(K * _STARTS, seen, *a.shape[2:]) for a in chosen))
+    W, V = random_weights(rng, len(few.weights), few.n_inputs)
+    product = _trained(few, W @ V, LMOptions(tolerance=1e-4, max_iterations=40))
+    return product.reshape(K, _STARTS, 3, few.n_inputs)
 
-    def _few_points(self, which: NDArray[np.intp]) -> Array:
-        """Train starts from random weights on a few points each."""
-        real = self.real[which]
-        seen = _SEEN[self.flat]
-        key = self.rng.random((len(which), _STARTS, real.shape[1])) + 2.0 * ~real[:, None]
-        slots = np.argpartition(key, seen, axis=2)[..., :seen].reshape(len(which), -1)
-        chosen = (
-            np.take_along_axis(self.patterns.inputs[which], slots[..., None], axis=1),
-            np.take_along_axis(self.patterns.targets[which], slots[..., None], axis=1),
-            np.ones(slots.shape),
-        )
-        few = Patterns(*(a.reshape(len(which) * _STARTS, seen, *a.shape[2:]) for a in chosen))
-        W, V = random_weights(self.rng, len(few.weights), few.n_inputs)
-        product = _trained(few, W @ V, LMOptions(tolerance=1e-4, max_iterations=40))
-        return product.reshape(len(which), _STARTS, 3, few.n_inputs)
 
-    def _learn_on(self, which: NDArray[np.intp], product: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Train repeatedly on all points near each network."""
-        K, S = product.shape[:2]
-        patterns = self.patterns.take(np.repeat(which, S))
-        options = LMOptions(stiffness=(0.0,), tolerance=1e-3, damping=1e-6, max_iterations=15)
-        near = np.zeros((K, S, patterns.weights.shape[1]), dtype=bool)
-        for _ in range(_PASSES):
-            before, (_, near) = near, self._near(which, product)
-            if (near == before).all():
-                break
-            weights = np.where(near.reshape(K * S, -1), patterns.weights, 0.0)
-            flat = product.reshape(K * S, 3, -1)
-            product = _trained(replace(patterns, weights=weights), flat, options).reshape(product.shape)
-        return product, *self._near(which, product)
-
-    def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
-        """Compare one start of each view with the best so far, and keep the one with the lower median."""
-        same = ((near == self.near[which]) | ~self.real[which]).sum(1) >= _AGREED * near.shape[1]
-        # Two failed starts with a large scatter also agree, because then all points are near.
-        same &= self.scale[which] < _TIGHT * self.spread[which]
-        better = scale < self.scale[which]
-        self.agreed[which] = np.where(same, self.agreed[which] + 1, np.where(better, 1, self.agreed[which]))
-        won = which[better]
-        self.product[won], self.scale[won], self.near[won] = product[better], scale[better], near[better]
-
-    def _near(self, which: NDArray[np.intp], product: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Robust standard deviation (K', S) of the points from their networks; the points near (K', S, n)."""
-        o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
-        distance = self._distance(o, self.patterns.targets[which][:, None])
-        real = np.broadcast_to(self.real[which][:, None], distance.shape)
-        ordered = np.sort(np.where(real, distance, np.inf), axis=-1)
-        middle = (real.sum(axis=-1, keepdims=True) - 1) // 2
-        # The median length of two normal errors is 1.18 sigma.
-        scale = np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9
-        return scale, real & (distance < _FAR * scale[..., None])
-
-    def _distance(self, o: Array, targets: Array) -> Array:
-        """Between outputs and targets: in the image, or the sine of the angle between rays."""
-        with np.errstate(all="ignore"):
-            if self.views.rays is None:
-                error = np.hypot(*np.moveaxis(o[..., :2] / o[..., 2:] - targets[..., :2], -1, 0))
-            else:
-                along = (o * targets).sum(axis=-1, keepdims=True)
-                across = o - along * targets
-                error = np.sqrt((across * across).sum(axis=-1) / (o * o).sum(axis=-1))
-                # The sign of a product is arbitrary.
-                same_side = along[..., 0] * along.sum(axis=-2) > 0
-                error = np.where(same_side, error, np.nan)
-        return np.where(np.isfinite(error), error, 1e9)
-
-    def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Write the points near their network into `kept`; return the views that are wrong as a whole."""
-        hopeless = np.zeros(len(self.members), dtype=bool)
-        everything = self.views.targets
-        for k, view in enumerate(self.members):
-            rows = slice(self.views.first[view], self.views.first[view] + self.views.counts[view])
-            local = self.views.local[rows]
-            if self.flat:
-                local = (local @ self.views.basis[view])[:, :2]
-            o = np.column_stack([local, np.ones(len(local))]) @ self.product[k].T
-            targets = everything[rows]
-            near = self._distance(o, targets) < _FAR * self.scale[k]
-            extent = np.sqrt(targets[near].var(axis=0).sum()) if near.any() else 0.0
-            hopeless[k] = near.mean() <= _MAJORITY or self.scale[k] > _TIGHT * extent
-            kept[rows] = near
-        return hopeless
+def _learn_on_near(patterns: Patterns, product: Array, rays: bool) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Train products (K, S, 3, I) repeatedly on all points near each network; also their `_scatter`."""
+    K, S = product.shape[:2]
+    repeated = patterns.take(np.repeat(np.arange(K), S))
+    options = LMOptions(stiffness=(0.0,), tolerance=1e-3, damping=1e-6, max_iterations=15)
+    near = np.zeros((K, S, patterns.weights.shape[1]), dtype=bool)
+    for _ in range(_PASSES):
+        before, (_, near) = near, _scatter(patterns, product, rays)
+        if (near == before).all():
+            break
+        weights = np.where(near.reshape(K * S, -1), repeated.weights, 0.0)
+        flat = product.reshape(K * S, 3, -1)
+        product = _trained(replace(repeated, weights=weights), flat, options).reshape(product.shape)
+    return product, *_scatter(patterns, product, rays)
 
 
 def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
@@ -230,3 +185,55 @@ def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
     W = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
     free = np.ones((3, 3), dtype=bool), np.ones((3, inputs), dtype=bool)
     return train_lm(Task(patterns, W, product, *free), options).product
+
+
+def _scatter(patterns: Patterns, product: Array, rays: bool) -> tuple[Array, NDArray[np.bool_]]:
+    """Robust standard deviation (K, S) of the points from their networks; the points near (K, S, n)."""
+    o = patterns.inputs[:, None] @ np.swapaxes(product, -1, -2)
+    distance = _distance(o, patterns.targets[:, None], rays)
+    real = np.broadcast_to((patterns.weights > 0)[:, None], distance.shape)
+    ordered = np.sort(np.where(real, distance, np.inf), axis=-1)
+    middle = (real.sum(axis=-1, keepdims=True) - 1) // 2
+    # The median length of two normal errors is 1.18 sigma.
+    scale = np.take_along_axis(ordered, middle, axis=-1)[..., 0] / 1.1774 + 1e-9
+    return scale, real & (distance < _FAR * scale[..., None])
+
+
+def _distance(o: Array, targets: Array, rays: bool) -> Array:
+    """Between outputs and targets: in the image, or the sine of the angle between rays."""
+    with np.errstate(all="ignore"):
+        if rays:
+            along = (o * targets).sum(axis=-1, keepdims=True)
+            across = o - along * targets
+            error = np.sqrt((across * across).sum(axis=-1) / (o * o).sum(axis=-1))
+            # The sign of a product is arbitrary.
+            same_side = along[..., 0] * along.sum(axis=-2) > 0
+            error = np.where(same_side, error, np.nan)
+        else:
+            error = np.hypot(*np.moveaxis(o[..., :2] / o[..., 2:] - targets[..., :2], -1, 0))
+    return np.where(np.isfinite(error), error, 1e9)
+
+
+def _judge(
+    views: Views,
+    members: NDArray[np.intp],
+    flat: bool,
+    product: Array,
+    scale: Array,
+    kept: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Write the points near their view's network into `kept`; return the views that are wrong as a whole."""
+    hopeless = np.zeros(len(members), dtype=bool)
+    everything = views.targets
+    for k, view in enumerate(members):
+        rows = slice(views.first[view], views.first[view] + views.counts[view])
+        local = views.local[rows]
+        if flat:
+            local = (local @ views.basis[view])[:, :2]
+        o = np.column_stack([local, np.ones(len(local))]) @ product[k].T
+        targets = everything[rows]
+        near = _distance(o, targets, views.rays is not None) < _FAR * scale[k]
+        extent = np.sqrt(targets[near].var(axis=0).sum()) if near.any() else 0.0
+        hopeless[k] = near.mean() <= _MAJORITY or scale[k] > _TIGHT * extent
+        kept[rows] = near
+    return hopeless

@@ -1,6 +1,7 @@
 """Networks trained by Levenberg-Marquardt: E_2D with gamma eliminated (variable projection).
 
-The linear parameters gamma are eliminated as by Golub and Pereyra (1973). `least_squares` does the descent.
+The linear parameters gamma are eliminated as by Golub and Pereyra (1973). The descent is that of
+`adjustment.levenberg_marquardt`.
 
 The two layers are linear, so the error depends on the product W V alone. If both layers are free, the step is
 that of the product. If V is given (the extrinsics are known), it is that of W.
@@ -154,23 +155,22 @@ class _Networks:
             last = stage == len(options.stiffness) - 1
             tolerance = options.tolerance if last else max(_RELEASED, options.tolerance)
             settings = replace(_FAR, damping=damping, tolerance=tolerance)
-            ended = self._descend(_Stiffened(self, mu, networks), settings, options.max_iterations)
+            problem = _Stiffened(self, mu, networks)
+            before = self.iterations[networks]
+            self.history.append((before, networks, self.loss[networks]))
+            descent = LevenbergMarquardt(
+                problem, settings, self.floor[networks], options.max_iterations - before
+            )
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                while descent.active.size:
+                    moving = networks[descent.active]
+                    descent.step()
+                    place = self.iterations[moving] + descent.iteration
+                    self.history.append((place, moving, self.loss[moving]))
+            self.iterations[networks] += descent.outcome.iterations
+            ended = descent.outcome.stop != Stop.LIMIT
             networks, damping = networks[ended], _SOFTENED * options.damping
         self.settled[networks] = True
-
-    def _descend(self, problem: _Stiffened, settings: DescentOptions, most: int) -> NDArray[np.bool_]:
-        """Train some networks with one stiffness; which of them ended before the limit."""
-        networks, before = problem.networks, self.iterations[problem.networks]
-        self.history.append((before, networks, self.loss[networks]))
-        descent = LevenbergMarquardt(problem, settings, self.floor[networks], most - before)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            while descent.active.size:
-                moving = networks[descent.active]
-                descent.step()
-                place = self.iterations[moving] + descent.iteration
-                self.history.append((place, moving, self.loss[moving]))
-        self.iterations[networks] += descent.outcome.iterations
-        return descent.outcome.stop != Stop.LIMIT
 
     def curve(self, most: int) -> Array:
         """(K, G) loss of each network after each iteration; its last loss is repeated."""
@@ -184,7 +184,7 @@ class _Networks:
 
 
 class _Stiffened:
-    """Networks with one stiffness mu as a problem of `least_squares`; each network is a group."""
+    """Networks with one stiffness mu as a `LeastSquaresProblem`; each network is a group."""
 
     def __init__(self, stack: _Networks, mu: float, networks: NDArray[np.intp]) -> None:
         self.stack, self.normal, self.networks, self.mu = stack, stack.normal, networks, mu

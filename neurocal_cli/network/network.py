@@ -1,22 +1,19 @@
 """The calibrating network of the paper's section 3: two linear layers and a factor for each pattern.
 
-A pattern is a normalised world point ``Z = (X, Y, Z, 1)`` and its normalised pixel
-``d = (u, v, 1)``. The hidden layer has the weights V (3 x 4, the pose), the output layer W (3 x 3,
-the intrinsic matrix). The paper's fourth hidden neuron is the constant 1. Its output weights are the
-zero column of A, so it is left out. For a flat board the input Z is always 0. Its column of V is left
-out as well, and V is 3 x 3. With o = W V Z the network's outputs are O = gamma o, eq. (7).
+A pattern is a normalised world point ``Z = (X, Y, Z, 1)`` and its normalised pixel ``d = (u, v, 1)``. The
+hidden layer has the weights V (3 x 4, the pose), the output layer W (3 x 3, the intrinsic matrix). The
+paper's fourth hidden neuron is the constant 1. Its output weights are the zero column of A, so it is left
+out. For a flat board the input Z is always 0. Its column of V is left out as well, and V is 3 x 3. With
+o = W V Z the network's outputs are O = gamma o, eq. (7).
 
     E_2D = 1/2 sum_i w_i |d_i - gamma_i o_i|^2                                    eqs. (5), (8)
 
-Every function takes a stack of networks: a leading axis of G networks, each with N patterns of I
-inputs. A network is one view of a camera, or one random start of it.
+Every function takes a stack of networks: a leading axis of G networks, each with N patterns of I inputs. A
+network is one view of a camera, or one random start of it. Its trainers (`levenberg_marquardt`, `backprop`)
+know patterns and weights, but no cameras.
 
-Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's between (10) and
-(15). Here ``V[j, l]`` goes from input l to hidden neuron j and ``W[k, j]`` from there to output k.
-
-Patterns: the points of views as a network learns them, normalised and with equally many for each view.
-
-Trainers of the calibrating network, and their interface: patterns and weights, but no cameras.
+Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's between (10) and (15). Here
+``V[j, l]`` goes from input l to hidden neuron j and ``W[k, j]`` from there to output k.
 """
 
 from __future__ import annotations

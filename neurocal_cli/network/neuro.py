@@ -1,27 +1,18 @@
 """The neural method, from random weights to the minimum of the reprojection error, in three stages.
 
 1. Each view's network learns the product W V_k from random weights (`view_networks`).
-2. The orthogonality conditions split the products into one W and a pose for each view
-   (`cameras_from_networks`). The paper's trainer goes on with its orthogonality term
-   (`constrained_training`).
+2. The orthogonality conditions split the products into one W and a pose for each view (`orthogonality`). The
+   paper's trainer goes on with its orthogonality term, eq. (14).
 3. Bundle adjustment minimises the reprojection error (3) over all parameters, with exact rotations
-   (`adjust`), also from other starts if another minimum may be lower (`local_minima`).
+   (`adjustment.adjust`), also from other starts if another minimum may be lower (`local_minima`).
 
 No stage needs an initial guess. Views with too few points for a free network, and cameras that a free network
-does not determine, start from random cameras instead (`random_cameras`).
-
-The paper's constrained training, eq. (14), between stages 2 and 3 for trainers that support it.
-
-It starts from an upper triangular W and an orthonormal V, into which the free network's product has been
-split; from random weights it would stall. Training follows eq. (15), with W's structural zeros and given
-weights fixed and beta E_orth added to the error.
-
-Type 4: V is given, so all views together train a single layer, W, with known inputs.
+does not determine, start from random cameras instead (`random_cameras`). In type 4 V is given, so all views
+together train a single layer, W, with known inputs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -61,38 +52,17 @@ if TYPE_CHECKING:
     from neurocal_cli.network.random_cameras import Found
 
 
-def train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:
-    """Train one view's network on E_tot from a camera; a flat board's V cannot be constrained.
-
-    Returns the state and the number of iterations. The state is unchanged if the trainer does not support
-    this, or if the result is no valid camera.
-    """
-    views = problem.views
-    if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
-        return state, 0
-    depth = float(state.t[0, 2])
-    # V is scaled so that depths, and so every gamma, are about 1; the constant a of E_orth compensates.
-    V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
-    free_W = np.zeros((3, 3), dtype=bool)
-    free_W[ENTRIES] = problem.free
-    patterns = patterns_of(views, np.array([0]), False, MOST_POINTS)
-    task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
-    trained = options.constrained(task, 1.0 / depth**2)
-    entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])
-    t = trained.V[:, :, 3] * depth
-    moved = CameraState(entries[None], R, t)
-    usable = np.isfinite(entries).all() and entries[[0, 2]].min() > 0 and t[0, 2] > 0
-    return moved if usable else state, int(trained.iterations.sum())
-
-
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
 _FEW_POINT_STARTS = 100
 # Initial damping of the first bundle adjustment from a pinhole, and from a camera near the minimum.
 _FAR, _NEAR = OPTIONS.damping, 1e-7
 _MANY_EQUATIONS = 12  # with so many more equations than unknowns there is only one good minimum
+# Type 4 with a wide lens: least depth of a training point as a share of its distance (60 degrees from the
+# axis), and fewest training points.
+_LEAST_DEPTH, _FEWEST = 0.5, 12
 
-_Found = tuple[Adjusted, TrainingRecord]
+_Begun = tuple[Adjusted, TrainingRecord]
 
 
 def solve(problem: Problem, options: Options) -> Solution:
@@ -103,156 +73,176 @@ def solve(problem: Problem, options: Options) -> Solution:
     rng = np.random.default_rng(options.seed)
     if problem.type == 4:
         return solve_given_poses(problem, options, rng)
-    search = _Search(problem, options, rng)
     # A free product needs 4 points of a plane or 6 in space.
     able = np.asarray(problem.views.distinct >= np.where(begin_flat(problem), 4, 6))
     if problem.type == 3:
-        adjusted, record = search.poses(able)
+        adjusted, record = _poses(problem, options, rng, able)
     elif able.all():
-        adjusted, record = search.camera_and_poses()
+        adjusted, record = _camera_and_poses(problem, options, rng)
     elif problem.views.n_views == 1:
-        adjusted, record = search.camera_from_few_points()
+        adjusted, record = _camera_from_few_points(problem, options, rng)
     else:
-        adjusted, record = search.camera_then_other_poses(able)
+        adjusted, record = _camera_then_other_poses(problem, options, rng, able)
     options.progress("refining", 1.0)
     return Solution(problem, adjusted, record)
 
 
-class _Search:
-    """The stages, on one problem with one stream of random numbers."""
+def _camera_and_poses(problem: Problem, options: Options, rng: np.random.Generator) -> _Begun:
+    """Types 1 and 2."""
+    every = np.ones(problem.views.n_views, dtype=bool)
+    groups, record = train_networks(problem, options, rng, every)
+    refuse_few_conditions(problem, groups)
+    # The paper's constrained training needs the networks as they are.
+    bend = radial_step(problem, groups) if options.constrained is None else None
+    products = groups if bend is None else bend.groups
 
-    def __init__(self, problem: Problem, options: Options, rng: np.random.Generator) -> None:
-        self.problem, self.options, self.rng = problem, options, rng
-        self.views = problem.views
-        self.many_starts = max(options.starts, _FEW_POINT_STARTS)
+    def camera(entries: Array) -> CameraState:
+        pinhole = cameras_from_products(problem, products, entries)
+        return pinhole if bend is None else bend.bent(pinhole, problem.distortion.model)
 
-    def _begin(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
-        """First bundle adjustment; the error of its start is recorded."""
-        self.options.progress("refining", 0.0)
-        adjusted = self.problem.adjust(state, damping=damping)
-        before = adjusted.before
-        if self.views.whitening is not None:
-            before = float((point_residuals(self.views, state) ** 2).sum())
-        return adjusted, replace(record, before=before)
+    first, *others = candidate_intrinsics(problem, products, rng)
+    state, record = _constrained(problem, options, camera(first), record)
+    best, record = _refined(problem, options, state, record, _FAR if bend is None else _NEAR)
+    for entries in others:
+        if reaches_bound(problem, best, groups):
+            break
+        best = try_start(problem, best, camera(entries))
+    best = try_mirrored(problem, best)
+    if problem.views.n_views == 1:
+        # One view: random cameras as well, if equations are scarce or the bound is not reached.
+        spare = 2 * int(problem.views.distinct.sum()) - problem.n_parameters
+        if spare < _MANY_EQUATIONS or not reaches_bound(problem, best, groups):
+            found = _random_camera(problem, rng, options.starts)
+            if found is not None:
+                record = replace(record, starts=record.starts + found.starts)
+                best = try_start(problem, best, found.state)
+    refuse_mirrored(problem, best, groups)
+    return best, record
 
-    def _constrained(self, state: CameraState, record: TrainingRecord, damping: float = _FAR) -> _Found:
-        state, iterations = train_constrained(self.problem, self.options, state)
-        return self._begin(state, replace(record, iterations=record.iterations + iterations), damping)
 
-    def camera_and_poses(self) -> _Found:
-        """Types 1 and 2."""
-        problem = self.problem
-        every = np.ones(self.views.n_views, dtype=bool)
-        groups, record = train_networks(problem, self.options, self.rng, every)
-        refuse_few_conditions(problem, groups)
-        # The paper's constrained training needs the networks as they are.
-        bend = radial_step(problem, groups) if self.options.constrained is None else None
-        products = groups if bend is None else bend.groups
-
-        def camera(entries: Array) -> CameraState:
-            pinhole = cameras_from_products(problem, products, entries)
-            return pinhole if bend is None else bend.bent(pinhole, problem.distortion.model)
-
-        first, *others = candidate_intrinsics(problem, products, self.rng)
-        best, record = self._constrained(camera(first), record, _FAR if bend is None else _NEAR)
-        for entries in others:
-            if reaches_bound(problem, best, groups):
-                break
-            best = try_start(problem, best, camera(entries))
-        best = try_mirrored(problem, best)
-        if self.views.n_views == 1:
-            best, record = self._against_random_cameras(best, record, groups)
-        refuse_mirrored(problem, best, groups)
-        return best, record
-
-    def _against_random_cameras(
-        self, best: Adjusted, record: TrainingRecord, groups: Sequence[Group]
-    ) -> _Found:
-        """One view: try random cameras if equations are scarce or the bound is not reached."""
-        problem = self.problem
-        spare = 2 * int(self.views.distinct.sum()) - problem.n_parameters
-        if spare >= _MANY_EQUATIONS and reaches_bound(problem, best, groups):
-            return best, record
-        found = self._random_camera(self.options.starts)
-        if found is None:
-            return best, record
-        record = replace(record, starts=record.starts + found.starts)
-        return try_start(problem, best, found.state), record
-
-    def _random_camera(self, starts: int) -> Found | None:
-        from neurocal_cli.network.random_cameras import find_camera
-
-        problem = self.problem
-        return find_camera(self.views, problem.normalised_entries, problem.free, self.rng, starts)
-
-    def camera_from_few_points(self) -> _Found:
-        """Type 2 with one view of 5 points: random cameras instead of a free product."""
-        found = self._random_camera(self.many_starts)
-        if found is None:
-            raise DegenerateGeometryError(
-                f"no random start found a camera for these {len(self.views.index)} points; give more points"
-            )
-        record = TrainingRecord.empty(1)
-        record = record.with_starts(np.array([0]), found.agreed, found.starts, found.iterations)
-        return self._begin(found.state, record)
-
-    def camera_then_other_poses(self, able: NDArray[np.bool_]) -> _Found:
-        """Types 1 and 2 with some views of too few points, which are added once the others determine W."""
-        views = self.views
-        if not able.any():
-            raise DegenerateGeometryError(
-                f"no view has enough different points by itself (view {views.names[0]!r} has "
-                f"{views.distinct[0]}); give at least one view with 6, or 4 on a flat board"
-            )
-        members = np.flatnonzero(able)
-        part = _Search(replace(self.problem, views=views.subset(members)), self.options, self.rng)
-        adjusted, record = part.camera_and_poses()
-        agreed = np.zeros(views.n_views, dtype=np.int64)
-        agreed[members] = record.agreed
-        R, t = np.zeros((views.n_views, 3, 3)), np.zeros((views.n_views, 3))
-        R[members], t[members] = adjusted.state.R, adjusted.state.t
-        state, record = self._with_random_poses(
-            replace(adjusted.state, R=R, t=t), replace(record, agreed=agreed), ~able, self.many_starts
+def _camera_from_few_points(problem: Problem, options: Options, rng: np.random.Generator) -> _Begun:
+    """Type 2 with one view of 5 points: random cameras instead of a free product."""
+    found = _random_camera(problem, rng, max(options.starts, _FEW_POINT_STARTS))
+    if found is None:
+        raise DegenerateGeometryError(
+            f"no random start found a camera for these {len(problem.views.index)} points; give more points"
         )
-        return try_mirrored(self.problem, self.problem.adjust(replace(adjusted, state=state))), record
-
-    def poses(self, able: NDArray[np.bool_]) -> _Found:
-        """Type 3: each view's pose by itself."""
-        problem = self.problem
-        groups: list[Group] = []
-        record = TrainingRecord.empty(self.views.n_views)
-        if able.any():
-            groups, record = train_networks(problem, self.options, self.rng, able)
-        state = cameras_from_products(problem, groups, problem.normalised_entries[None])
-        state, record = self._with_random_poses(state, record, ~able, self.many_starts)
-        best, record = self._constrained(state, record)
-        best = try_mirrored(problem, best)
-        late = short_of_bound(problem, best, groups) | (able & (record.agreed < 2))
-        if late.any():
-            state, record = self._with_random_poses(best.state, record, late, self.options.starts)
-            best = better_by_view(problem, best, problem.adjust(state))
-        refuse_mirrored(problem, best, groups)
-        return best, record
-
-    def _with_random_poses(
-        self, state: CameraState, record: TrainingRecord, which: NDArray[np.bool_], starts: int
-    ) -> tuple[CameraState, TrainingRecord]:
-        """The state with some views' poses found from random rotations."""
-        members = np.flatnonzero(which)
-        if not members.size:
-            return state, record
-        from neurocal_cli.network.random_cameras import find_poses
-
-        found = find_poses(self.views, members, state.entries, self.rng, starts)
-        R, t = state.R.copy(), state.t.copy()
-        R[members], t[members] = found.state.R, found.state.t
-        record = record.with_starts(members, found.agreed, found.starts, found.iterations)
-        return replace(state, R=R, t=t), record
+    record = TrainingRecord.empty(1)
+    record = record.with_starts(np.array([0]), found.agreed, found.starts, found.iterations)
+    return _refined(problem, options, found.state, record)
 
 
-# With a wide lens: least depth of a training point as a share of its distance (60 degrees from the axis), and
-# fewest training points.
-_LEAST_DEPTH, _FEWEST = 0.5, 12
+def _camera_then_other_poses(
+    problem: Problem, options: Options, rng: np.random.Generator, able: NDArray[np.bool_]
+) -> _Begun:
+    """Types 1 and 2 with some views of too few points, which are added once the others determine W."""
+    views = problem.views
+    if not able.any():
+        raise DegenerateGeometryError(
+            f"no view has enough different points by itself (view {views.names[0]!r} has "
+            f"{views.distinct[0]}); give at least one view with 6, or 4 on a flat board"
+        )
+    members = np.flatnonzero(able)
+    part = replace(problem, views=views.subset(members))
+    adjusted, record = _camera_and_poses(part, options, rng)
+    agreed = np.zeros(views.n_views, dtype=np.int64)
+    agreed[members] = record.agreed
+    R, t = np.zeros((views.n_views, 3, 3)), np.zeros((views.n_views, 3))
+    R[members], t[members] = adjusted.state.R, adjusted.state.t
+    state, record = _with_random_poses(
+        views, replace(adjusted.state, R=R, t=t), replace(record, agreed=agreed), ~able, rng,
+        max(options.starts, _FEW_POINT_STARTS),
+    )  # fmt: skip
+    return try_mirrored(problem, problem.adjust(replace(adjusted, state=state))), record
+
+
+def _poses(problem: Problem, options: Options, rng: np.random.Generator, able: NDArray[np.bool_]) -> _Begun:
+    """Type 3: each view's pose by itself."""
+    views = problem.views
+    groups: list[Group] = []
+    record = TrainingRecord.empty(views.n_views)
+    if able.any():
+        groups, record = train_networks(problem, options, rng, able)
+    state = cameras_from_products(problem, groups, problem.normalised_entries[None])
+    many = max(options.starts, _FEW_POINT_STARTS)
+    state, record = _with_random_poses(views, state, record, ~able, rng, many)
+    state, record = _constrained(problem, options, state, record)
+    best, record = _refined(problem, options, state, record)
+    best = try_mirrored(problem, best)
+    late = short_of_bound(problem, best, groups) | (able & (record.agreed < 2))
+    if late.any():
+        state, record = _with_random_poses(views, best.state, record, late, rng, options.starts)
+        best = better_by_view(problem, best, problem.adjust(state))
+    refuse_mirrored(problem, best, groups)
+    return best, record
+
+
+def _constrained(
+    problem: Problem, options: Options, state: CameraState, record: TrainingRecord
+) -> tuple[CameraState, TrainingRecord]:
+    """The paper's constrained training of one view's network, eq. (14), for trainers that support it.
+
+    It starts from an upper triangular W and an orthonormal V, into which the free network's product has been
+    split; from random weights it would stall. Training follows eq. (15), with W's structural zeros and given
+    weights fixed and beta E_orth added to the error. A flat board's V cannot be constrained. The state is
+    unchanged if the result is no valid camera.
+    """
+    views = problem.views
+    if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
+        return state, record
+    depth = float(state.t[0, 2])
+    # V is scaled so that depths, and so every gamma, are about 1; the constant a of E_orth compensates.
+    V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
+    free_W = np.zeros((3, 3), dtype=bool)
+    free_W[ENTRIES] = problem.free
+    patterns = patterns_of(views, np.array([0]), False, MOST_POINTS)
+    task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
+    trained = options.constrained(task, 1.0 / depth**2)
+    entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])
+    t = trained.V[:, :, 3] * depth
+    usable = np.isfinite(entries).all() and entries[[0, 2]].min() > 0 and t[0, 2] > 0
+    record = replace(record, iterations=record.iterations + int(trained.iterations.sum()))
+    return CameraState(entries[None], R, t) if usable else state, record
+
+
+def _refined(
+    problem: Problem, options: Options, state: CameraState, record: TrainingRecord, damping: float = _FAR
+) -> _Begun:
+    """First bundle adjustment; the error of its start is recorded."""
+    options.progress("refining", 0.0)
+    adjusted = problem.adjust(state, damping=damping)
+    before = adjusted.before
+    if problem.views.whitening is not None:
+        before = float((point_residuals(problem.views, state) ** 2).sum())
+    return adjusted, replace(record, before=before)
+
+
+def _random_camera(problem: Problem, rng: np.random.Generator, starts: int) -> Found | None:
+    """Intrinsics and pose of a single view from random cameras."""
+    from neurocal_cli.network.random_cameras import find_camera
+
+    return find_camera(problem.views, problem.normalised_entries, problem.free, rng, starts)
+
+
+def _with_random_poses(
+    views: Views,
+    state: CameraState,
+    record: TrainingRecord,
+    which: NDArray[np.bool_],
+    rng: np.random.Generator,
+    starts: int,
+) -> tuple[CameraState, TrainingRecord]:
+    """The state with some views' poses found from random rotations."""
+    members = np.flatnonzero(which)
+    if not members.size:
+        return state, record
+    from neurocal_cli.network.random_cameras import find_poses
+
+    found = find_poses(views, members, state.entries, rng, starts)
+    R, t = state.R.copy(), state.t.copy()
+    R[members], t[members] = found.state.R, found.state.t
+    record = record.with_starts(members, found.agreed, found.starts, found.iterations)
+    return replace(state, R=R, t=t), record
 
 
 def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generator) -> Solution:

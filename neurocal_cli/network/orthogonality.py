@@ -3,9 +3,7 @@
 Each view's network has learnt a product B_k = W V_k up to scale. All views share W, and the rotation part of
 V_k is orthonormal, so the columns of W^-1 B_k must be perpendicular and of equal length. A view of a solid
 target gives five conditions, a view of a flat board two (Zhang 2000). Levenberg-Marquardt solves them for W's
-five entries from random values.
-
-Stage 2: the trained products become cameras, one W for all views and a pose for each.
+five entries from random values. W^-1 B_k is then the pose of its view.
 """
 
 from __future__ import annotations
@@ -37,6 +35,22 @@ _APART = 1e-2  # largest difference of any entry from which on two minima are di
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
 _STARTS = 8  # random starts, trained side by side
 _ENOUGH = 3  # starts at the same, lowest loss with which training ends
+# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
+# which depths keep all points in front of the first camera.
+_MOST_CANDIDATES = 4
+_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
+
+
+def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
+    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
+    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
+    for group in groups:
+        if group.flat:
+            flat = group.product[:, :, :2]
+        else:
+            solid = group.product[:, :, :3]
+    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
+    return shared.entries[:_MOST_CANDIDATES, None]
 
 
 @frozen_dataclass(eq=False)
@@ -62,9 +76,18 @@ def shared_intrinsics(
     # The logarithms of W11 and W22 keep them positive.
     random, known = np.log(np.abs(p[:, [0, 2]]) + 1e-3), np.log(np.maximum(given[[0, 2]], 1e-300))
     p[:, [0, 2]] = np.where(free[[0, 2]], random, known)
-    p, loss = _minimum(conditions, p)
+    starts = _Starts(conditions, p)
+    descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
+    with np.errstate(all="ignore"):
+        while descent.active.size:
+            descent.step()
+            ended = np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min())
+            ended[descent.active] = False
+            if ended.sum() >= _ENOUGH:
+                break
+    loss = np.where(np.isfinite(starts.loss), starts.loss, np.inf)
     order = np.argsort(loss, kind="stable")
-    p, loss = p[order], loss[order]
+    p, loss = starts.p[order], loss[order]
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
     agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
@@ -74,6 +97,11 @@ def shared_intrinsics(
         if apart[n, distinct].all():
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
+
+
+def _tie(loss: float) -> float:
+    """Tolerance within which another loss equals this one."""
+    return 1e-3 * loss + 1e-16
 
 
 class _Conditions:
@@ -181,28 +209,21 @@ class _Starts:
         self.p[kept], self.r[kept], self.J[kept], self.loss[kept] = (values[better] for values in trial)
 
 
-def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
-    """Train parameter sets (B, 5) until all have ended, or enough of them at the same, lowest loss (B,)."""
-    starts = _Starts(conditions, p)
-    descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
-    with np.errstate(all="ignore"):
-        while descent.active.size:
-            descent.step()
-            if _same_lowest(starts.loss, descent.active) >= _ENOUGH:
-                break
-    return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
+def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:
+    """Poses of the trained views, given W's entries (1, 5); all points in front.
 
-
-def _same_lowest(loss: Array, active: NDArray[np.intp]) -> int:
-    """Number of starts that have ended at the lowest of all losses (B,)."""
-    same = np.abs(loss - loss.min()) <= _tie(loss.min())
-    same[active] = False
-    return int(same.sum())
-
-
-def _tie(loss: float) -> float:
-    """Tolerance within which another loss equals this one."""
-    return 1e-3 * loss + 1e-16
+    Views that are in no group get the identity.
+    """
+    views = problem.views
+    V = views.n_views
+    R, t = np.tile(np.eye(3), (V, 1, 1)), np.tile([0.0, 0.0, 2.0], (V, 1))
+    W = intrinsic_matrix(entries[0])
+    for group in groups:
+        rotation, t[group.views] = pose_from_product(W, group.product)
+        if group.flat:
+            rotation = rotation @ np.swapaxes(views.basis[group.views], 1, 2)
+        R[group.views] = rotation
+    return CameraState(entries, R, _in_front(views, R, t))
 
 
 def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
@@ -220,41 +241,6 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
         third = cross_matrix(M[:, :, 0]) @ M[:, :, 1:] / scale[:, None, None]
         M = np.concatenate([M, third], axis=2)
     return nearest_rotation(M), D[:, :, -1] / scale[:, None]
-
-
-# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
-# which depths keep all points in front of the first camera.
-_MOST_CANDIDATES = 4
-_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
-
-
-def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
-    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
-    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
-    for group in groups:
-        if group.flat:
-            flat = group.product[:, :, :2]
-        else:
-            solid = group.product[:, :, :3]
-    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
-    return shared.entries[:_MOST_CANDIDATES, None]
-
-
-def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:
-    """Poses of the trained views, given W's entries (1, 5); all points in front.
-
-    Views that are in no group get the identity.
-    """
-    views = problem.views
-    V = views.n_views
-    R, t = np.tile(np.eye(3), (V, 1, 1)), np.tile([0.0, 0.0, 2.0], (V, 1))
-    W = intrinsic_matrix(entries[0])
-    for group in groups:
-        rotation, t[group.views] = pose_from_product(W, group.product)
-        if group.flat:
-            rotation = rotation @ np.swapaxes(views.basis[group.views], 1, 2)
-        R[group.views] = rotation
-    return CameraState(entries, R, _in_front(views, R, t))
 
 
 def _in_front(views: Views, R: Array, t: Array) -> Array:

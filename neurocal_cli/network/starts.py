@@ -69,31 +69,25 @@ def learn(
         iterations=0,
         curve=np.zeros(0),
     )
+    free_W = np.ones((3, 3), dtype=bool) if W is None else np.isnan(W)
+    free_V = np.full((3, patterns.n_inputs), V is None)
     views = np.arange(K)
     round_size = 2
     while views.size:
         count = min(round_size, limit - int(best.starts[views[0]]))
         if count <= 0:
             break
-        task = _random_task(patterns.take(np.repeat(views, count)), rng, W, V)
-        best = _best_of(best, views, task.patterns, trainer(task), agreement)
+        many = patterns.take(np.repeat(views, count))
+        random_W, random_V = random_weights(rng, len(many.weights), many.n_inputs)
+        if W is not None:
+            random_W = np.where(free_W, random_W, W)
+        if V is not None:
+            random_V = np.repeat(V, len(random_V), axis=0)
+        trained = trainer(Task(many, random_W, random_V, free_W, free_V))
+        best = _best_of(best, views, many, trained, agreement)
         views = views[best.agreed[views] < 2]
         round_size = 4
     return best
-
-
-def _random_task(patterns: Patterns, rng: np.random.Generator, W: Array | None, V: Array | None) -> Task:
-    """Random starts, with weights that are given as in `learn`."""
-    networks = len(patterns.weights)
-    random_W, random_V = random_weights(rng, networks, patterns.n_inputs)
-    free_W, free_V = np.ones((3, 3), dtype=bool), np.ones((3, patterns.n_inputs), dtype=bool)
-    if W is not None:
-        free_W = np.isnan(W)
-        random_W = np.where(free_W, random_W, W)
-    if V is not None:
-        free_V[:] = False
-        random_V = np.repeat(V, networks, axis=0)
-    return Task(patterns, random_W, random_V, free_W, free_V)
 
 
 def _best_of(

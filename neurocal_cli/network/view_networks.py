@@ -1,6 +1,4 @@
-"""Stage 1: each view's network learns its product W V from random weights.
-
-One step of all networks together with a radial distortion that they share.
+"""Stage 1: each view's network learns its product W V from random weights, and all tell a lens's distortion.
 
 The networks model a pinhole. A bent lens leaves errors in them that are alike in all views, and these errors
 tell its distortion before there is a camera. Undistortion by
@@ -36,6 +34,9 @@ from neurocal_cli.network.starts import learn
 # Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
 _NO_CONDITION = 1e-13
 _SMALL = 1500  # number of patterns below which subsampling saves no time (tests/benchmarks/test_speed.py)
+_RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular
+_STRONGEST = 0.5  # largest change of the farthest point's radius for which one step is near enough
+_RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients of a model are fitted
 
 
 @frozen_dataclass(eq=False)
@@ -65,45 +66,33 @@ def train_networks(
 ) -> tuple[list[Group], TrainingRecord]:
     """Train the networks of some views (V,) from random weights, flat and solid targets separately."""
     options.progress("training the networks", 0.0)
-    flat = begin_flat(problem)
-    groups, record = [], TrainingRecord.empty(problem.views.n_views)
-    for kind in (True, False):
-        members = np.flatnonzero(which & (flat == kind))
-        if members.size:
-            group, record = _train_group(problem, options, rng, members, kind, record)
-            groups.append(group)
+    views, begins_flat = problem.views, begin_flat(problem)
+    groups, record = [], TrainingRecord.empty(views.n_views)
+    W = _given_weights(problem)
+    for flat in (True, False):
+        members = np.flatnonzero(which & (begins_flat == flat))
+        if not members.size:
+            continue
+        every = patterns_of(views, members, flat, MOST_POINTS)
+        small = every.weights.size <= _SMALL
+        most = options.start_points[0 if flat else 1]
+        some = every if small else patterns_of(views, members, flat, most, rng)
+        learnt = learn(some, options.trainer, rng, options.starts, options.agreement, W=W)
+        iterations = learnt.iterations
+        if options.finish is not None and not small:
+            free = np.ones((3, 3), dtype=bool), np.ones((3, every.n_inputs), dtype=bool)
+            trained = options.finish(Task(every, learnt.W, learnt.V, *free))
+            learnt = replace(learnt, W=trained.W, V=trained.V, rms=every.rms(trained.loss))
+            iterations += int(trained.iterations.sum())
+        record = replace(
+            record.with_starts(members, learnt.agreed, int(learnt.starts.sum()), iterations),
+            squares=record.squares + float((learnt.rms**2 * views.counts[members]).sum()),
+            curve=learnt.curve if members[0] == 0 else record.curve,
+        )
+        bound = _pixel_error(problem, members, flat, learnt.product, every)
+        groups.append(Group(members, flat, learnt.product, bound, every))
     options.progress("training the networks", 1.0)
     return groups, record
-
-
-def _train_group(
-    problem: Problem,
-    options: Options,
-    rng: np.random.Generator,
-    members: NDArray[np.intp],
-    flat: bool,
-    record: TrainingRecord,
-) -> tuple[Group, TrainingRecord]:
-    views = problem.views
-    every = patterns_of(views, members, flat, MOST_POINTS)
-    small = every.weights.size <= _SMALL
-    some = every if small else patterns_of(views, members, flat, options.start_points[0 if flat else 1], rng)
-    W = _given_weights(problem)
-    learnt = learn(some, options.trainer, rng, options.starts, options.agreement, W=W)
-    iterations = learnt.iterations
-    if options.finish is not None and not small:
-        free = np.ones((3, 3), dtype=bool), np.ones((3, every.n_inputs), dtype=bool)
-        trained = options.finish(Task(every, learnt.W, learnt.V, *free))
-        learnt = replace(learnt, W=trained.W, V=trained.V, rms=every.rms(trained.loss))
-        iterations += int(trained.iterations.sum())
-    record = record.with_starts(members, learnt.agreed, int(learnt.starts.sum()), iterations)
-    record = replace(
-        record,
-        squares=record.squares + float((learnt.rms**2 * views.counts[members]).sum()),
-        curve=learnt.curve if members[0] == 0 else record.curve,
-    )
-    bound = _pixel_error(problem, members, flat, learnt.product, every)
-    return Group(members, flat, learnt.product, bound, every), record
 
 
 def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
@@ -162,14 +151,9 @@ def _squared_error(product: Array, patterns: Patterns) -> Array:
     return np.where(patterns.weights > 0, patterns.weights * error, 0.0).sum(axis=1)
 
 
-_RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular
-_STRONGEST = 0.5  # largest change of the farthest point's radius for which one step is near enough
-_RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients of a model are fitted
-
-
 @frozen_dataclass(eq=False)
 class RadialStep:
-    """Networks after the step, and the distortion."""
+    """Networks after one step together with a radial distortion that they share."""
 
     groups: tuple[Group, ...]
     strength: Array  # (2,) kappa_1 and kappa_2

@@ -2,9 +2,8 @@
 
 A plane has cols x rows inner vertices. Vertex (c, r) is ``origin + c square x_axis + r square y_axis``.
 The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway from (c, r) to
-(c + 1, r), ``v:c:r`` halfway from (c, r) to (c, r + 1).
-
-The planes of a folded target: by the names in its points' ids, or by the places of its points.
+(c + 1, r), ``v:c:r`` halfway from (c, r) to (c, r + 1). On a folded target, points belong to planes by the
+names in their ids, or else by their places (`planes_of`).
 """
 
 from __future__ import annotations
@@ -24,6 +23,12 @@ Triple = tuple[float, float, float]
 _AXIS_TOLERANCE = 1e-6
 _FEWEST_MEASURED = 4  # places that determine a plane's bend
 _MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error would need gigabytes
+_THIN = 1e-6  # thickness of a plane up to rounding, relative to its size
+# Planes that are looked for among points without names, and the fewest points of one, also as a share of all.
+_MOST, _FEWEST, _LEAST_SHARE = 4, 8, 0.125
+_SPANNING, _TESTED = 16, 200  # points that span trial planes, and points that are compared with all of them
+_NARROW = 0.02  # least area that three points span, over that of the target
+_PARALLEL = 0.99  # |cosine| of two normals: layers of a block are no planes that were set up by hand
 
 
 @frozen_dataclass
@@ -51,8 +56,15 @@ class Plane:
             raise InputError(
                 f"name must be printable, without '/' and outer blanks, found {name!r}; rename it"
             )
-        for count in ("cols", "rows"):
-            object.__setattr__(self, count, _count(count, getattr(self, count)))
+        for side in ("cols", "rows"):
+            count = getattr(self, side)
+            whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
+            if not whole or not 2 <= int(count) <= _MOST_VERTICES:
+                raise InputError(
+                    f"{side} counts inner vertices and must be a whole number from 2 to {_MOST_VERTICES}, "
+                    f"found {count!r}"
+                )
+            object.__setattr__(self, side, int(count))
         square = _numbers("square", self.square, ())
         if square <= 0:
             raise InputError(f"square must be a positive length, found {square:g}")
@@ -60,7 +72,15 @@ class Plane:
         for vector in ("origin", "x_axis", "y_axis"):
             value = _numbers(vector, getattr(self, vector), (3,))
             object.__setattr__(self, vector, tuple(value.tolist()))
-        self._check_axes()
+        x, y = np.array(self.x_axis), np.array(self.y_axis)
+        for axis, direction in (("x_axis", x), ("y_axis", y)):
+            length = float(np.linalg.norm(direction))
+            if abs(length - 1) > _AXIS_TOLERANCE:
+                raise InputError(f"{axis} must have the length 1, found {length:.9g}; divide it by that")
+        if abs(float(x @ y)) > _AXIS_TOLERANCE:
+            raise InputError(
+                f"x_axis and y_axis must be perpendicular, found the cosine {float(x @ y):.3g} between them"
+            )
         rows = tuple(tuple(_numbers("points", row, (5,)).tolist()) for row in self.measured)
         if rows and len({row[:2] for row in rows}) < max(len(rows), _FEWEST_MEASURED):
             raise InputError(
@@ -127,17 +147,6 @@ class Plane:
     def midpoints(self) -> tuple[tuple[str, ...], Array]:
         """Ids (N) and world coordinates (N, 3) [world unit] of the mid-points; see `midpoint_grid`."""
         return self.midpoint_ids(), self.at(self.midpoint_grid())
-
-    def _check_axes(self) -> None:
-        x, y = np.array(self.x_axis), np.array(self.y_axis)
-        for name, axis in (("x_axis", x), ("y_axis", y)):
-            length = float(np.linalg.norm(axis))
-            if abs(length - 1) > _AXIS_TOLERANCE:
-                raise InputError(f"{name} must have the length 1, found {length:.9g}; divide it by that")
-        if abs(float(x @ y)) > _AXIS_TOLERANCE:
-            raise InputError(
-                f"x_axis and y_axis must be perpendicular, found the cosine {float(x @ y):.3g} between them"
-            )
 
 
 @frozen_dataclass
@@ -219,16 +228,6 @@ def smooth_between(places: Array, values: Array, at: Array) -> Array:
     return np.asarray(RBFInterpolator(places, values)(at))
 
 
-def _count(name: str, value: object) -> int:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or not 2 <= int(value) <= _MOST_VERTICES:  # type: ignore[call-overload]
-        raise InputError(
-            f"{name} counts inner vertices and must be a whole number from 2 to {_MOST_VERTICES}, "
-            f"found {value!r}"
-        )
-    return int(value)  # type: ignore[call-overload]
-
-
 def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     words = "a finite number" if shape == () else f"{shape[0]} finite numbers"
     try:
@@ -238,14 +237,6 @@ def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"{name} must be {words}, found {value!r}")
     return array
-
-
-_THIN = 1e-6  # thickness of a plane up to rounding, relative to its size
-# Planes that are looked for among points without names, and the fewest points of one, also as a share of all.
-_MOST, _FEWEST, _LEAST_SHARE = 4, 8, 0.125
-_SPANNING, _TESTED = 16, 200  # points that span trial planes, and points that are compared with all of them
-_NARROW = 0.02  # least area that three points span, over that of the target
-_PARALLEL = 0.99  # |cosine| of two normals: layers of a block are no planes that were set up by hand
 
 
 def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:

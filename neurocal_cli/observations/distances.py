@@ -14,6 +14,7 @@ from neurocal_cli.errors import InputError
 _NUMBER = r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
 _LABEL = rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})"
 _ANOTHER_UNIT = 0.1  # a scale further from 1 is not that of a print of the stated board
+_CONTRADICTED = 4.0  # standard deviations of a distance
 
 
 @frozen_dataclass
@@ -53,7 +54,6 @@ class Scale:
 
 
 NO_SCALE = Scale()
-_CONTRADICTED = 4.0  # standard deviations of a distance
 
 
 def grid_place(label: str) -> tuple[str, float, float]:

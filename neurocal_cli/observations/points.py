@@ -125,9 +125,15 @@ class Correspondences:
                 "distances out"
             )
         if self.world_std is not None:
-            self._check_world_std(_matrix("world_std", self.world_std, 3))
+            std = _matrix("world_std", self.world_std, 3)
+            good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
+            problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
+            self._set_rows("world_std", std, good, problem)
         if self.across is not None:
-            self._check_across(_matrix("across", self.across, 2))
+            across = _matrix("across", self.across, 2)
+            good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
+            problem = "the direction nu,nv in which the point was measured must be two finite numbers"
+            self._set_rows("across", across, good, problem)
         if self.image_size is not None:
             self._set(image_size=checked_size(self.image_size))
         if self.image_center is not None:
@@ -226,16 +232,6 @@ class Correspondences:
             np.asarray(good), "the pixel's covariance (sigma, or suu,suv,svv) must be positive definite"
         )
         self._set(covariance=_frozen(covariance))
-
-    def _check_world_std(self, std: Array) -> None:
-        good = np.asarray(((std >= 0) & (std <= _LARGEST)).all(axis=1))  # False for nan as well
-        problem = "the world point's standard deviation sX,sY,sZ must be numbers of at least 0"
-        self._set_rows("world_std", std, good, problem)
-
-    def _check_across(self, across: Array) -> None:
-        good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
-        problem = "the direction nu,nv in which the point was measured must be two finite numbers"
-        self._set_rows("across", across, good, problem)
 
     def _check_length(self, name: str, values: Array) -> None:
         if len(values) != len(self.world):

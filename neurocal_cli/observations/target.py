@@ -1,8 +1,7 @@
-"""`Target`, the estimated shape of a target: the true positions of its points besides the given ones.
+"""`Target`, the estimated shape of a target: the true positions of its points, and the bends of single views.
 
-Bends of single views: a flat board that leaves its plane by a different quadratic surface in each view.
-
-A thin sheet bends into cylinders. A shallow cylinder whose axis has the angle phi has the height
+A flat board may leave its plane by a different quadratic surface in each view: a thin sheet bends into
+cylinders. A shallow cylinder whose axis has the angle phi has the height
 
     a (x cos phi + y sin phi)^2 = a/2 (x^2 + y^2) + a/2 cos 2 phi (x^2 - y^2) + a/2 sin 2 phi (2 x y).
 
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,15 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, distinct_rows, nearest_similarity, rotation_vector
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.board import planes_of
+from neurocal_cli.observations.board import Board, Plane, planes_of, smooth_between
 from neurocal_cli.observations.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.observations.points import Correspondences
-
-if TYPE_CHECKING:
-    from neurocal_cli.observations.board import Board, Plane
-
 
 TARGETS = ("auto", "given", "flat", "free")
 
 _DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
+N_SHAPES = 3
+"""Number of shapes that a bend has."""
 
 
 @frozen_dataclass(eq=False)
@@ -49,7 +46,8 @@ class Target:
     found: Array  # (n, 3) [world unit]
     std: Array  # (n, 3) [world unit] of the estimated points, along the world's axes
     plane: NDArray[np.intp]  # (n,) index of the plane of the target to which each point belongs
-    sizes: Mapping[str, float]  # [world unit] prior std of each part of the offsets, see `board.prior`
+    # [world unit] prior std of each part of the offsets, see `adjustment.board.prior`
+    sizes: Mapping[str, float]
     flat: bool  # whether the points were kept in their plane
     evidence: float  # gain in log evidence (marginal likelihood) over the given target
     point: NDArray[np.str_] | None = None  # (n,) ids
@@ -100,17 +98,14 @@ class Target:
     def _bend(self, bends: Bends, points: Correspondences) -> Array:
         """(N, 3) offsets of points by the bends of their views [world unit]."""
         by_view = bends.of_views(points.view_names)[points.view_index]
-        return np.asarray((self._shapes(points.world) @ by_view[..., None])[..., 0])
-
-    def _shapes(self, world: Array) -> Array:
-        """(N, 3, 3) offsets of points for a unit coefficient of each shape of a bend."""
-        return surface_of(self.given).offsets(world)
+        shapes = surface_of(self.given).offsets(points.world)
+        return np.asarray((shapes @ by_view[..., None])[..., 0])
 
     def bend_of_views(self) -> float:
         """Rms height of the bends of single views, over points and views [world unit]; 0 without bends."""
         if self.bends is None:
             return 0.0
-        heights = self._shapes(self.found) @ self.bends.coefficients.T  # (n, 3, V)
+        heights = surface_of(self.given).offsets(self.found) @ self.bends.coefficients.T  # (n, 3, V)
         return float(np.sqrt((heights**2).sum(axis=1).mean()))
 
     def joined(self, other: Target) -> Target:
@@ -195,13 +190,34 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
         raise InputError(
             "the points have no ids of a board; calibrate from points found by `neurocal detect`"
         )
-    from neurocal_cli.observations.board import Board
-
     planes: dict[str, list[tuple[tuple[float, float], Array, Array]]] = {}
     for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
         name, place = _place(str(label))
         planes.setdefault(name, []).append((place, given, found))
     return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit, distances)
+
+
+def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
+    """The plane with the grid places, given and estimated coordinates of its points."""
+    grid = np.array([place for place, _, _ in rows])
+    given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
+    sides = np.linalg.norm(unknowns[1:], axis=1)
+    square = float(sides.mean())
+    # Given points may be those of an estimated board, whose sides are neither equal nor perpendicular. The
+    # nearest perpendicular axes are the polar factor.
+    U, _, Vt = np.linalg.svd(unknowns[1:] / sides[:, None], full_matrices=False)
+    x_axis, y_axis = U @ Vt
+    cols, rows_ = (_size(places) for places in grid.T)
+    origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
+    measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
+    return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
+
+
+def _size(places: Array) -> int:
+    """Number of vertices in a row, from grid coordinates of points; half coordinates may be at the rim."""
+    whole = places[places == np.rint(places)]
+    return int(whole.max() if len(whole) else np.ceil(places.max())) + 1
 
 
 def scale_of(points: Correspondences) -> Scale:
@@ -216,11 +232,9 @@ def scale_of(points: Correspondences) -> Scale:
 
 
 def scale_of_points(world: Array, ids: NDArray[np.str_] | None, distances: tuple[Distance, ...]) -> Scale:
-    """The same for the distinct points (n, 3) of a target with their ids."""
+    """The scale of a target from its distinct points (n, 3), with their ids."""
     if not distances or ids is None:
         return NO_SCALE
-    from neurocal_cli.observations.board import smooth_between
-
     names = [_place(str(label)) for label in ids.tolist()]
     planes = np.array([name for name, _ in names])
     grid = np.array([place for _, place in names])
@@ -246,30 +260,6 @@ def _place(label: str) -> tuple[str, tuple[float, float]]:
     if half is None or not (c.removeprefix("-").isdecimal() and r.removeprefix("-").isdecimal()):
         raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
     return name, (int(c) + half[0], int(r) + half[1])
-
-
-def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
-    from neurocal_cli.observations.board import Plane
-
-    grid = np.array([place for place, _, _ in rows])
-    given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
-    unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
-    sides = np.linalg.norm(unknowns[1:], axis=1)
-    square = float(sides.mean())
-    # Given points may be those of an estimated board, whose sides are neither equal nor perpendicular. The
-    # nearest perpendicular axes are the polar factor.
-    U, _, Vt = np.linalg.svd(unknowns[1:] / sides[:, None], full_matrices=False)
-    x_axis, y_axis = U @ Vt
-    cols, rows_ = (_size(places) for places in grid.T)
-    origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
-    measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
-    return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
-
-
-def _size(places: Array) -> int:
-    """Number of vertices in a row, from grid coordinates of points; half coordinates may be at the rim."""
-    whole = places[places == np.rint(places)]
-    return int(whole.max() if len(whole) else np.ceil(places.max())) + 1
 
 
 def distinct_points(
@@ -302,9 +292,6 @@ def _whole(world: Array, known: Array) -> Array:
     """World coordinates in units of the resolution to which those of the same known point agree."""
     size = float(np.ptp(known, axis=0).max()) if len(known) else 1.0
     return np.round(world / (float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0))
-
-
-N_SHAPES = 3
 
 
 @frozen_dataclass(eq=False)

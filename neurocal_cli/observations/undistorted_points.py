@@ -85,16 +85,18 @@ def map_points(
     undistorted = replace(points, pixels=pixels, image_size=size)
     if not camera.distortion.is_identity:
         undistorted = replace(undistorted, undistorted="plane" if isinstance(new, Camera) else new.shape)
-    if points.covariance is not None:
-        # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
-        M = np.linalg.inv(distorted_by_undistorted(camera, new, pixels, R))
-        C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
-        undistorted = replace(undistorted, covariance=C)
-    if points.across is not None:
-        # Only n . m is measured of a pixel m, and so n^T M^-1 m' of the undistorted pixel m'.
-        n = (points.across[:, None, :] @ distorted_by_undistorted(camera, new, pixels, R))[:, 0]
-        undistorted = replace(undistorted, across=unit(n))
+    if points.covariance is not None or points.across is not None:
+        inverse = distorted_by_undistorted(camera, new, pixels, R)
+        if points.covariance is not None:
+            # To first order C' = M C M^T, with the derivative M of the undistorted pixel by the other one.
+            M = np.linalg.inv(inverse)
+            C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+            C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
+            undistorted = replace(undistorted, covariance=C)
+        if points.across is not None:
+            # Only n . m is measured of a pixel m, and so n^T M^-1 m' of the undistorted pixel m'.
+            n = (points.across[:, None, :] @ inverse)[:, 0]
+            undistorted = replace(undistorted, across=unit(n))
     if points.image_center is not None:
         u0, v0 = undistort_pixels(camera, new, np.array([points.image_center]), R)[0].tolist()
         undistorted = replace(undistorted, image_center=(u0, v0) if np.isfinite(u0 + v0) else None)

@@ -1,7 +1,4 @@
-"""Compare all methods on a user's points: errors, time, parameters; for two cameras the paper's Table 2.
-
-One function for all methods, each with the distortion model that is nearest to the requested one.
-"""
+"""Compare all methods on a user's points: errors, time, parameters; for two cameras the paper's Table 2."""
 
 from __future__ import annotations
 
@@ -23,36 +20,6 @@ from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
-
-
-def calibrate_with(
-    method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
-) -> Calibration:
-    """Calibrate a camera by one of `METHODS`, with nothing known (type 1), from all points of a given target.
-
-    The method backprop is the network with the paper's trainer, and opencv is `calibrateCamera`. Of the
-    requested distortion model, linear uses none, and tsai at most k1. Raises NeurocalError if the method has
-    no solution.
-    """
-    if method == "opencv":
-        return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))
-    trainer = "backprop" if method == "backprop" else "lm"
-    if method == "linear":
-        model = "none"
-    elif method == "tsai" and model != "none":
-        model = "k1"
-    return calibrate(
-        points,
-        method="neuro" if method == "backprop" else method,
-        trainer=trainer,
-        distortion=model,
-        skew=skew,
-        outliers="keep",
-        seed=seed,
-        target="given",  # the other methods cannot estimate the target
-    )
-
-
 _FOLDS = 5
 
 
@@ -116,6 +83,33 @@ def compare(
     return Comparison(tuple(kept), tuple(cameras), stereo, tuple(notes))
 
 
+def calibrate_with(
+    method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
+) -> Calibration:
+    """Calibrate a camera by one of `METHODS`, with nothing known (type 1), from all points of a given target.
+
+    The method backprop is the network with the paper's trainer, and opencv is `calibrateCamera`. Of the
+    requested distortion model, linear uses none, and tsai at most k1. Raises NeurocalError if the method has
+    no solution.
+    """
+    if method == "opencv":
+        return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))
+    if method == "linear":
+        model = "none"
+    elif method == "tsai" and model != "none":
+        model = "k1"
+    return calibrate(
+        points,
+        method="neuro" if method == "backprop" else method,
+        trainer="backprop" if method == "backprop" else "lm",
+        distortion=model,
+        skew=skew,
+        outliers="keep",
+        seed=seed,
+        target="given",  # the other methods cannot estimate the target
+    )
+
+
 def _compared(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> Compared:
     start = time.perf_counter()
     try:
@@ -140,20 +134,16 @@ def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed
         except NeurocalError:
             return np.nan
         rest = points.select(fold == k)
-        squares += float((_residuals(found, rest) ** 2).sum())
+        poses = [found.views[name].pose for name in rest.view_names]
+        predicted = found.camera.project(in_cameras(poses, rest.world, rest.view_index))[0]
+        squares += float(((predicted - rest.pixels) ** 2).sum())
     return float(np.sqrt(squares / len(points)))
-
-
-def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
-    """(N, 2) predicted minus observed pixels."""
-    poses = [calibration.views[name].pose for name in points.view_names]
-    inside = in_cameras(poses, points.world, points.view_index)
-    return calibration.camera.project(inside)[0] - points.pixels
 
 
 def _stereo(
     cameras: list[dict[str, Compared]], methods: Sequence[str], notes: list[str]
 ) -> dict[str, StereoEvaluation]:
+    """The pairs of cameras of each method; why there is none is added to the notes."""
     found = {}
     for method in methods:
         left, right = (camera[method].calibration for camera in cameras)

@@ -84,19 +84,19 @@ def study_noise(
     exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(methods), -1)
     fold = _Fold(scene)
     errors = {method: noisy[:, :, m] for m, method in enumerate(methods)}
+    bounds = {method: cramer_rao(scene, method) for method in methods}
     results = {
         method: MethodErrors(
             fold.worst(exact[0, m]),
             fold.rms(errors[method]),
             fold.mean(errors[method]),
-            fold.bound(cramer_rao(scene, method)),
+            fold.bound(bounds[method]),
             np.isnan(errors[method][..., 0]).sum(axis=1),
         )
         for m, method in enumerate(methods)
     }
-    whole = cramer_rao(scene, "neuro")
     apart = {
-        (a, b): _apart(errors[a], errors[b], np.array(sigma), whole)
+        (a, b): _apart(errors[a], errors[b], np.array(sigma), bounds[a])
         for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
         if a in errors and b in errors and not (results[a].failed + results[b].failed >= trials).any()
     }
@@ -165,6 +165,7 @@ def _parameters(intrinsics: Intrinsics, k: Array, poses: Iterable[Pose]) -> Arra
 
 
 def _apart(one: Array, two: Array, sigma: Array, bound: Array) -> float:
+    """Largest difference (S, T, P) of the errors of two methods, over the bound."""
     free = bound > 0
     with np.errstate(invalid="ignore"):
         difference = np.abs(one - two)[..., free] / (sigma[:, None, None] * bound[free])

@@ -1,7 +1,4 @@
-"""Simulated cameras and targets with known truth: the paper's (Table 1), a user's, and random poses.
-
-Render images of a simulated scene, with its visible points.
-"""
+"""Simulated views with known truth: the paper's scene (Table 1), a user's or random poses; their pictures."""
 
 from __future__ import annotations
 
@@ -36,6 +33,7 @@ PAPER_BOARD = Board(
 _TILT = 15.0, 45.0  # degrees
 _FILLED = 0.55, 0.9  # share of the image spanned by the target
 _TRIES = 1000
+_MARGIN = 0.5  # squares of white paper around a board of one plane
 
 
 @frozen_dataclass(eq=False)
@@ -130,6 +128,7 @@ def true_calibration(scene: SimulatedScene) -> Calibration:
 
 
 def _seen(camera: Camera, pose: Pose, world: Array, name: str) -> Array:
+    """Pixels (N, 2) of world points in the view of a name; an InputError unless all are seen."""
     inside = pose.to_camera(world)
     if not camera.sees(inside).all():
         raise InputError(f"the camera cannot see all points in the pose of view {name!r}; give other poses")
@@ -146,24 +145,22 @@ def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Genera
     corners = np.concatenate([plane.vertices().reshape(-1, 3) for plane in board.planes])
     centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     facing = sum((plane.normal for plane in board.planes), np.zeros(3))
-    upright = _facing(facing / np.linalg.norm(facing))
+    normal = facing / np.linalg.norm(facing)
+    # A rotation that shows the board from the front, with its mean normal along the camera's z axis.
+    x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(normal, x), normal])
     return {
         f"view{k + 1:02d}": _random_pose(camera, corners - centre, centre, upright, k / count, rng)
         for k in range(count)
     }
 
 
-def _facing(normal: Array) -> Array:
-    """Rotation that shows a target from the front, with its mean normal along the camera's z axis."""
-    x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = x - (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(normal, x), normal])
-
-
 def _random_pose(
     camera: Camera, corners: Array, centre: Array, upright: Array, turn: float, rng: np.random.Generator
 ) -> Pose:
+    """A pose of a board with corners (N, 3) about its centre, seen after a turn [turns] about the z axis."""
     assert camera.image_size is not None
     size = np.array(camera.image_size)
     K = camera.intrinsics
@@ -182,9 +179,6 @@ def _random_pose(
             if (pixels > 0).all() and (pixels < size - 1).all():
                 return pose
     raise InputError("no pose puts the whole board into the camera's image; give a smaller board")
-
-
-_MARGIN = 0.5  # squares of white paper around a board of one plane
 
 
 @frozen_dataclass(eq=False)

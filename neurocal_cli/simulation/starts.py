@@ -102,6 +102,7 @@ def study_starts(
 
 
 def _problem(scene: SimulatedScene, sigma: float, seed: int) -> Problem:
+    """The problem of the scene's points, with noise and without distortion."""
     pinhole = replace(scene, camera=replace(scene.camera, distortion=Distortion()))
     inside = [pinhole.poses[name].to_camera(M) for name, M in zip(scene.view, scene.world, strict=True)]
     pixels = pinhole.camera.project(np.array(inside))[0]
@@ -139,6 +140,7 @@ def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float
 
 
 def _from_network(trainer: str, problem: Problem, rng: np.random.Generator) -> float:
+    """Train each network from one start, and adjust the camera of their products; rms error."""
     options = replace(options_for(trainer, 2, 0), starts=1)
     if problem.type == 4:
         return _rms(problem, solve_given_poses(problem, options, rng).state)
@@ -167,6 +169,7 @@ def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
 
 
 def _from_camera(problem: Problem, rng: np.random.Generator) -> float:
+    """Minimise (3) from a random camera with random poses; rms error."""
     views = problem.views
     V = views.n_views
     random = np.array([0.0, 0.0, 0.0, *rng.uniform(-0.5, 0.5, 2)])
@@ -179,8 +182,7 @@ def _from_camera(problem: Problem, rng: np.random.Generator) -> float:
     t[:, :2] = (seen - entries[3:]) / entries[[0, 2]] * t[:, 2:]
     if problem.type == 4:
         raise NeurocalError("with given poses (3) is linear, and any start will do")
-    found = descend(problem, CameraState(entries[None], R, t))
-    return _rms(problem, found.state)
+    return _rms(problem, descend(problem, CameraState(entries[None], R, t)).state)
 
 
 def _rms(problem: Problem, state: CameraState) -> float:

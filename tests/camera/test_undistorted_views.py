@@ -16,10 +16,10 @@ from support.wide_cameras import SIZE, WIDE_LENSES, wide_camera, wide_points
 from neurocal_cli import Correspondences, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import UNDISTORTED
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.undistortion import (
     PANORAMAS,
-    SHAPES,
     Panorama,
     field_of_view,
     sources,
@@ -70,7 +70,7 @@ def test_half_a_turn_ends_a_panorama() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", UNDISTORTED)
 def test_what_a_wide_lens_sees_goes_there_and_back(model: str, shape: str) -> None:
     cam = wide_camera(model, skew=2.0)
     new = undistorted_view(cam, SIZE, shape)
@@ -160,7 +160,7 @@ def test_points_behind_a_plane_are_named_and_a_cylinder_keeps_them() -> None:
         undistort_points(points, cam, 0.5, to="cylinder")
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", UNDISTORTED)
 def test_an_image_and_its_points_agree(shape: str) -> None:
     """A dot is found where its pixel is moved to, also behind the camera; what sees nothing is black."""
     size = SIZE[0] // 2, SIZE[1] // 2

@@ -66,6 +66,7 @@ def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
     first, second = (np.rint(grid + s * half).astype(np.intp) @ [1, plane.cols] for s in (-1, 1))
     visible = vertices_visible.reshape(-1)
     edges_visible = midpoints_visible & visible[first] & visible[second] & quarters[0] & quarters[1]
+    square = np.floor(grid + 0.5 * (1 - 2 * half)).astype(np.int64)  # on the side of the normal
     chord = vertices.reshape(-1, 2)[second] - vertices.reshape(-1, 2)[first]
     return PlaneTruth(
         plane=plane,
@@ -79,7 +80,7 @@ def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
         ends=np.stack([first, second], axis=-1),
         normals=_normals(sight, grid, half),
         lengths=np.hypot(*chord.T),
-        polarity=_polarity(target, grid, half),
+        polarity=np.where((square.sum(axis=1) % 2 == 0) == target.first_black, -1, 1),
     )
 
 
@@ -91,12 +92,6 @@ def _normals(sight: _Sight, grid: Array, half: Array) -> Array:
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
     normal /= np.hypot(*normal.T)[:, None]
     return np.asarray(normal * np.sign((normal * side).sum(axis=1))[:, None])
-
-
-def _polarity(target: Target, grid: Array, half: Array) -> NDArray[np.int64]:
-    square = np.floor(grid + 0.5 * (1 - 2 * half)).astype(np.int64)
-    even = square.sum(axis=1) % 2 == 0
-    return np.where(even == target.first_black, -1, 1)
 
 
 class _Sight:
