@@ -31,7 +31,9 @@ def imports() -> Counter[tuple[str, str]]:
     for room in ROOMS:
         for path in (PACKAGE / room).rglob("*.py"):
             nodes = [n for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, ast.ImportFrom)]
-            used = {n.module.split(".")[1] for n in nodes if n.module and n.module.startswith("neurocal_cli.")}
+            used = {
+                n.module.split(".")[1] for n in nodes if n.module and n.module.startswith("neurocal_cli.")
+            }
             found.update((room, other) for other in used & ROOMS.keys() - {room})
     return found
 

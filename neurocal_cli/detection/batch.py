@@ -35,9 +35,9 @@ from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.images import Image, encode_png, parse_image
 from neurocal_cli.files.processes import start_worker, usable_cores, work_through
+from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_at_once
 from neurocal_cli.observations.board import Board
 
