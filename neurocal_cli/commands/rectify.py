@@ -181,7 +181,7 @@ class _Work:
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.calibration.rig.rectification import row_error_of_rig
-        from neurocal_cli.commands.show.camera_report import number_or_none
+        from neurocal_cli.commands.show.text import number_or_none
 
         self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
@@ -194,7 +194,7 @@ class _Work:
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
         from neurocal_cli.calibration.rig.rectification import row_error
-        from neurocal_cli.commands.show.camera_report import number_or_none
+        from neurocal_cli.commands.show.text import number_or_none
         from neurocal_cli.files.points_csv import format_points
 
         if len(sides[0]) > 1:

@@ -209,11 +209,10 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
 
 def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
     """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
-    from neurocal_cli.commands.show.camera_report import align
+    from neurocal_cli.commands.show.text import align, joined
 
     if not is_terminal(sys.stdout):
-        blocks = [*map(align, tables), *([below] if below else [])]
-        click.echo("\n\n".join("\n".join(block) for block in blocks))
+        click.echo(joined(*map(align, tables), below))
         return
     from rich.console import Console
     from rich.table import Table

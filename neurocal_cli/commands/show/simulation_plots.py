@@ -52,6 +52,9 @@ def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kin
 
 
 def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bool) -> None:
+    """Draw each method's rms error of one parameter over the noise, and the bounds."""
+    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+
     p = study.names.index(name)
     bounds = {method: one.bound[p] for method, one in study.methods.items() if one.bound[p] > 0}
     widest = max(bounds.values(), default=0.0)
@@ -73,19 +76,13 @@ def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bo
     style(axes, name)
     axes.set(xlabel="noise sigma [px]", ylabel=f"rms error [{unit}]".replace("$", r"\$"))
     axes.grid(True, which="minor", color="0.95", linewidth=0.4)
-    _plain_ticks(axes, study.sigma)
+    axes.xaxis.set_major_locator(FixedLocator(study.sigma.tolist()))
+    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     if legend:
         axes.legend(frameon=False, fontsize=8, loc="upper left")
     elif told:
         axes.legend(*zip(*told, strict=True), frameon=False, fontsize=8, loc="lower right")
-
-
-def _plain_ticks(axes: Axes, values: np.ndarray) -> None:
-    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
-
-    axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
-    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_starts(axes: Axes, starts: StartStudy) -> None:
@@ -136,6 +133,7 @@ def _draw_grid(
     colours: str,
     limits: tuple[float, float],
 ) -> None:
+    """Draw a coloured square with a text for each pair of rates, and a frame about the default ones."""
     from matplotlib.patches import Rectangle
 
     axes.imshow(values, origin="lower", cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto")
