@@ -1,4 +1,4 @@
-"""``neurocal evaluate``: how good a result is: a camera by reprojection, two cameras by triangulation."""
+"""``neurocal evaluate``: the error of a camera by reprojection, and of two cameras by triangulation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
+from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
@@ -47,7 +47,7 @@ def evaluate() -> None:
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
-@plot_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
+@panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
@@ -84,13 +84,23 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         from neurocal_cli.commands.show.plot_pages import draw_camera
 
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
-    _tell(evaluation)
-    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables, verdict_lines
+    renamed = evaluation.renamed
+    for names, why in (
+        ([name for name in evaluation.fitted_views if name not in renamed], "not in the calibration"),
+        (renamed, "other points than the calibration has under this name"),
+    ):
+        if names:
+            note(f"{first_of(names)}: {why}; the pose is fitted with the intrinsic parameters fixed")
+    if evaluation.on_target:
+        note("the points are taken where the calibration found them, not where their file has them")
+    warn(*evaluation.warnings)
+    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.text import verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:
-        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+        show(evaluation_tables(evaluation), verdict_lines(verdict))
 
 
 def _evaluate_camera(
@@ -110,20 +120,6 @@ def _evaluate_camera(
     if verdict is not None and points is not None:
         verdict = judged_by_points(verdict, camera, evaluation.given_points)
     return evaluation, verdict, camera
-
-
-def _tell(evaluation: CameraEvaluation) -> None:
-    renamed = evaluation.renamed
-    new = tuple(name for name in evaluation.fitted_views if name not in renamed)
-    for names, why in (
-        (new, "not in the calibration"),
-        (renamed, "other points than the calibration has under this name"),
-    ):
-        if names:
-            note(f"{first_of(names)}: {why}; the pose is fitted with the intrinsic parameters fixed")
-    if evaluation.on_target:
-        note("the points are taken where the calibration found them, not where their file has them")
-    warn(*evaluation.warnings)
 
 
 @evaluate.command(cls=options.Command)
@@ -148,7 +144,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
     "takes the middle between the two rays.",
     default="optimal",
 )
-@plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
+@panel_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
     cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, plots: Plots, as_json: bool
@@ -190,21 +186,22 @@ def stereo(
         raise UsageError(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
-    preparation.check_one_stdin(*cameras, *(points or ()))
+    inputs = *cameras, *(points or ())
+    preparation.check_one_stdin(*inputs)
     check_plots(plots)
-    preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    preparation.check_outputs((file for _, file in plots), inputs)
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
-    from neurocal_cli.commands.show.camera_report import verdict_lines
     from neurocal_cli.commands.show.rig_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
     )
+    from neurocal_cli.commands.show.text import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -216,13 +213,13 @@ def stereo(
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
-        verdict = evaluation.verdict
-        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+        show(stereo_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
 
 
 def _evaluate_stereo(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
 ) -> tuple[StereoEvaluation, Rig | None]:
+    """Evaluate the rig of a file, or two calibrations, of which no rig is known."""
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
 
     if len(cameras) == 1:
