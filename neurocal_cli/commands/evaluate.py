@@ -13,11 +13,9 @@ from neurocal_cli.commands.streams import first_of, note, print_summary, show, w
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.calibration import Calibration, Verdict
-    from neurocal_cli.calibration.evaluation import CameraEvaluation
+    from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
     from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
 
@@ -78,7 +76,20 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (calibration, points))
     given = None if points is None else preparation.given_points(points)
-    evaluation, verdict, judged = _evaluate_camera(calibration, given)
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.verdict.assessment import assess
+    from neurocal_cli.calibration.verdict.given_points import judged_by_points
+    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.text import verdict_lines
+
+    judged, seen = preparation.calibration_or_camera(calibration, given)
+    evaluation = evaluate_camera(judged, seen)
+    verdict = None
+    if isinstance(judged, Calibration):
+        verdict = assess(judged)
+        if verdict is not None and given is not None:
+            verdict = judged_by_points(verdict, judged, evaluation.given_points)
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
@@ -94,32 +105,10 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
-    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
-    from neurocal_cli.commands.show.text import verdict_lines
-
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:
         show(evaluation_tables(evaluation), verdict_lines(verdict))
-
-
-def _evaluate_camera(
-    name: str, points: Correspondences | None
-) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
-    """Evaluate a calibration or, if points are given, any camera file, with all poses fitted."""
-    from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.evaluation import evaluate_camera
-    from neurocal_cli.calibration.verdict.assessment import assess
-    from neurocal_cli.calibration.verdict.given_points import judged_by_points
-
-    camera, points = preparation.calibration_or_camera(name, points)
-    evaluation = evaluate_camera(camera, points)
-    if not isinstance(camera, Calibration):
-        return evaluation, None, camera
-    verdict = assess(camera)
-    if verdict is not None and points is not None:
-        verdict = judged_by_points(verdict, camera, evaluation.given_points)
-    return evaluation, verdict, camera
 
 
 @evaluate.command(cls=options.Command)

@@ -25,9 +25,10 @@ TYPED = "neurocal.typed"  # key of the words of the command line in click's cont
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
 _NOT_CONVERGED = 3  # exit status
-T = TypeVar("T")
 _PATIENCE = 0.5  # seconds after which the bar appears
 _WIDEST = 10_000  # characters; no table is wider
+
+T = TypeVar("T")
 
 
 class _ClosedOutput(io.RawIOBase):

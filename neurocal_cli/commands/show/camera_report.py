@@ -14,6 +14,7 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Table,
     align,
     align_views,
     joined,
@@ -65,7 +66,7 @@ def calibration_report(calibration: Calibration) -> str:
     )
 
 
-def parameter_rows(calibration: Calibration) -> list[list[str]]:
+def parameter_rows(calibration: Calibration) -> Table:
     """Rows of the intrinsic parameters, and of the pose if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
     for name, value in parameters(calibration).items():
@@ -231,7 +232,7 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
     }
 
 
-def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
+def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
     """Rows, the heading first, of the table of all points and of the table of views."""
     e = evaluation
     overall = [

@@ -11,14 +11,20 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.show.text import align, joined, number, number_or_none, parameters, rounded
+from neurocal_cli.commands.show.text import (
+    Table,
+    align,
+    joined,
+    number,
+    number_or_none,
+    parameters,
+    rounded,
+)
 from neurocal_cli.simulation.comparison import Compared, Comparison
 from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.scenes import SimulatedScene
 from neurocal_cli.simulation.starts import StartStudy
-
-Table = list[list[str]]
 
 FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
 # The errors in the paper's Table 1, calibrated minus true.

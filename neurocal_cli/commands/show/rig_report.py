@@ -13,6 +13,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Table,
     align,
     align_views,
     joined,
@@ -57,7 +58,7 @@ def pair_name(left: str, right: str) -> str:
     return printable(left if left == right else f"{left} / {right}")
 
 
-def camera_rows(rig: Rig) -> list[list[str]]:
+def camera_rows(rig: Rig) -> Table:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
     rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
@@ -76,7 +77,7 @@ def camera_rows(rig: Rig) -> list[list[str]]:
     return rows
 
 
-def rig_rows(rig: Rig) -> list[list[str]]:
+def rig_rows(rig: Rig) -> Table:
     """Rows of the pose of the right camera and the baseline, with their standard deviations."""
     rows = [["X_right = R X_left + t", "value", "std"]]
     length = printable(rig.unit)
@@ -150,7 +151,7 @@ def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
     ]
 
 
-def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
+def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
     """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit
     ways, heads = [evaluation.by_view], ["poses of each view"]

@@ -17,6 +17,9 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
 
+Table = list[list[str]]
+"""Rows of cells, the heading first."""
+
 UNITS = dict.fromkeys(INTRINSIC_NAMES, "px") | {"theta": "rad"}
 """Of the intrinsic parameters; the coefficients of the distortion have none."""
 

@@ -14,6 +14,7 @@ from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show.camera_report import target_json, target_lines
 from neurocal_cli.commands.show.text import (
     UNITS,
+    Table,
     align,
     joined,
     labelled,
@@ -66,7 +67,7 @@ def _camera_errors(lens: ZoomLens) -> str:
     return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
 
 
-def _network_rows(lens: ZoomLens) -> list[list[str]]:
+def _network_rows(lens: ZoomLens) -> Table:
     """What each network learnt: its hidden units, and the range and the uncertainty of its parameter."""
     prediction = lens.predict(lens.settings)
     rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
@@ -129,7 +130,7 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], ver
     )
 
 
-def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
+def _baseline_rows(evaluation: LensEvaluation) -> Table:
     """A row for each baseline: fitted one parameter at a time, and jointly."""
     rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
     baselines = evaluation.baselines
