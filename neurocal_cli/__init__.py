@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+# The modules of the names, in alphabetical order as below.
 _HOMES = {
-    "ZoomLens": "calibration.zoom.zoom_lens",
     "Board": "observations.board",
     "Calibration": "calibration.calibration",
     "Camera": "camera.camera",
@@ -51,6 +51,7 @@ _HOMES = {
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
     "Rig": "calibration.rig.rig",
+    "ZoomLens": "calibration.zoom.zoom_lens",
     "calibrate": "calibration.calibrate",
     "calibrate_stereo": "calibration.rig.calibrate_stereo",
     "camera_at": "calibration.zoom.zoom_lens",

@@ -29,7 +29,9 @@ def main() -> None:
         stand_in_for_closed_stdout()
         neurocal(prog_name="neurocal")
     except KeyboardInterrupt:  # pressed while modules are still being loaded
-        sys.exit(_interrupted())
+        if sys.stderr is not None:
+            sys.stderr.write("Error: interrupted\n")
+        sys.exit(130)
     finally:
         # Python takes some ms to end, in which an interrupt would kill it whatever its exit status is. One
         # that has just come is raised by the first of the two calls.
@@ -39,13 +41,6 @@ def main() -> None:
         # It also kills itself at its end if an interrupt came while a text was evaluated, as some modules do
         # when they are loaded, even if the interrupt was handled. The next evaluation makes it forget that.
         eval("0")
-
-
-def _interrupted() -> int:
-    """Say so where the commands cannot, and return the exit status."""
-    if sys.stderr is not None:
-        sys.stderr.write("Error: interrupted\n")
-    return 130
 
 
 if __name__ == "__main__":

@@ -5,14 +5,14 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
 from neurocal_cli.commands.streams import print_summary
 
 
 @click.command(cls=options.Command)
 @options.argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
 @options.count("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
-@options.plot("the outlines of these views")
+@plot_option("the outlines of these views")
 @options.json
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
     """Advise which views of the target to photograph next.
@@ -32,7 +32,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    options.check_plot(plot)
+    check_plot(plot)
     preparation.check_outputs((plot,), (calibration,))
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines

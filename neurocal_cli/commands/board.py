@@ -90,6 +90,7 @@ def board(
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:
+    """Warn of a board that is hard to detect, and describe what was written."""
     cols, rows = target.planes[0].cols, target.planes[0].rows
     if len(target.planes) == 1 and (cols - rows) % 2 == 0:
         warn(

@@ -6,7 +6,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 
@@ -15,7 +15,7 @@ from neurocal_cli.commands.streams import ProgressBar, conclude, warn
 @options.points
 @estimation_options()
 @options.camera_name
-@plot_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
+@panel_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
 @options.lean
 @options.summary

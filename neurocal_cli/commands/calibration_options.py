@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 # Options of back-propagation only, and their names in `BackpropOptions`.
 _BACKPROP = {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}
 
-# Options that are arguments of `methods.calibrate` with the same name and value.
+# Options that are arguments of `calibrate` with the same name and value.
 _SAME = ("method", "trainer", "distortion", "outliers", "target", "seed", "starts")
 
 
@@ -90,9 +90,11 @@ class Estimation:
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
+            from neurocal_cli.calibration.calibration import Calibration
+
             points, camera = preparation.given_camera(self.intrinsics, points)
             arguments["intrinsics"] = camera
-            if not getattr(camera, "known_covariance", ((), None))[0]:
+            if not (isinstance(camera, Calibration) and camera.known_covariance[0]):
                 _note_exact(f"{self.intrinsics} does not say how accurate its camera is, so it")
         elif self.extrinsics is not None:
             from neurocal_cli.files.calibration_tree import read_extrinsics

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, UsageError, plural
 from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
@@ -139,51 +138,7 @@ def convert(
     if as_json:
         print_summary(summary)
     elif not isinstance(found, CameraSet):
-        say(f"{len(found)} points of {found.n_views} view{'s' * (found.n_views != 1)}")
-
-
-def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
-    """Write points; return the summary for programs."""
-    from neurocal_cli.files.exchange.corner_texts import corner_text, points_lost
-
-    text = corner_text(points, target, os.path.splitext(output)[1].lower())
-    losses, remarks = points_lost(points, target)
-    note(*remarks)
-    warn(*losses)
-    write_whole(output, text)
-    counts = {"n_points": len(points), "n_views": points.n_views}
-    return {"to": target, **counts, "warnings": [*losses, *remarks]}
-
-
-def _write_cameras(
-    cameras: CameraSet, target: str, model: str | None, force: bool, output: str
-) -> dict[str, Any]:
-    """Write cameras; return the summary for programs."""
-    from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
-    from neurocal_cli.files.exchange.reading import FORMATS
-
-    wanted = FORMATS[target]
-    adapted = adapt_cameras(cameras, wanted, force, model)
-    contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
-    _write(contents, output, target)
-    note(*adapted.remarks)
-    warn(*adapted.losses)
-    written = [
-        {
-            "name": camera.name,
-            "distortion": camera.distortion.model,
-            "image_size": camera.image_size,
-            "moved": None if moved is None else asdict(moved),
-        }
-        for camera, moved in zip(adapted.cameras.cameras, adapted.moved, strict=True)
-    ]
-    return {
-        "from": cameras.program,
-        "to": target,
-        "cameras": written,
-        "n_views": len(adapted.cameras.poses),
-        "warnings": [*adapted.losses, *adapted.remarks],
-    }
+        say(f"{len(found)} points of {plural(found.n_views, 'view')}")
 
 
 def _read(
@@ -226,14 +181,54 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
     return cameras
 
 
-def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
+def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
+    """Write points; return the summary for programs."""
+    from neurocal_cli.files.exchange.corner_texts import corner_text, points_lost
+
+    text = corner_text(points, target, os.path.splitext(output)[1].lower())
+    losses, remarks = points_lost(points, target)
+    note(*remarks)
+    warn(*losses)
+    write_whole(output, text)
+    counts = {"n_points": len(points), "n_views": points.n_views}
+    return {"to": target, **counts, "warnings": [*losses, *remarks]}
+
+
+def _write_cameras(
+    cameras: CameraSet, target: str, model: str | None, force: bool, output: str
+) -> dict[str, Any]:
+    """Write cameras; return the summary for programs."""
+    from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
+    from neurocal_cli.files.exchange.reading import FORMATS
+
+    wanted = FORMATS[target]
+    adapted = adapt_cameras(cameras, wanted, force, model)
+    contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
     if set(contents) == {""}:
         write_whole(output, contents[""])
-        return
-    if output == "-" or (os.path.exists(output) and not os.path.isdir(output)):
-        raise UsageError(f"--to {target} writes {len(contents)} files here; give a folder, -o DIR")
-    make_folder(output)
-    places = {os.path.join(output, name): text for name, text in contents.items()}
-    check_places(*places)
-    for place, text in places.items():
-        write_whole(place, text)
+    else:
+        if output == "-" or (os.path.exists(output) and not os.path.isdir(output)):
+            raise UsageError(f"--to {target} writes {len(contents)} files here; give a folder, -o DIR")
+        make_folder(output)
+        places = {os.path.join(output, name): text for name, text in contents.items()}
+        check_places(*places)
+        for place, text in places.items():
+            write_whole(place, text)
+    note(*adapted.remarks)
+    warn(*adapted.losses)
+    written = [
+        {
+            "name": camera.name,
+            "distortion": camera.distortion.model,
+            "image_size": camera.image_size,
+            "moved": None if moved is None else asdict(moved),
+        }
+        for camera, moved in zip(adapted.cameras.cameras, adapted.moved, strict=True)
+    ]
+    return {
+        "from": cameras.program,
+        "to": target,
+        "cameras": written,
+        "n_views": len(adapted.cameras.poses),
+        "warnings": [*adapted.losses, *adapted.remarks],
+    }

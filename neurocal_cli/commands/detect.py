@@ -136,7 +136,14 @@ def detect(
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
     target = _measured(board.read())
-    wanted = _wanted(target, points, gamma, overlay, cache)
+    from neurocal_cli.detection.batch import DetectionCache, DetectionOptions
+    from neurocal_cli.files.board_yaml import format_board
+
+    kind, known = cast("Points", points), None
+    if cache is not None:
+        preparation.check_folder("--cache", cache)
+        known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(target)}")
+    wanted = DetectionOptions(target, kind, gamma, overlay is not None, debugging(), known)
     if watch is None:
         outcomes = _examined(images, wanted, board.file, output, overlay, jobs, frames)
     else:
@@ -148,7 +155,10 @@ def detect(
 
     text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
     if overlay is not None:
-        _write_overlays(outcomes, overlay)
+        make_folder(overlay)
+        for name, outcome in outcomes.items():
+            if outcome.overlay is not None:
+                write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
     write_whole(output, text)
 
 
@@ -164,20 +174,6 @@ def _measured(board: Board | None) -> Board:
             f"{100 * scale.std:.2g} %{said}"
         )
     return board.as_measured()
-
-
-def _wanted(
-    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None
-) -> DetectionOptions:
-    from neurocal_cli.detection.batch import DetectionCache, DetectionOptions
-    from neurocal_cli.files.board_yaml import format_board
-
-    kind = cast("Points", points)
-    known = None
-    if cache is not None:
-        preparation.check_folder("--cache", cache)
-        known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
-    return DetectionOptions(board, kind, gamma, overlay is not None, debugging(), known)
 
 
 def _examined(
@@ -197,7 +193,10 @@ def _examined(
     preparation.check_outputs((output,), (*given, board_file))
     with videos_as_frames(given, frames) as (paths, folder):
         names = view_names(paths)
-        note(*_mixed_sizes(paths))
+        sizes = Counter(size for size in stated_sizes(paths) if size is not None)
+        if len(sizes) > 1 and sizes.most_common(2)[1][1] >= _SECOND:
+            counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))
+            note(f"the images have {len(sizes)} sizes ({counts}); those of one camera have one")
         if overlay is not None:
             preparation.check_folder("--overlay", overlay)
             folders = {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}
@@ -223,40 +222,6 @@ def _watched(
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
     preparation.check_outputs((output,), outcomes)
     return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
-
-
-def _write_overlays(outcomes: Mapping[str, Outcome], folder: str) -> None:
-    make_folder(folder)
-    for name, outcome in outcomes.items():
-        if outcome.overlay is not None:
-            write_whole(os.path.join(folder, f"{name}.png"), outcome.overlay)
-
-
-def _mixed_sizes(paths: Sequence[str]) -> list[str]:
-    """Warn of images of different sizes before any work, because one camera has one image size."""
-    sizes = Counter(size for size in stated_sizes(paths) if size is not None)
-    if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
-        return []
-    counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))
-    return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
-
-
-def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
-    """Warn of images that were turned differently: each way of turning has its own image centre."""
-    from neurocal_cli.files.images import BY_EXIF
-
-    turns = Counter(
-        next((text.split(BY_EXIF)[0] for text in outcome.notes if BY_EXIF in text), "as stored")
-        for outcome in outcomes
-    )
-    if len(turns) < 2:
-        return []
-    counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
-    return [
-        f"the images have different EXIF orientations ({counts}), so their image centres differ although "
-        "they may be of one camera; remove the orientation from all files, for example with `exiftool "
-        "-Orientation= FILE`, and detect again"
-    ]
 
 
 def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> None:
@@ -291,6 +256,24 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
             f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
             f"{summary['n_rejected']} rejected"
         )
+
+
+def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
+    """Warn of images that were turned differently: each way of turning has its own image centre."""
+    from neurocal_cli.files.images import BY_EXIF
+
+    turns = Counter(
+        next((text.split(BY_EXIF)[0] for text in outcome.notes if BY_EXIF in text), "as stored")
+        for outcome in outcomes
+    )
+    if len(turns) < 2:
+        return []
+    counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())
+    return [
+        f"the images have different EXIF orientations ({counts}), so their image centres differ although "
+        "they may be of one camera; remove the orientation from all files, for example with `exiftool "
+        "-Orientation= FILE`, and detect again"
+    ]
 
 
 def _shown(outcome: Outcome) -> tuple[int, int] | None:

@@ -1,4 +1,4 @@
-"""``neurocal evaluate``: how good a result is: a camera by reprojection, two cameras by triangulation."""
+"""``neurocal evaluate``: the error of a camera by reprojection, and of two cameras by triangulation."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import Plots, check_plots, plot_option, write_plots
+from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.calibration import Calibration, Verdict
-    from neurocal_cli.calibration.evaluation import CameraEvaluation
+    from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
     from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
 
@@ -47,7 +45,7 @@ def evaluate() -> None:
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
-@plot_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
+@panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
@@ -78,45 +76,28 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     check_plots(plots)
     preparation.check_outputs((file for _, file in plots), (calibration, points))
     given = None if points is None else preparation.given_points(points)
-    evaluation, verdict, judged = _evaluate_camera(calibration, given)
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.verdict.assessment import assess
+    from neurocal_cli.calibration.verdict.given_points import judged_by_points
+    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.text import verdict_lines
+
+    judged, seen = preparation.calibration_or_camera(calibration, given)
+    evaluation = evaluate_camera(judged, seen)
+    verdict = None
+    if isinstance(judged, Calibration):
+        verdict = assess(judged)
+        if verdict is not None and given is not None:
+            verdict = judged_by_points(verdict, judged, evaluation.given_points)
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
 
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
-    _tell(evaluation)
-    from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables, verdict_lines
-
-    if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
-    else:
-        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
-
-
-def _evaluate_camera(
-    name: str, points: Correspondences | None
-) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
-    """Evaluate a calibration or, if points are given, any camera file, with all poses fitted."""
-    from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.evaluation import evaluate_camera
-    from neurocal_cli.calibration.verdict.assessment import assess
-    from neurocal_cli.calibration.verdict.given_points import judged_by_points
-
-    camera, points = preparation.calibration_or_camera(name, points)
-    evaluation = evaluate_camera(camera, points)
-    if not isinstance(camera, Calibration):
-        return evaluation, None, camera
-    verdict = assess(camera)
-    if verdict is not None and points is not None:
-        verdict = judged_by_points(verdict, camera, evaluation.given_points)
-    return evaluation, verdict, camera
-
-
-def _tell(evaluation: CameraEvaluation) -> None:
     renamed = evaluation.renamed
-    new = tuple(name for name in evaluation.fitted_views if name not in renamed)
     for names, why in (
-        (new, "not in the calibration"),
+        ([name for name in evaluation.fitted_views if name not in renamed], "not in the calibration"),
         (renamed, "other points than the calibration has under this name"),
     ):
         if names:
@@ -124,6 +105,10 @@ def _tell(evaluation: CameraEvaluation) -> None:
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
+    if as_json:
+        print_summary(evaluation_json(evaluation, verdict))
+    else:
+        show(evaluation_tables(evaluation), verdict_lines(verdict))
 
 
 @evaluate.command(cls=options.Command)
@@ -148,7 +133,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
     "takes the middle between the two rays.",
     default="optimal",
 )
-@plot_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
+@panel_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
     cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, plots: Plots, as_json: bool
@@ -190,21 +175,22 @@ def stereo(
         raise UsageError(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
-    preparation.check_one_stdin(*cameras, *(points or ()))
+    inputs = *cameras, *(points or ())
+    preparation.check_one_stdin(*inputs)
     check_plots(plots)
-    preparation.check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    preparation.check_outputs((file for _, file in plots), inputs)
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
     if plots:
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
-    from neurocal_cli.commands.show.camera_report import verdict_lines
     from neurocal_cli.commands.show.rig_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
     )
+    from neurocal_cli.commands.show.text import verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -216,13 +202,13 @@ def stereo(
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
-        verdict = evaluation.verdict
-        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
+        show(stereo_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
 
 
 def _evaluate_stereo(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
 ) -> tuple[StereoEvaluation, Rig | None]:
+    """Evaluate the rig of a file, or two calibrations, of which no rig is known."""
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
 
     if len(cameras) == 1:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line, say
-from neurocal_cli.errors import FormatError, NeurocalError
+from neurocal_cli.errors import FormatError, NeurocalError, plural
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,6 +40,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 
 
 def _frames(path: str, folder: str, most: int) -> list[str]:
+    """Choose frames of a video, and write them to a folder; their files."""
     from neurocal_cli.detection.batch import choose_frames
     from neurocal_cli.files.images import frame_rate, save_frame, video_frames
 
@@ -131,6 +132,7 @@ def _whole(
 
 
 def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) -> None:
+    """Report on a new image: what is wrong with it, or the verdict so far and the view to take next."""
     alike = of_one_size(outcomes)
     outcome = alike[path]
     if outcome.detection is None:
@@ -139,11 +141,10 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
     found = detections(alike)
     from neurocal_cli.calibration.advice import advise
     from neurocal_cli.calibration.calibrate import calibrate
-    from neurocal_cli.commands.show.advice import advice_lines
+    from neurocal_cli.commands.show.advice import advised_views
     from neurocal_cli.detection.detect import gather
 
-    views = "1 view" if len(found) == 1 else f"{len(found)} views"
-    head = f"{os.path.basename(path)}: {len(outcome.detection.ids)} points, {views}"
+    head = f"{os.path.basename(path)}: {len(outcome.detection.ids)} points, {plural(len(found), 'view')}"
     try:
         calibration = calibrate(gather(found, options.board.unit))
         verdict = calibration.verdict
@@ -151,6 +152,6 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
         say(one_line(f"{head}: rms {calibration.rmse_px:.3g} px{word}"))
         for reason in () if verdict is None else verdict.reasons:
             say(one_line(f"  reason: {reason}"))
-        say(one_line(f"  next: {advice_lines(advise(calibration, 1))[1].partition('. ')[2]}"))
+        say(one_line(f"  next: {advised_views(advise(calibration, 1))[0]}"))
     except NeurocalError as error:
         say(one_line(f"{head}: no camera yet: {error}"))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
 
-_MOST_UNITS = 20
-
+_MOST_UNITS = 20  # of a layer
+# Options that change nothing on known cameras.
 _OF_POINTS = ("distortion", "training", "camera", "outliers", "no_skew", "target")
 
 _LENS = options.argument(
@@ -88,7 +88,7 @@ def lens() -> None:
     default="auto",
 )
 @options.seed
-@options.plot("each parameter over the settings, with its uncertainty, and the errors")
+@plot_option("each parameter over the settings, with its uncertainty, and the errors")
 @options.summary
 @options.output("LENS.yaml", "Write the lens to this file.")
 def fit(
@@ -133,7 +133,7 @@ def fit(
     preparation.compute_in_one_thread()
     preparation.check_one_stdin(*points)
     preparation.check_summary(as_json, output)
-    options.check_plot(plot, output)
+    check_plot(plot, output)
     preparation.check_outputs((output, plot), points)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
@@ -231,7 +231,7 @@ def camera(
     "POINTS.csv",
     "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
 )
-@options.plot("the error over the settings, and the errors of the baseline models")
+@plot_option("the error over the settings, and the errors of the baseline models")
 @options.json
 def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
@@ -254,7 +254,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     preparation.check_one_stdin(lens_file, points)
-    options.check_plot(plot)
+    check_plot(plot)
     preparation.check_outputs((plot,), (lens_file, points))
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.judgement import judge_lens

@@ -102,14 +102,19 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     others = [other for other in names if other != name]
     children = [child for child in list(_walk(ctx))[1:] if not isinstance(child.command, click.Group)]
     commands = [(child.command_path, _split_help(child.command.help or "")[0]) for child in children]
+    arguments = options.arguments(ctx.command)
+    words = [rf"\fB{_escape(ctx.command_path)}\fR", r"[\fIOPTIONS\fR]"]
+    words += [rf"\fI{_escape(name)}\fR" for name, _ in arguments]
+    if isinstance(ctx.command, click.Group):
+        words.append(r"\fICOMMAND\fR ...")
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
         *_section("NAME", _wrap(rf"{_escape(name)} \- {_escape(brief)}")),
-        *_section("SYNOPSIS", _synopsis(ctx)),
+        *_section("SYNOPSIS", [" ".join(words)]),
         *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
         *_section("COMMANDS", _terms(commands)),
-        *_section("ARGUMENTS", _terms(options.arguments(ctx.command))),
+        *_section("ARGUMENTS", _terms(arguments)),
         *_section("OPTIONS", _terms(_options(ctx))),
         *_section("EXAMPLES", _verbatim(examples)),
         *_section("EXIT STATUS", _terms(_EXIT_STATUS)),
@@ -129,14 +134,6 @@ def _split_help(text: str) -> tuple[str, list[str], list[str]]:
     return " ".join(paragraphs[0].split()), others, lines
 
 
-def _synopsis(ctx: click.Context) -> list[str]:
-    words = [rf"\fB{_escape(ctx.command_path)}\fR", r"[\fIOPTIONS\fR]"]
-    words += [rf"\fI{_escape(name)}\fR" for name, _ in options.arguments(ctx.command)]
-    if isinstance(ctx.command, click.Group):
-        words.append(r"\fICOMMAND\fR ...")
-    return [" ".join(words)]
-
-
 def _options(ctx: click.Context) -> list[tuple[str, str]]:
     """Each option with its values, its help and its default."""
     rows = []
@@ -144,15 +141,11 @@ def _options(ctx: click.Context) -> list[tuple[str, str]]:
         if isinstance(option, click.Option) and not option.hidden:
             head = ", ".join(option.opts)
             bare = option.is_flag or option.count
-            values = "" if bare else f" {option.metavar or _choices(option)}"
-            rows.append((head + values, f"{option.help} {_default(option)}".strip()))
+            choices = option.type.choices if isinstance(option.type, click.Choice) else ()
+            values = option.metavar or "|".join(map(str, choices)) or option.type.name.upper()
+            text = f"{option.help} {_default(option)}".strip()
+            rows.append((head if bare else f"{head} {values}", text))
     return rows
-
-
-def _choices(option: click.Option) -> str:
-    if isinstance(option.type, click.Choice):
-        return "|".join(str(choice) for choice in option.type.choices)
-    return option.type.name.upper()
 
 
 def _default(option: click.Option) -> str:
@@ -164,10 +157,12 @@ def _default(option: click.Option) -> str:
 
 
 def _section(title: str, body: list[str]) -> list[str]:
+    """A section without a paragraph break under its heading; nothing without a body."""
     return [f".SH {title}", *(body[1:] if body[:1] == [".PP"] else body)] if body else []
 
 
 def _prose(paragraphs: list[str]) -> list[str]:
+    """Paragraphs as running text, or line by line where click's mark says so."""
     lines: list[str] = []
     for paragraph in paragraphs:
         if paragraph.startswith("\b\n"):

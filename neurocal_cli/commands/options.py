@@ -6,7 +6,6 @@ Commands use them as ``@options.path(...)``, so that options with the same meani
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial, wraps
@@ -17,7 +16,6 @@ from click.core import ParameterSource
 from click.types import FloatParamType
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.commands.show.figure import check_available
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
 
@@ -25,8 +23,6 @@ if TYPE_CHECKING:
     from neurocal_cli.observations.board import Board
 
 NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
-
-_PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -105,14 +101,6 @@ class FiniteNumber(FloatParamType):
         if self._positive and number <= 0:
             self.fail(f"{value!r} is not greater than 0.", param, ctx)
         return number
-
-
-def _method_names(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
-    """Names of methods, separated by commas, without repetitions."""
-    names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
-    if not names or any(name not in METHODS for name in names):
-        raise click.BadParameter(f"{value!r} is not a list of {', '.join(METHODS)}.")
-    return names
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -302,10 +290,17 @@ def check_alpha(alpha: float | None) -> None:
 
 def methods(default: str) -> Callable[[F], F]:
     """Add ``--methods``, the methods to compare."""
+
+    def parse(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+        if not names or any(name not in METHODS for name in names):
+            raise click.BadParameter(f"{value!r} is not a list of {', '.join(METHODS)}.")
+        return names
+
     return click.option(
         "--methods",
         metavar="M,...",
-        callback=_method_names,
+        callback=parse,
         default=default,
         help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
         "with the paper's trainer.",
@@ -327,7 +322,6 @@ interpolation = choice(
     default="cubic",
 )
 
-
 json = flag("--json", "Print one JSON object instead of tables.", without="print tables", to="as_json")
 
 summary = flag(
@@ -338,21 +332,3 @@ summary = flag(
 )
 
 lean = flag("--lean", "Leave the points, the poses and the network out of the file, so that it is short.")
-
-
-def plot(what: str) -> Callable[[F], F]:
-    """Add ``--plot``, a picture of the result; see `check_plot`."""
-    return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
-
-
-def check_plot(plot: str | None, output: str = "-") -> None:
-    """Refuse a picture that cannot be drawn, before any work is done."""
-    if plot is None:
-        return
-    if not plot.lower().endswith(_PICTURES):
-        raise UsageError(
-            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
-        )
-    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give two different files")
-    check_available()

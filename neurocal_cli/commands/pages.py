@@ -11,7 +11,9 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
+from neurocal_cli.commands.show.figure import check_available
 from neurocal_cli.commands.streams import TYPED
+from neurocal_cli.errors import UsageError
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_whole
 
@@ -19,10 +21,17 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.rig import Rig
 
+_PICTURES = (".png", ".pdf", ".svg")
+
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 
 
-def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
+def plot_option(what: str) -> Callable[[F], F]:
+    """Add ``--plot``, a picture of the result; see `check_plot`."""
+    return options.path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
+
+
+def panel_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
 
     def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
@@ -49,10 +58,23 @@ def plot_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     )
 
 
+def check_plot(plot: str | None, output: str = "-") -> None:
+    """Refuse a picture that cannot be drawn, before any work is done."""
+    if plot is None:
+        return
+    if not plot.lower().endswith(_PICTURES):
+        raise UsageError(
+            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
+        )
+    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
+        raise UsageError("-o and --plot name the same file; give two different files")
+    check_available()
+
+
 def check_plots(plots: Plots, output: str = "-") -> None:
-    """Refuse pictures that cannot be drawn; see `options.check_plot`."""
+    """Refuse pictures that cannot be drawn; see `check_plot`."""
     for _, file in plots:
-        options.check_plot(file, output)
+        check_plot(file, output)
 
 
 def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:

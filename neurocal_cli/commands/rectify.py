@@ -12,7 +12,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, note, print_summary, say, warn
-from neurocal_cli.errors import FormatError, InputError, UsageError
+from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.image_files import find_images, is_image, view_names
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -98,10 +98,18 @@ def rectify(
     if not images:
         options.note_unused("without images", "interpolation", "side_by_side")
     preparation.check_outputs((), (*sides[0], *sides[1]))
-    _check_folders(output, sides)
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
     from neurocal_cli.calibration.rig.rectification import rectified_pair
+    from neurocal_cli.files.exchange.neurocal import as_rig
+    from neurocal_cli.files.exchange.reading import read_cameras
 
-    found = _read_rig(rig)
+    cameras = read_cameras([rig])
+    if (count := len(cameras.cameras)) != 2:
+        raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig of two", rig)
+    found = as_rig(cameras)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
@@ -112,16 +120,6 @@ def rectify(
         work.rectify_points(sides)
     if as_json:
         print_summary(work.summary)
-
-
-def _read_rig(name: str) -> Rig:
-    from neurocal_cli.files.exchange.neurocal import as_rig
-    from neurocal_cli.files.exchange.reading import read_cameras
-
-    cameras = read_cameras([name])
-    if (count := len(cameras.cameras)) != 2:
-        raise FormatError(f"holds {count} camera{'s' * (count != 1)}; give the file of a rig of two", name)
-    return as_rig(cameras)
 
 
 def _sides(files: Sequence[str]) -> _Paths:
@@ -139,14 +137,6 @@ def _sides(files: Sequence[str]) -> _Paths:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
-
-
-def _check_folders(output: str, sides: _Paths) -> None:
-    """Refuse folders of results that are folders of inputs."""
-    for side, paths in zip(_SIDES, sides, strict=True):
-        folder = os.path.realpath(os.path.join(output, side))
-        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
-            raise UsageError(f"{folder} is the folder of the inputs; give another output")
 
 
 @dataclass
@@ -181,7 +171,7 @@ class _Work:
     def tell_rows_of_rig(self) -> None:
         """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.calibration.rig.rectification import row_error_of_rig
-        from neurocal_cli.commands.show.camera_report import number_or_none
+        from neurocal_cli.commands.show.text import number_or_none
 
         self.summary["along"] = self.along
         error = self.own_rows = row_error_of_rig(self.rig, self.pair)
@@ -194,7 +184,7 @@ class _Work:
     def rectify_points(self, sides: _Paths) -> None:
         """Rectify the points of both cameras and write them."""
         from neurocal_cli.calibration.rig.rectification import row_error
-        from neurocal_cli.commands.show.camera_report import number_or_none
+        from neurocal_cli.commands.show.text import number_or_none
         from neurocal_cli.files.points_csv import format_points
 
         if len(sides[0]) > 1:
@@ -242,9 +232,10 @@ class _Work:
         pairs = list(zip(*sides, strict=True))
         done = len(pairs) - len(each_of(pairs, self._rectify_pair, "pairs", "rectified"))
         self.summary["images"] = {"pairs": len(pairs), "rectified": done}
-        self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
+        self._tell(f"rectified {done} of {plural(len(pairs), 'pair')}")
 
     def _rectify_pair(self, pair: tuple[str, str]) -> None:
+        """Rectify two images and write them, and the picture of both if it is wanted."""
         from neurocal_cli.calibration.rig.rectification import pair_picture
         from neurocal_cli.files.images import encode_image, encode_png, read_picture
 

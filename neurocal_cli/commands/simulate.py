@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
 from neurocal_cli.commands.streams import ProgressBar, note, print_summary
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -105,7 +105,7 @@ def _is_number(word: str) -> bool:
     "With --save: also write rendered images of the target, and the exact points that they show.",
     without="points only",
 )
-@options.plot("the errors over the noise and the random starts, or with --rates the rates,")
+@plot_option("the errors over the noise and the random starts, or with --rates the rates,")
 @options.json
 def simulate(
     camera: str | None,
@@ -161,7 +161,7 @@ def simulate(
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
         preparation.check_folder("--save", save)
-    options.check_plot(plot)
+    check_plot(plot)
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
 

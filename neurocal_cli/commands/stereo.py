@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import Plots, check_plots, html_option, plot_option, write_page, write_plots
+from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import RIG_PANELS
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.rig import Rig
 
 
 @click.command(cls=options.Command)
@@ -45,7 +41,7 @@ if TYPE_CHECKING:
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@plot_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
+@panel_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @options.lean
 @options.summary
@@ -134,18 +130,14 @@ def stereo(
 
         write_plots(plots, draw_rig, rig)
     if ros is not None:
-        _write_ros(rig, ros, alpha)
+        from neurocal_cli.files.rig_yaml import format_ros_pair
+
+        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
+            write_whole(name, text)
     warn(*write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
     note(*views_alone(rig.alone))
     conclude(rig, as_json, rig_json, rig_report)
-
-
-def _write_ros(rig: Rig, files: tuple[str, str], alpha: float | None) -> None:
-    from neurocal_cli.files.rig_yaml import format_ros_pair
-
-    for name, text in zip(files, format_ros_pair(rig, alpha), strict=True):
-        write_whole(name, text)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

@@ -25,9 +25,10 @@ TYPED = "neurocal.typed"  # key of the words of the command line in click's cont
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
 _NOT_CONVERGED = 3  # exit status
-T = TypeVar("T")
 _PATIENCE = 0.5  # seconds after which the bar appears
 _WIDEST = 10_000  # characters; no table is wider
+
+T = TypeVar("T")
 
 
 class _ClosedOutput(io.RawIOBase):
@@ -209,11 +210,10 @@ def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str)
 
 def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
     """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
-    from neurocal_cli.commands.show.camera_report import align
+    from neurocal_cli.commands.show.text import align, joined
 
     if not is_terminal(sys.stdout):
-        blocks = [*map(align, tables), *([below] if below else [])]
-        click.echo("\n\n".join("\n".join(block) for block in blocks))
+        click.echo(joined(*map(align, tables), below))
         return
     from rich.console import Console
     from rich.table import Table

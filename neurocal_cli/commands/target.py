@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import write_plot
+from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
 from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.errors import InputError
 
@@ -14,7 +14,7 @@ from neurocal_cli.errors import InputError
 @options.argument(
     "camera", "CAMERA.yaml", "A calibration that `neurocal calibrate` wrote; - is standard input."
 )
-@options.plot("the heights of the board's points and their shifts")
+@plot_option("the heights of the board's points and their shifts")
 @options.summary
 @options.output("BOARD.yaml", "Write the board to this file.")
 def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
@@ -33,7 +33,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
       neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
-    options.check_plot(plot, output)
+    check_plot(plot, output)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output, plot), (camera,))
 

@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:
@@ -80,10 +80,8 @@ def triangulate(
       cat sample_data/matches.csv | neurocal triangulate rig.yaml - > xyz.csv
     """  # noqa: D301 - as in the group
     if len(inputs) not in (2, 3):
-        raise UsageError(
-            f"{len(inputs)} file{'s' * (len(inputs) > 1)} given; give RIG.yaml MATCHES.csv, or LEFT.yaml "
-            "RIGHT.yaml MATCHES.csv"
-        )
+        given = plural(len(inputs), "file")
+        raise UsageError(f"{given} given; give RIG.yaml MATCHES.csv, or LEFT.yaml RIGHT.yaml MATCHES.csv")
     if sigma is not None and sigma > _LARGEST_SIGMA:
         raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
     preparation.check_one_stdin(*inputs)
@@ -96,7 +94,11 @@ def triangulate(
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
     from neurocal_cli.files.triangulation_csv import format_space_points, read_matches
 
-    sigma = _noise(rig) if sigma is None else sigma
+    if sigma is None and math.isnan(rig.sigma):
+        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+        sigma = _USUAL_SIGMA
+    elif sigma is None:
+        sigma = rig.sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
@@ -111,6 +113,7 @@ def triangulate(
 
 
 def _rig(names: tuple[str, ...]) -> Rig:
+    """The rig of the file, or one that is fitted to two calibrations."""
     if len(names) == 1:
         from neurocal_cli.files.rig_yaml import read_rig
 
@@ -122,20 +125,12 @@ def _rig(names: tuple[str, ...]) -> Rig:
 
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)
-    views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
+    views = plural(len(rig.pairs), "view")
     note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
     warn(*rig.warnings)
     if not rig.warnings:
         preparation.warn_of_poor(rig, "; points in space may be far off")
     return rig
-
-
-def _noise(rig: Rig) -> float:
-    """Standard deviation of the rig's own pixels [px], or an assumed one if it does not state any."""
-    if not math.isnan(rig.sigma):
-        return rig.sigma
-    note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
-    return _USUAL_SIGMA
 
 
 class _Tally:
@@ -165,7 +160,7 @@ class _Tally:
 
     def tell(self, as_json: bool) -> None:
         """Report the outcome on stderr, or as JSON on stdout."""
-        parts = [f"{self.points} point{'s' * (self.points != 1)}"]
+        parts = [plural(self.points, "point")]
         if self.off:
             are, lines = ("is", "its epipolar line") if self.off == 1 else ("are", "their epipolar lines")
             parts.append(f"{self.off} of them {are} more than {self.limit:.3g} px off {lines}")
@@ -180,15 +175,12 @@ class _Tally:
         if self.outside:
             warn(f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras")
         if self.off + self.behind > _MANY_OFF * self.points:
-            warn(f"most points are flagged off or behind; {self._fault()}")
+            from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 
-    def _fault(self) -> str:
-        """Why most points do not fit the rig, or what to check."""
-        from neurocal_cli.calibration.rig.triangulation import fault_of_matches
-
-        assert self.first is not None
-        left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]
-        return fault_of_matches(self.rig, left, right, self.limit) or (
-            "check that uL,vL are pixels of the left camera, that the pixels are neither undistorted nor "
-            "rectified, and the order of the matches"
-        )
+            assert self.first is not None
+            left, right = self.first.left[:_SAMPLE], self.first.right[:_SAMPLE]
+            fault = fault_of_matches(self.rig, left, right, self.limit) or (
+                "check that uL,vL are pixels of the left camera, that the pixels are neither undistorted nor "
+                "rectified, and the order of the matches"
+            )
+            warn(f"most points are flagged off or behind; {fault}")

@@ -1,7 +1,4 @@
-"""``neurocal undistort``: remove the lens distortion from images and points.
-
-Undistort the files of ``neurocal undistort`` one by one, and report the loss of field of view.
-"""
+"""``neurocal undistort``: remove the lens distortion from images and points, and report what is lost."""
 
 from __future__ import annotations
 
@@ -9,15 +6,11 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
-from neurocal_cli.calibration.calibration import undistorted_before
-from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.undistortion import Panorama, Undistorted, field_of_view
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import each_of, is_terminal, note, note_once, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
@@ -25,10 +18,12 @@ from neurocal_cli.files.image_files import find_images, is_image
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.remapping import Remapping
-
+    from neurocal_cli.camera.undistortion import Undistorted
 
 _NOT_WRITTEN = (".gif", ".webp", ".jp2", ".heic", ".avif", ".svg", ".pdf")  # pictures, and no folders
+_UNTOLD = 2.0  # degrees of field of view whose loss is not reported
 
 
 @click.command(cls=options.Command)
@@ -137,7 +132,7 @@ def undistort(
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     original = read_intrinsics(camera)
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
-    work = Undistorting(original, view, interpolation, folder, original.image_size)
+    work = _Undistorting(original, view, interpolation, folder, original.image_size)
     failed = work.correct_all(paths, outputs)
     note_once(work.notes)
     if new_camera is not None:
@@ -213,11 +208,8 @@ def _check_distinct(inputs: Iterable[str], results: Iterable[tuple[str, str | No
         taken[place] = source
 
 
-_UNTOLD = 2.0  # degrees of field of view whose loss is not reported
-
-
 @dataclass
-class Undistorting:
+class _Undistorting:
     """One camera with the prepared tables for its images, and the notes for the user."""
 
     camera: Camera
@@ -227,23 +219,21 @@ class Undistorting:
     size: tuple[int, int] | None  # of the images [px], once it is known
     notes: dict[str, list[str]] = field(default_factory=dict)  # remarks about images, and the images
     left_out: int = 0  # number of points that the result cannot show
-    remapping: Remapping | None = None
 
     def new(self) -> Undistorted:
         """The camera of the results, once the size of the images is known."""
         return self.view(self.size)
 
-    def remap(self) -> Remapping:
-        """The tables of images of the known size."""
+    @cached_property
+    def remapping(self) -> Remapping:
+        """The tables of images, once their size is known."""
         from neurocal_cli.camera.remapping import Remapping
 
         if self.size is None:
             raise InputError(
                 "tables need the size of the images; put image_width and image_height into the camera"
             )
-        if self.remapping is None:
-            self.remapping = Remapping(self.camera, self.new(), self.size, self.interpolation)
-        return self.remapping
+        return Remapping(self.camera, self.new(), self.size, self.interpolation)
 
     def correct_all(self, paths: Sequence[str], outputs: Sequence[str]) -> dict[str, str]:
         """Undistort all files; return those that failed, with the reasons. A single file raises."""
@@ -275,12 +265,15 @@ class Undistorting:
 
     def summary(self) -> dict[str, Any]:
         """Summary of the results for programs."""
+        import numpy as np
+
         shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
         camera = {key: np.asarray(value).tolist() for key, value in self._described().items()}
         return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
 
     def write_camera(self, path: str) -> None:
         """Write the camera of the undistorted results."""
+        from neurocal_cli.camera.undistortion import Panorama
         from neurocal_cli.files.camera_tree import format_camera_info, format_panorama
 
         new = self.new()
@@ -293,23 +286,28 @@ class Undistorting:
         """Write the remapping tables, and the camera of the images that they produce."""
         from neurocal_cli.files.exchange.dictionary import npz_bytes
 
-        u, v = self.remap().tables()
+        u, v = self.remapping.tables()
         write_whole(path, npz_bytes({"u": u, "v": v, **self._described()}))
 
     def _fields_of_view(self, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
         """Fields of view of the results and of the images, horizontally and vertically [degrees]."""
+        from neurocal_cli.camera.undistortion import field_of_view
+
         new = self.new()
         whole = field_of_view(self.camera, size)
         return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
 
     def _described(self) -> dict[str, Any]:
         """The camera of the results by the names of its parts."""
+        from neurocal_cli.camera.undistortion import Panorama
+
         new = self.new()
         if isinstance(new, Panorama):
             return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
         return {"projection": "plane", "K": new.A}
 
     def _correct(self, place: tuple[str, str]) -> None:
+        """Undistort a file to its output."""
         path, output = place
         content = self._image(path, output) if is_image(path) else self._points(path)
         if self.folder is not None:
@@ -317,11 +315,12 @@ class Undistorting:
         write_whole(output, content)
 
     def _image(self, path: str, output: str) -> bytes:
+        """Undistort an image; the bytes of a file whose name ends as the output's."""
         from neurocal_cli.files.images import encode_image, read_picture
 
         pixels, source, notes = read_picture(path)
         self.size = self.size or (pixels.shape[1], pixels.shape[0])
-        remapping = self.remap()
+        remapping = self.remapping
         try:
             corrected = remapping(pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
@@ -332,6 +331,8 @@ class Undistorting:
         return content
 
     def _points(self, path: str) -> str:
+        """Undistort a file of points; its text."""
+        from neurocal_cli.calibration.calibration import undistorted_before
         from neurocal_cli.files.points_csv import format_points, read_points
         from neurocal_cli.observations.undistorted_points import map_points, shown
 

@@ -12,13 +12,8 @@ from support.wrong_inputs import corner
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, evaluate_camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.commands.show.camera_report import (
-    align,
-    calibration_report,
-    evaluation_json,
-    evaluation_tables,
-    rounded,
-)
+from neurocal_cli.commands.show.camera_report import calibration_report, evaluation_json, evaluation_tables
+from neurocal_cli.commands.show.text import align, rounded
 
 
 @pytest.mark.parametrize(

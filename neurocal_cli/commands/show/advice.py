@@ -1,7 +1,4 @@
-"""Advice as text and as JSON.
-
-Draw the advised views as outlines in the image, as a guide for taking them.
-"""
+"""Advice as text and as JSON, and as a picture: the views' outlines in the image, a guide for taking them."""
 
 from __future__ import annotations
 
@@ -11,48 +8,33 @@ import numpy as np
 
 from neurocal_cli.calibration.advice import Advice, Candidate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.commands.show.camera_report import number_or_none
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
+from neurocal_cli.commands.show.text import number_or_none
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
 _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
 _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "upper", "upper right")
+_MOST_DOTS = 4000
+_COLOURS = (ACCENT, INK, "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
 
 
 def advice_lines(advice: Advice) -> list[str]:
     """A line for each view, with the uncertainty after it."""
-    lines = [
+    return [
         "largest std of a projected pixel, for points at half to ten times the distance of the views: "
-        f"{_px(advice.before)}"
+        f"{_px(advice.before)}",
+        *(f"{number}. {text}" for number, text in enumerate(advised_views(advice), start=1)),
     ]
-    for number, (view, after) in enumerate(zip(advice.views, advice.after, strict=True), start=1):
-        lines.append(f"{number}. {_described(view)}: {_px(after)}")
-    return lines
 
 
-def advice_json(advice: Advice) -> dict[str, Any]:
-    """The advice as values for JSON."""
-    return {
-        "worst_px": number_or_none(advice.before),
-        "views": [
-            {
-                "position": view.position.tolist(),
-                "width": view.width,
-                "tilt_deg": view.tilt,
-                "nearer_side_deg": view.way,
-                "roll_deg": view.roll,
-                "rotation": view.pose.R.tolist(),
-                "translation": view.pose.t.tolist(),
-                "outline": view.outline.tolist(),
-                "worst_px": number_or_none(after),
-            }
-            for view, after in zip(advice.views, advice.after, strict=True)
-        ],
-    }
+def advised_views(advice: Advice) -> list[str]:
+    """Each advised view in words, with the uncertainty that is left after it."""
+    return [
+        f"{_described(view)}: {_px(after)}" for view, after in zip(advice.views, advice.after, strict=True)
+    ]
 
 
 def _described(view: Candidate) -> str:
@@ -79,9 +61,25 @@ def _px(value: float) -> str:
     return f"{value:.3g} px" if value < float("inf") else "unknown, as the views do not determine the camera"
 
 
-_MOST_DOTS = 4000
-
-_COLOURS = (ACCENT, INK, "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
+def advice_json(advice: Advice) -> dict[str, Any]:
+    """The advice as values for JSON."""
+    return {
+        "worst_px": number_or_none(advice.before),
+        "views": [
+            {
+                "position": view.position.tolist(),
+                "width": view.width,
+                "tilt_deg": view.tilt,
+                "nearer_side_deg": view.way,
+                "roll_deg": view.roll,
+                "rotation": view.pose.R.tolist(),
+                "translation": view.pose.t.tolist(),
+                "outline": view.outline.tolist(),
+                "worst_px": number_or_none(after),
+            }
+            for view, after in zip(advice.views, advice.after, strict=True)
+        ],
+    }
 
 
 def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> bytes:

@@ -1,6 +1,6 @@
-"""Panels of a camera: residuals, scatter, coverage, uncertainty, poses, errors by view, learning curve.
+"""Panels of a camera, from residuals to the learning curve, and the picture of an estimated target.
 
-Picture of an estimated target. matplotlib is imported only when a picture is drawn.
+matplotlib is imported only when a picture is drawn.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 _MOST_ARROWS = 500  # more arrows cannot be distinguished
 _MANY_DOTS = 2000  # more dots overlap, and make a large .svg file
 _MOST_BARS = 40  # greatest number of views with room for their names
@@ -36,12 +35,15 @@ _LONGEST_ARROW = 0.04  # greatest length of an rms arrow, as a share of the imag
 _ZERO = 1e-16  # px; shown instead of 0 on a logarithmic axis
 _CELLS = 6  # across and down, as in the verdict
 _MOST_DOTS = 5000
-_LEVELS = 12
+_LEVELS = 12  # of uncertainty
 _FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
-_MOST_NAMES = 8
+_MOST_NAMES = 8  # of views in space
 _SIZE = 0.12  # of a drawn camera, relative to the scene
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 _HERE = Pose(np.eye(3), np.zeros(3))
+_LONGEST = 0.12  # of a target's plane, for the longest arrow
+_HEIGHT_LEVELS = 13
+_WIDTH, _HEIGHT = 5.5, 4.5  # inches of a target's panel
 
 
 @frozen_dataclass
@@ -88,6 +90,7 @@ def set_image(axes: Axes, subject: Subject) -> Array:
 
 
 def _frame(subject: Subject) -> Array:
+    """Left, right, top and bottom of the image or, if its size is unknown, of the points and a margin."""
     if subject.image_size is not None:
         width, height = subject.image_size
         return np.array([-0.5, width - 0.5, -0.5, height - 0.5])
@@ -297,7 +300,7 @@ def _frustum(camera: Camera, size: float) -> Array:
 
 
 def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
-    """Functions that draw the panels of a camera, by their names in `plots.CAMERA_PANELS`."""
+    """Functions that draw the panels of a camera, by their names in `CAMERA_PANELS`."""
     panels = {
         "residuals": draw_residuals,
         "coverage": draw_coverage,
@@ -308,11 +311,6 @@ def panels_of(subject: Subject) -> dict[str, Callable[[Axes], None]]:
         "views": draw_views,
     }
     return {name: partial(draw, subject=subject) for name, draw in panels.items()}
-
-
-_LONGEST = 0.12  # of the plane's size, for the longest arrow
-_HEIGHT_LEVELS = 13
-_WIDTH, _HEIGHT = 5.5, 4.5  # inches of a panel
 
 
 def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
@@ -329,6 +327,7 @@ def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
 
 
 def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axes) -> None:
+    """Draw one plane of a target: the offsets out of it in one panel, those in it in the other."""
     rows = target.plane == plane
     given, offsets = target.given[rows], target.offsets[rows]
     centred = given - given.mean(axis=0)

@@ -1,111 +1,44 @@
-"""Results as plain text and JSON: the summary of a calibration, and the errors of a camera on points.
-
-Values are rounded by their standard deviation: it keeps two significant digits, and the value has the same
-number of decimals, so that no meaningless digit is shown.
-
-A verdict as plain text and as JSON.
-"""
+"""A calibration, its errors on points and the target it found, as text, as rows of tables and as JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Verdict, ViewResult
-from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.commands.show.text import (
+    UNITS,
+    Table,
+    align,
+    align_views,
+    joined,
+    labelled,
+    number_or_none,
+    parameters,
+    printable,
+    rounded,
+    verdict_json,
+    verdict_lines,
+)
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.target import Target, scale_of
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.evaluation import CameraEvaluation
 
-
-# The main measures, in words.
-_FACTS: dict[str, Callable[[float], str]] = {
-    "held_out_px": "cross-validation error {:.3g} px".format,
-    "precision_px": "noise floor {:.3g} px".format,
-    "projection_px": lambda std: f"std of predicted pixels {two_digits(std)} px at most",
-    "depth_share": lambda std: f"std of triangulated depth {100 * std:.2g} % of the depth",
-    "coverage": lambda share: f"{100 * share:.0f} % of the image covered",
-}
-
-
-def verdict_lines(verdict: Verdict) -> list[str]:
-    """Lines of the verdict: the word, the main measures, reasons and advice."""
-    lines = [f"verdict: {verdict.word}"]
-    if found := facts(verdict):
-        lines.append(f"  {found}")
-    lines += [f"  reason: {reason}" for reason in verdict.reasons]
-    lines += [f"  advice: {advice}" for advice in verdict.advice]
-    return lines
-
-
-def verdict_json(verdict: Verdict) -> dict[str, Any]:
-    """Convert a verdict to JSON values; numbers that are not finite become None."""
-    measures = {name: value if math.isfinite(value) else None for name, value in verdict.measures.items()}
-    return {
-        "word": verdict.word,
-        "reasons": list(verdict.reasons),
-        "advice": list(verdict.advice),
-        "measures": measures,
-    }
-
-
-def facts(verdict: Verdict) -> str:
-    """The main measures of a verdict in one line."""
-    m = verdict.measures
-    return ", ".join(text(m[name]) for name, text in _FACTS.items() if math.isfinite(m.get(name, math.nan)))
-
-
-_MOST_VIEWS = 20  # rows of a table that fit on a screen
 _TIED = 1.009  # ratio of cross-validation errors that the choice of the model takes for equal
-_MOST_DECIMALS = 9  # further digits are rounding errors
 _GIVEN = {
     1: "nothing given",
     2: "image centre given",
     3: "intrinsic parameters given",
     4: "extrinsic parameters given",
 }
-
-
-def rounded(value: float, std: float) -> tuple[str, str]:
-    """Format a value and its standard deviation, both to the deviation's second significant digit.
-
-    Examples
-    --------
-    >>> rounded(556.01234, 0.4321)
-    ('556.01', '0.43')
-    >>> rounded(5560.1, 432.1)
-    ('5560', '430')
-    """
-    if not (math.isfinite(value) and math.isfinite(std)) or std <= 0:
-        return f"{value:.7g}", "unknown" if not math.isfinite(std) else "0"
-    decimals = 1 - int(f"{std:.1e}".partition("e")[2])
-    if decimals > _MOST_DECIMALS:
-        return f"{value:.{_MOST_DECIMALS}f}", f"{std:.1e}"
-    places = max(decimals, 0)
-    return f"{round(value, decimals):.{places}f}", f"{round(std, decimals):.{places}f}"
-
-
-def align(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
-    rows = list(rows)
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def calibration_report(calibration: Calibration) -> str:
@@ -116,13 +49,134 @@ def calibration_report(calibration: Calibration) -> str:
         f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
         f"{'image size unknown' if size is None else f'{size[0]} x {size[1]} px'}"
     )
+    views = [
+        (view.rmse_px, [printable(name), str(view.n_points), _pixels(view.rmse_px)])
+        for name, view in calibration.views.items()
+    ]
     fit = [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)]
     if points.distances:
         held = plural(len(points.distances), "measured distance")
         fit.append(f"scale: held by {held}, std {100 * scale_of(points).std:.2g} %")
-    verdict = [] if calibration.verdict is None else verdict_lines(calibration.verdict)
-    blocks = [[headline], align(parameter_rows(calibration)), _view_lines(calibration.views), fit, verdict]
-    return "\n\n".join("\n".join(block) for block in blocks if block)
+    return joined(
+        [headline],
+        align(parameter_rows(calibration)),
+        align_views(["view", "points", "rms [px]"], views, "views"),
+        fit,
+        verdict_lines(calibration.verdict),
+    )
+
+
+def parameter_rows(calibration: Calibration) -> Table:
+    """Rows of the intrinsic parameters, and of the pose if there is only one view."""
+    rows = [["parameter", "value", "std", "relative"]]
+    for name, value in parameters(calibration).items():
+        if name not in rich_lens.NAMES:
+            given = name in calibration.fixed
+            rows.append(_parameter_row(name, UNITS.get(name, ""), value, calibration.std[name], given))
+    if calibration.distortion_model == "rich":
+        rows.append(_displacement_row(calibration))
+    if len(calibration.views) == 1:
+        (view,) = calibration.views.values()
+        values = [*view.pose.euler, *view.pose.t]
+        for name, value in zip(POSE_NAMES, values, strict=True):
+            unit = "rad" if name.startswith("R") else printable(calibration.unit)
+            rows.append(_parameter_row(name, unit, float(value), view.std[name], view.fixed))
+    return rows
+
+
+def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
+    label = labelled(name, unit)
+    if given:
+        return [label, f"{value:.7g}", "fixed", ""]
+    relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"
+    return [label, *rounded(value, std), relative]
+
+
+def _displacement_row(calibration: Calibration) -> list[str]:
+    """One row for all nodes of a rich lens: their largest displacement at the observed points [px]."""
+    rays = calibration.camera.unproject(calibration.points.pixels)
+    k = calibration.distortion[-len(rich_lens.NAMES) :]
+    X, Y, Z = rays[np.isfinite(rays[:, 0])].T
+    d = rich_lens.displacement(k, X, Y, Z, by_coefficients=False)
+    moved = np.hypot(calibration.intrinsics.alpha_u * d.x, calibration.intrinsics.alpha_v * d.y)
+    return ["displacement [px]", f"up to {moved.max(initial=0.0):.2g}", f"{len(rich_lens.NODES)} nodes", ""]
+
+
+def _training_lines(calibration: Calibration) -> list[str]:
+    """The error, and how the calibration came to it."""
+    rejected = f", {plural(calibration.n_rejected, 'outlier')} rejected" if calibration.n_rejected else ""
+    lines = [
+        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, "
+        f"maximum {_pixels(calibration.max_px)} px{rejected}"
+    ]
+    if (found := calibration.straight_lines) is not None:
+        u, v = found.centre
+        lines.append(
+            f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
+            f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
+            f"after; centre of distortion ({u:.1f}, {v:.1f})"
+        )
+    if (network := calibration.network) is not None:
+        starts, views = plural(network.starts, "random start"), len(network.V)
+        agreed = (
+            f"networks: {starts} for {views} views, at least {network.agreed} agreed in each view"
+            if views > 1
+            else f"network: {network.agreed} of {starts} agreed"
+        )
+        lines += [
+            f"{agreed}, {plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
+            f"bundle adjustment: rms {_pixels(network.rmse_before)} px before, "
+            f"{_pixels(network.rmse_after)} px after {plural(network.refine_iterations, 'iteration')}",
+        ]
+    if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
+        errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
+        how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
+        lines += [
+            f"distortion model: {calibration.distortion_model}, {how}:",
+            f"  {', '.join(errors)} px",
+        ]
+    return [*lines, calibration.stop_reason]
+
+
+def _among(calibration: Calibration) -> str:
+    """From which models the distortion model was chosen, if one that was excluded has a lower error."""
+    choice, chosen = calibration.lens_choice, calibration.distortion_model
+    error = choice.get(chosen, 0.0)
+    if chosen not in WIDE and any(name in WIDE and other < error for name, other in choice.items()):
+        return " among ordinary lenses, because the points do not decidedly favour a fisheye"
+    if error > _TIED * min(choice.values()):
+        return " among the models that the points support"
+    return ""
+
+
+def calibration_json(calibration: Calibration) -> dict[str, Any]:
+    """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
+    return {
+        "camera_name": calibration.camera_name,
+        "n_points": len(calibration.points),
+        "n_rejected": calibration.n_rejected,
+        "unit": calibration.unit,
+        "type": calibration.type,
+        "method": calibration.method,
+        "distortion": calibration.distortion_model,
+        "parameters": {
+            name: {
+                "value": value,
+                "std": number_or_none(calibration.std.get(name, math.nan)),
+                "fixed": name in calibration.fixed,
+            }
+            for name, value in parameters(calibration).items()
+        },
+        "rmse_px": number_or_none(calibration.rmse_px),
+        "max_px": number_or_none(calibration.max_px),
+        "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
+        "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
+        "target": target_json(calibration.target, calibration.unit),
+        "converged": bool(calibration.converged),
+        "stop_reason": str.__str__(calibration.stop_reason),
+        "warnings": list(calibration.warnings),
+        **verdict_json(calibration.verdict),
+    }
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:
@@ -158,7 +212,27 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     return lines
 
 
-def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
+def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
+    """Convert the estimated target to JSON values; None if it was used as given."""
+    if target is None:
+        return None
+    shift, turn = target.displaced()
+    planes = {"planes_shift": shift, "planes_turn_deg": float(np.degrees(turn))}
+    return {
+        "unit": unit,
+        "flat": bool(target.flat),
+        "bend": number_or_none(float(target.bend())),
+        "stretch": number_or_none(float(target.stretch())),
+        "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
+        "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
+        "n_points": len(target.found),
+        **(planes if target.plane.any() else {}),
+        **({} if target.bends is None else {"bend_of_views_rms": target.bend_of_views()}),
+        **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
+    }
+
+
+def evaluation_tables(evaluation: CameraEvaluation) -> tuple[Table, Table]:
     """Rows, the heading first, of the table of all points and of the table of views."""
     e = evaluation
     overall = [
@@ -183,203 +257,30 @@ def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None
         **{name: number_or_none(getattr(evaluation, name)) for name in names},
         "views": {name: number_or_none(view.rmse_px) for name, view in evaluation.views.items()},
         "fitted_views": list(evaluation.fitted_views),
-        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+        **verdict_json(verdict),
     }
 
 
-def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
-    verdict = calibration.verdict
-    return {
-        "camera_name": calibration.camera_name,
-        "n_points": len(calibration.points),
-        "n_rejected": calibration.n_rejected,
-        "unit": calibration.unit,
-        "type": calibration.type,
-        "method": calibration.method,
-        "distortion": calibration.distortion_model,
-        "parameters": _parameters_json(calibration),
-        "rmse_px": number_or_none(calibration.rmse_px),
-        "max_px": number_or_none(calibration.max_px),
-        "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
-        "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
-        "target": target_json(calibration.target, calibration.unit),
-        "converged": bool(calibration.converged),
-        "stop_reason": str.__str__(calibration.stop_reason),
-        "warnings": list(calibration.warnings),
-        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
-    }
-
-
-def _parameters_json(calibration: Calibration) -> dict[str, Any]:
-    return {
-        name: {
-            "value": value,
-            "std": number_or_none(calibration.std.get(name, math.nan)),
-            "fixed": name in calibration.fixed,
-        }
-        for name, value in _parameters(calibration).items()
-    }
-
-
-def _parameters(calibration: Calibration) -> dict[str, float]:
-    """The intrinsic parameters and the coefficients of the distortion."""
-    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
-    values = [*calibration.intrinsics.values().tolist(), *calibration.distortion.tolist()]
-    return dict(zip(names, values, strict=True))
-
-
-def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
-    """Convert the estimated target to JSON values; None if it was used as given."""
-    if target is None:
+def _decimals(value: float) -> int | None:
+    """Decimals of a pixel error with about four significant digits; None if it needs an exponent."""
+    if value != 0 and abs(value) < 1e-4:
         return None
-    return {
-        "unit": unit,
-        "flat": bool(target.flat),
-        "bend": number_or_none(float(target.bend())),
-        "stretch": number_or_none(float(target.stretch())),
-        "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
-        "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
-        "n_points": len(target.found),
-        **_planes_json(target),
-        **({} if target.bends is None else {"bend_of_views_rms": target.bend_of_views()}),
-        **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
-    }
-
-
-def _planes_json(target: Target) -> dict[str, float]:
-    shift, turn = target.displaced()
-    return {"planes_shift": shift, "planes_turn_deg": float(np.degrees(turn))} if target.plane.any() else {}
-
-
-def number_or_none(value: float) -> float | None:
-    """The number, or None if it is not finite, as JSON has no such numbers."""
-    return value if math.isfinite(value) else None
-
-
-def _bias(value: float, rms: float) -> str:
-    """Format a mean residual with the decimals of the rms error of the same axis."""
-    if not (math.isfinite(value) and math.isfinite(rms)):
-        return "-"
-    text = _pixels(rms)
-    if "e" in text:
-        return f"{value:+.1e}"
-    decimals = len(text.partition(".")[2])
-    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 avoids -0
+    return max(0, 5 - len(str(int(abs(value)))))
 
 
 def _pixels(value: float) -> str:
     """Format a pixel error with about four significant digits; only tiny errors have an exponent."""
     if not math.isfinite(value):
         return "-"
-    if value != 0 and abs(value) < 1e-4:
-        return f"{value:.1e}"
-    whole = len(str(int(abs(value))))
-    return f"{value:.{max(0, 5 - whole)}f}"
+    decimals = _decimals(value)
+    return f"{value:.1e}" if decimals is None else f"{value:.{decimals}f}"
 
 
-def printable(name: str) -> str:
-    """The name as printable text on one line, with other characters escaped."""
-    return name if name.isprintable() else ascii(name)[1:-1]
-
-
-def parameter_rows(calibration: Calibration) -> list[list[str]]:
-    """Rows of the intrinsic parameters, and of the pose if there is only one view."""
-    rows = [["parameter", "value", "std", "relative"]]
-    units = dict.fromkeys(INTRINSIC_NAMES, "px") | {"theta": "rad"}
-    for name, value in _parameters(calibration).items():
-        if name not in rich_lens.NAMES:
-            unit, std = units.get(name, ""), calibration.std[name]
-            rows.append(_parameter_row(name, unit, value, std, name in calibration.fixed))
-    if calibration.distortion_model == "rich":
-        rows.append(_displacement_row(calibration))
-    if len(calibration.views) == 1:
-        (view,) = calibration.views.values()
-        values = [*view.pose.euler, *view.pose.t]
-        for name, value in zip(POSE_NAMES, values, strict=True):
-            unit = "rad" if name.startswith("R") else calibration.unit
-            rows.append(_parameter_row(name, printable(unit), float(value), view.std[name], view.fixed))
-    return rows
-
-
-def _displacement_row(calibration: Calibration) -> list[str]:
-    """One row for all nodes of a rich lens: their largest displacement at the observed points [px]."""
-    rays = calibration.camera.unproject(calibration.points.pixels)
-    k = calibration.distortion[-len(rich_lens.NAMES) :]
-    X, Y, Z = rays[np.isfinite(rays[:, 0])].T
-    d = rich_lens.displacement(k, X, Y, Z, by_coefficients=False)
-    moved = np.hypot(calibration.intrinsics.alpha_u * d.x, calibration.intrinsics.alpha_v * d.y)
-    return ["displacement [px]", f"up to {moved.max(initial=0.0):.2g}", f"{len(rich_lens.NODES)} nodes", ""]
-
-
-def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
-    label = f"{name} [{unit}]" if unit else name
-    if given:
-        return [label, f"{value:.7g}", "fixed", ""]
-    relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"
-    return [label, *rounded(value, std), relative]
-
-
-def _view_lines(views: Any) -> list[str]:
-    """Error of each view in the order of the data, or the largest errors if there are many views."""
-    if len(views) == 1:
-        return []
-    shown: list[tuple[str, ViewResult]] = list(views.items())
-    if len(shown) > _MOST_VIEWS:
-        shown = sorted(shown, key=lambda item: -item[1].rmse_px)[:_MOST_VIEWS]
-    rows = [["view", "points", "rms [px]"]]
-    rows += [[printable(name), str(view.n_points), _pixels(view.rmse_px)] for name, view in shown]
-    lines = align(rows)
-    if len(views) > _MOST_VIEWS:
-        lines.append(f"the {_MOST_VIEWS} views with the largest error, of {len(views)} views")
-    return lines
-
-
-def _training_lines(calibration: Calibration) -> list[str]:
-    rejected = f", {plural(calibration.n_rejected, 'outlier')} rejected" if calibration.n_rejected else ""
-    lines = [
-        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, "
-        f"maximum {_pixels(calibration.max_px)} px{rejected}"
-    ]
-    if (found := calibration.straight_lines) is not None:
-        u, v = found.centre
-        lines.append(
-            f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
-            f"distance {_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px "
-            f"after; centre of distortion ({u:.1f}, {v:.1f})"
-        )
-    if calibration.network is not None:
-        lines += _network_lines(calibration.network)
-    if choice := calibration.lens_choice:  # the candidates with their cross-validation errors, best first
-        errors = [f"{name} {_pixels(error)}" for name, error in sorted(choice.items(), key=itemgetter(1))]
-        how = f"chosen by cross-validation error and number of coefficients{_among(calibration)}"
-        lines += [
-            f"distortion model: {calibration.distortion_model}, {how}:",
-            f"  {', '.join(errors)} px",
-        ]
-    return [*lines, calibration.stop_reason]
-
-
-def _among(calibration: Calibration) -> str:
-    """From which models the distortion model was chosen, if one that was excluded has a lower error."""
-    choice, chosen = calibration.lens_choice, calibration.distortion_model
-    error = choice.get(chosen, 0.0)
-    if chosen not in WIDE and any(name in WIDE and other < error for name, other in choice.items()):
-        return " among ordinary lenses, because the points do not decidedly favour a fisheye"
-    if error > _TIED * min(choice.values()):
-        return " among the models that the points support"
-    return ""
-
-
-def _network_lines(network: NetworkRecord) -> list[str]:
-    agreed = f"network: {network.agreed} of {plural(network.starts, 'random start')} agreed"
-    if len(network.V) > 1:
-        starts = plural(network.starts, "random start")
-        agreed = (
-            f"networks: {starts} for {len(network.V)} views, at least {network.agreed} agreed in each view"
-        )
-    return [
-        f"{agreed}, {plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
-        f"bundle adjustment: rms {_pixels(network.rmse_before)} px before, {_pixels(network.rmse_after)} px "
-        f"after {plural(network.refine_iterations, 'iteration')}",
-    ]
+def _bias(value: float, rms: float) -> str:
+    """Format a mean residual with the decimals of the rms error of the same axis."""
+    if not (math.isfinite(value) and math.isfinite(rms)):
+        return "-"
+    decimals = _decimals(rms)
+    if decimals is None:
+        return f"{value:+.1e}"
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 avoids -0

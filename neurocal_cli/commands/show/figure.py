@@ -1,4 +1,4 @@
-"""The figure of all plots. matplotlib is imported only if a plot is drawn."""
+"""The figure of all pictures, and the style of their panels. matplotlib is imported only to draw one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: floa
 
 def plain(text: str) -> str:
     """Escape text so that matplotlib does not read it as mathematics."""
-    return (text if text.isprintable() else ascii(text)[1:-1]).replace("$", r"\$")
+    from neurocal_cli.commands.show.text import printable  # not above: options need this module, but no NumPy
+
+    return printable(text).replace("$", r"\$")
 
 
 def style(axes: Axes, title: str) -> None:

@@ -1,10 +1,9 @@
-"""Elements of a page: style and script, sortable tables, enlargeable drawings, the verdict, the origin.
+"""Elements of a page: style and script, sortable tables, the verdict, the origin, and drawings.
 
-SVG drawings for a page: residuals, their scatter, errors by view, and maps of an uncertainty.
-
-Colours come from the style of the page, so they suit its light and dark modes. The levels of a map differ by
-equal factors, because the corners of an image can be a hundred times as uncertain as its middle. Each level
-is one path of rectangles, so a map takes only some kilobytes.
+The drawings are SVG: residuals, their scatter, errors by view, and maps of an uncertainty. Colours come from
+the style of the page, so they suit its light and dark modes. The levels of a map differ by equal factors,
+because the corners of an image can be a hundred times as uncertain as its middle. Each level is one path of
+rectangles, so a map takes only some kilobytes.
 """
 
 from __future__ import annotations
@@ -23,9 +22,15 @@ from neurocal_cli import __version__
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_report import facts
+from neurocal_cli.commands.show.text import facts
 
 _LONG = 40  # characters; longer cells are texts
+_MOST = 4000  # greatest number of vectors in a drawing
+_MOST_DOTS = 1500  # on a map
+_LONGEST = 0.04  # length of a residual of three times the rms, as a share of the image's width
+_CELLS = 120  # approximate number of cells of a map across
+_LEVELS = 8
+_FAINTEST, _STRONGEST = 0.06, 0.92  # opacity
 
 _STYLE = """
 :root{color-scheme:light dark;--ink:#1c2330;--soft:#5b6472;--paper:#fff;--card:#f4f6f9;
@@ -163,14 +168,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:  # not installed as a package
             continue
     return found
-
-
-_MOST = 4000  # greatest number of vectors in a drawing
-_LONGEST = 0.04  # length of a residual of three times the rms, as a share of the image's width
-_LEVELS = 8
-_CELLS = 120  # approximate number across
-_MOST_DOTS = 1500
-_FAINTEST, _STRONGEST = 0.06, 0.92  # opacity
 
 
 def residual_map(

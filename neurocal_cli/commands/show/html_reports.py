@@ -1,4 +1,4 @@
-"""Pages of a calibration, a rig and a zoom lens."""
+"""The HTML pages of a calibration, a rig and a zoom lens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_report import parameter_rows, printable
+from neurocal_cli.commands.show.camera_report import parameter_rows
 from neurocal_cli.commands.show.html_page import (
     Origin,
     definitions,
@@ -29,7 +29,8 @@ from neurocal_cli.commands.show.html_page import (
     table,
     verdict_block,
 )
-from neurocal_cli.commands.show.rig_report import camera_rows, rig_rows
+from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, rig_rows
+from neurocal_cli.commands.show.text import printable
 from neurocal_cli.commands.show.zoom_report import lens_report
 from neurocal_cli.errors import InputError
 
@@ -52,7 +53,7 @@ def calibration_page(
         verdict_block(calibration.verdict),
         section("Parameters", table(parameter_rows(calibration))),
         *_camera_parts(calibration, photographs or {}),
-        _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
+        _repeat("neurocal calibrate POINTS.csv", calibration, origin),
     ]
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
@@ -65,7 +66,7 @@ def rig_page(
     pairs = [["pair", "left rms [px]", "right rms [px]"]]
     for a, b in rig.pairs:
         errors = rig.left.views[a].rmse_px, rig.right.views[b].rmse_px
-        pairs.append([printable(a if a == b else f"{a} / {b}"), *(f"{error:.4f}" for error in errors)])
+        pairs.append([pair_name(a, b), *(f"{error:.4f}" for error in errors)])
     left_out = [["pair", "reason"]]
     left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
     parts = [
@@ -81,22 +82,18 @@ def rig_page(
     for (side, camera), images in zip(sides, photographs or ({}, {}), strict=True):
         parts.append(section(side, " "))
         parts += _camera_parts(camera, images)
-    command = "neurocal stereo LEFT.csv RIGHT.csv" + _options(rig.left)
-    parts.append(_repeat(command, rig.left, origin))
+    parts.append(_repeat("neurocal stereo LEFT.csv RIGHT.csv", rig.left, origin))
     return page("Calibration of two cameras", parts)
 
 
 def lens_page(lens: ZoomLens, origin: Origin) -> str:
     """Make the page of a zoom lens; see `calibration_page`."""
-    verdict = judge_lens(lens)
+    command = f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml"
     parts = [
-        verdict_block(verdict),
+        verdict_block(judge_lens(lens)),
         section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
         section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
-        section(
-            "How to repeat it",
-            _origin(f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml", origin, {}),
-        ),
+        section("How to repeat it", _origin(command, origin, {})),
     ]
     return page("Calibration of a zoom lens", parts)
 
@@ -186,6 +183,7 @@ def _view_parts(
     scale: float,
     photographs: Mapping[str, bytes],
 ) -> list[str]:
+    """Sections on the views: a table, and a drawing of each one's residuals with the same enlargement."""
     points = calibration.points
     unit = printable(calibration.unit)
     rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
@@ -219,6 +217,7 @@ def _view_parts(
 
 
 def _rejected(calibration: Calibration) -> str:
+    """Section of the views and of the points that were left out."""
     rejected = calibration.rejected
     rows = [["view", "point", "u", "v", "error [px]"]]
     if rejected.points is not None:
@@ -239,7 +238,8 @@ def _warnings(warnings: tuple[str, ...]) -> str:
     return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
 
 
-def _options(calibration: Calibration) -> str:
+def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
+    """Section on how to make the file again: `command` with the calibration's options is likely right."""
     options = f" --type {calibration.type}" if calibration.type != 1 else ""
     if calibration.method in ("neuro", "linear", "nonlinear", "tsai"):
         options += f" --method {calibration.method}"
@@ -249,16 +249,13 @@ def _options(calibration: Calibration) -> str:
         options += f" --distortion {calibration.distortion_model}"
     if not calibration.intrinsics.skewed:
         options += " --no-skew"
-    return f"{options} --seed {calibration.seed}"
-
-
-def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
+    likely = f"{command}{options} --seed {calibration.seed}"
     text = (
         "The same points, options and seed give the same file, byte for byte, with the same versions. The "
         "file holds its points; neurocal evaluate camera judges it again."
     )
     facts = {"seed": str(calibration.seed), "how it ended": calibration.stop_reason}
-    return section("How to repeat it", _origin(command, origin, facts), f'<p class="soft">{text}</p>')
+    return section("How to repeat it", _origin(likely, origin, facts), f'<p class="soft">{text}</p>')
 
 
 def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:

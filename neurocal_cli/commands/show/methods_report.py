@@ -1,7 +1,4 @@
-"""Comparisons as tables and as JSON.
-
-Results of simulations as tables and as JSON.
-"""
+"""Comparisons of methods and results of simulations, as tables with titles and as JSON."""
 
 from __future__ import annotations
 
@@ -13,58 +10,93 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.space_error import SpaceError
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.show.camera_report import align, number_or_none, rounded
+from neurocal_cli.commands.show.text import (
+    Table,
+    align,
+    joined,
+    number,
+    number_or_none,
+    parameters,
+    rounded,
+)
 from neurocal_cli.simulation.comparison import Compared, Comparison
 from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.scenes import SimulatedScene
 from neurocal_cli.simulation.starts import StartStudy
 
-_SIDES = "left", "right"
+FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
+# The errors in the paper's Table 1, calibrated minus true.
+_PRINTED = {
+    "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
+    "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
+}  # fmt: skip
+_KINDS = {
+    "lm": "network, trained by lm",
+    "backprop": "network, trained by backprop",
+    "weights": "plain LM on (3) from the network's random weights",
+    "camera": "plain LM on (3) from a random camera",
+}
+
+
+def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str]) -> str:
+    """Format tables with titles as aligned text, and lines below them."""
+    return joined(*([title, *align(rows)] for title, rows in tables), below)
 
 
 def comparison_report(comparison: Comparison) -> str:
-    """Tables of errors and of parameters for each camera; of triangulated points for two."""
-    tables = []
-    for side, camera in enumerate(comparison.cameras):
-        points = comparison.points[side]
-        name = f"{_SIDES[side]} camera, " if len(comparison.cameras) == 2 else ""
-        tables.append((f"{name}{len(points)} points in {points.n_views} views", _errors(camera)))
-        tables.append((f"{name}parameters", _parameters(camera)))
+    """Tables of errors and of parameters for each camera, of triangulated points for two; best methods."""
+    tables, below = [], []
+    for side, points, camera in zip(("left", "right"), comparison.points, comparison.cameras, strict=False):
+        two = len(comparison.cameras) == 2
+        title, line = (f"{side} camera, ", f"{side} camera: ") if two else ("", "")
+        tables.append((f"{title}{len(points)} points in {points.n_views} views", _errors(camera)))
+        known = {method: one.calibration for method, one in camera.items() if one.calibration is not None}
+        names = dict.fromkeys(
+            [*INTRINSIC_NAMES, *(name for one in known.values() for name in parameters(one))]
+        )
+        rows = [[name, *(_estimate(one, name) for one in known.values())] for name in names]
+        tables.append((f"{title}parameters", [["parameter", *known], *rows]))
+        errors = {method: one.held_out_px for method, one in camera.items()}
+        below += _lowest(f"{line}lowest held-out error", errors, " px")
+        below += [f"{line}{method}: {one.problem}" for method, one in camera.items() if one.problem]
     if comparison.stereo is not None:
-        tables.append(("both cameras, each calibrated alone", _triangulation(comparison)))
-    return text_of(tables, _below(comparison))
+        unit = comparison.unit
+        head = [
+            "method",
+            f"RMSE [{unit}]",
+            "NSCE",
+            f"baseline [{unit}]",
+            f"through one rig: RMSE [{unit}]",
+            "NSCE",
+        ]
+        rows = [head]
+        for method, pair in comparison.stereo.items():
+            rig = ["-", "-"] if pair.rig is None else [_digits(pair.rig.rmse), _digits(pair.rig.nsce)]
+            alone = _digits(pair.by_view.rmse), _digits(pair.by_view.nsce), f"{pair.baseline:.2f}"
+            rows.append([method, *alone, *rig])
+        tables.append(("both cameras, each calibrated alone", rows))
+        found = {method: pair.by_view for method, pair in comparison.stereo.items()}
+        below += _lowest("lowest RMSE", {method: one.rmse for method, one in found.items()}, f" {unit}")
+        below += _lowest("lowest NSCE", {method: one.nsce for method, one in found.items()}, "")
+    return text_of(tables, below)
 
 
-def text_of(tables: Sequence[tuple[str, list[list[str]]]], below: Sequence[str]) -> str:
-    """Format tables with titles as aligned text, and lines below them."""
-    blocks = ["\n".join([title, *align(rows)]) for title, rows in tables]
-    return "\n\n".join([*blocks, *(["\n".join(below)] if below else [])])
-
-
-def _errors(camera: dict[str, Compared]) -> list[list[str]]:
+def _errors(camera: dict[str, Compared]) -> Table:
     rows = [["method", "rms [px]", "held-out [px]", "time [ms]", "distortion"]]
     for method, one in camera.items():
         cells = ["-"] * 4
         if one.calibration is not None:
             model = one.calibration.distortion_model
-            errors = _px(one.calibration.rmse_px), _px(one.held_out_px)
+            errors = _digits(one.calibration.rmse_px), _digits(one.held_out_px)
             cells = [*errors, f"{1000 * one.seconds:.0f}", "no distortion" if model == "none" else model]
         rows.append([method, *cells])
     return rows
 
 
-def _parameters(camera: dict[str, Compared]) -> list[list[str]]:
-    known = {method: one.calibration for method, one in camera.items() if one.calibration is not None}
-    names = dict.fromkeys([*INTRINSIC_NAMES, *(name for one in known.values() for name in _values(one))])
-    rows = [[name, *(_value(calibration, name) for calibration in known.values())] for name in names]
-    return [["parameter", *known], *rows]
-
-
-def _value(calibration: Calibration, name: str) -> str:
-    values = _values(calibration)
+def _estimate(calibration: Calibration, name: str) -> str:
+    values = parameters(calibration)
     if name not in values:
         return "-"
     if name in calibration.fixed:
@@ -73,50 +105,20 @@ def _value(calibration: Calibration, name: str) -> str:
     return f"{value} +- {std}"
 
 
-def _values(calibration: Calibration) -> dict[str, float]:
-    values = {name: float(getattr(calibration.intrinsics, name)) for name in INTRINSIC_NAMES}
-    names = coefficient_names(calibration.distortion_model)
-    return values | dict(zip(names, map(float, calibration.distortion), strict=True))
-
-
-def _triangulation(comparison: Comparison) -> list[list[str]]:
-    assert comparison.stereo is not None
-    unit = f"[{comparison.unit}]"
-    rows = [["method", f"RMSE {unit}", "NSCE", f"baseline {unit}", f"through one rig: RMSE {unit}", "NSCE"]]
-    for method, one in comparison.stereo.items():
-        rig = ["-", "-"] if one.rig is None else [_px(one.rig.rmse), _px(one.rig.nsce)]
-        rows.append([method, _px(one.by_view.rmse), _px(one.by_view.nsce), f"{one.baseline:.2f}", *rig])
-    return rows
-
-
-def _below(comparison: Comparison) -> list[str]:
-    """Lines about the methods with the lowest errors, and about methods without a solution."""
-    lines = []
-    for side, camera in enumerate(comparison.cameras):
-        name = f"{_SIDES[side]} camera: " if len(comparison.cameras) == 2 else ""
-        errors = {method: one.held_out_px for method, one in camera.items()}
-        lines += _lowest(f"{name}lowest held-out error", errors, " px")
-        lines += [f"{name}{method}: {one.problem}" for method, one in camera.items() if one.problem]
-    if comparison.stereo is not None:
-        found, unit = {method: one.by_view for method, one in comparison.stereo.items()}, comparison.unit
-        lines += _lowest("lowest RMSE", {method: one.rmse for method, one in found.items()}, f" {unit}")
-        lines += _lowest("lowest NSCE", {method: one.nsce for method, one in found.items()}, "")
-    return lines
-
-
 def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
     """A line about the best method, with all methods that have the same digits in the table."""
     known = {method: error for method, error in errors.items() if math.isfinite(error)}
     if not known:
         return []
     best = min(known.values())
-    winners = [method for method, error in known.items() if _px(error) == _px(best)]
+    winners = [method for method, error in known.items() if _digits(error) == _digits(best)]
     names = " and ".join([", ".join(winners[:-1]), winners[-1]] if len(winners) > 1 else winners)
-    return [f"{what}: {names}, {_px(best)}{unit}"]
+    return [f"{what}: {names}, {_digits(best)}{unit}"]
 
 
-def _px(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "-"
+def _digits(value: float) -> str:
+    """Four significant digits."""
+    return number(value, ".4g")
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
@@ -140,10 +142,6 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
     return found
 
 
-def _triangulated_json(errors: SpaceError) -> dict[str, float | None]:
-    return {"rmse": number_or_none(errors.rmse), "nsce": number_or_none(errors.nsce)}
-
-
 def _camera_json(one: Compared) -> dict[str, Any]:
     calibration = one.calibration
     if calibration is None:
@@ -155,25 +153,13 @@ def _camera_json(one: Compared) -> dict[str, Any]:
         "distortion_model": calibration.distortion_model,
         "parameters": {
             name: {"value": value, "std": number_or_none(calibration.std[name])}
-            for name, value in _values(calibration).items()
+            for name, value in parameters(calibration).items()
         },
     }
 
 
-Table = list[list[str]]
-
-FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
-# The errors in the paper's Table 1, calibrated minus true.
-_PRINTED = {
-    "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
-    "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
-}  # fmt: skip
-_KINDS = {
-    "lm": "network, trained by lm",
-    "backprop": "network, trained by backprop",
-    "weights": "plain LM on (3) from the network's random weights",
-    "camera": "plain LM on (3) from a random camera",
-}
+def _triangulated_json(errors: SpaceError) -> dict[str, float | None]:
+    return {"rmse": number_or_none(errors.rmse), "nsce": number_or_none(errors.nsce)}
 
 
 def simulation_tables(
@@ -198,7 +184,16 @@ def simulation_tables(
         ]
         title = f"single random starts that reach the minimum (noise {starts.sigma:g} px)"
         tables.append((title, [["start", "reached", "of"], *rows]))
-    return tables, _findings(study)
+    below = [
+        f"{a} and {b} differ by at most {apart:.1g} of the bound, in any parameter of any trial"
+        for (a, b), apart in study.apart.items()
+    ]
+    below += [
+        f"{method} gave no answer in {one.failed.sum()} of {study.trials * len(study.sigma)} trials"
+        for method, one in study.methods.items()
+        if one.failed.any()
+    ]
+    return tables, below
 
 
 def _exact(study: NoiseStudy, paper: bool) -> Table:
@@ -211,7 +206,7 @@ def _exact(study: NoiseStudy, paper: bool) -> Table:
 
 
 def _error(value: float) -> str:
-    return "-" if not np.isfinite(value) else "0" if value == 0 else f"{value:.1e}"
+    return "0" if value == 0 else number(value, ".1e")
 
 
 def _fig_1(study: NoiseStudy) -> Table:
@@ -221,8 +216,8 @@ def _fig_1(study: NoiseStudy) -> Table:
     for name in FIG_1:
         p = study.names.index(name)
         for k, sigma in enumerate(study.sigma):
-            values = [_number(one.rms[k, p]) for one in study.methods.values()]
-            rows.append([name, f"{sigma:g}", _number(sigma * bound[p]), *values])
+            values = [number(one.rms[k, p], ".3g") for one in study.methods.values()]
+            rows.append([name, f"{sigma:g}", number(sigma * bound[p], ".3g"), *values])
     return rows
 
 
@@ -237,7 +232,7 @@ def _at_largest_sigma(study: NoiseStudy, cell: Callable[[NoiseStudy, MethodError
 
 def _ratio(study: NoiseStudy, one: MethodErrors, p: int) -> str:
     """Rms error over its bound."""
-    return _number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]))
+    return number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]), ".3g")
 
 
 def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
@@ -245,19 +240,6 @@ def _bias(study: NoiseStudy, one: MethodErrors, p: int) -> str:
     variance = max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0)
     spread = np.sqrt(variance / max(study.trials - one.failed[-1], 1))
     return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
-
-
-def _findings(study: NoiseStudy) -> list[str]:
-    lines = [
-        f"{a} and {b} differ by at most {apart:.1g} of the bound, in any parameter of any trial"
-        for (a, b), apart in study.apart.items()
-    ]
-    for method, one in study.methods.items():
-        if one.failed.any():
-            lines.append(
-                f"{method} gave no answer in {one.failed.sum()} of {study.trials * len(study.sigma)} trials"
-            )
-    return lines
 
 
 def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
@@ -283,8 +265,17 @@ def simulation_json(
     scene: SimulatedScene, seed: int, study: NoiseStudy, starts: StartStudy | None
 ) -> dict[str, Any]:
     """The studies of noise and starts for JSON; missing numbers are None."""
-    whole = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed, **noise_json(study)}
-    return whole if starts is None else {**whole, "random_starts": starts_json(starts)}
+    counts = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
+    if starts is None:
+        return {**counts, **noise_json(study)}
+    random_starts = {
+        "sigma": starts.sigma,
+        "best_rmse_px": starts.best,
+        "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
+        "reached": starts.reached,
+        "rmse_px": {kind: _numbers(rms) for kind, rms in starts.rms.items()},
+    }
+    return {**counts, **noise_json(study), "random_starts": random_starts}
 
 
 def noise_json(study: NoiseStudy) -> dict[str, Any]:
@@ -308,17 +299,6 @@ def noise_json(study: NoiseStudy) -> dict[str, Any]:
     }
 
 
-def starts_json(starts: StartStudy) -> dict[str, Any]:
-    """Counts and final errors of single starts for JSON."""
-    return {
-        "sigma": starts.sigma,
-        "best_rmse_px": starts.best,
-        "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
-        "reached": starts.reached,
-        "rmse_px": {kind: _numbers(rms) for kind, rms in starts.rms.items()},
-    }
-
-
 def rates_json(study: RateStudy) -> dict[str, Any]:
     """The study of rates for JSON."""
     return {
@@ -339,7 +319,3 @@ def _by_name(study: NoiseStudy, values: Any) -> dict[str, float | None]:
 
 def _numbers(values: Any) -> list[float | None]:
     return [number_or_none(float(value)) for value in values]
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"

@@ -1,4 +1,4 @@
-"""Plots of cameras, rigs and triangulated points: a page of panels, or a single panel."""
+"""Pictures of cameras, rigs and triangulated points: a page of panels, or a single panel."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
+from neurocal_cli.errors import plural
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,20 +28,20 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw all panels of a camera, or one of `plots.CAMERA_PANELS`; the same subject gives the same bytes."""
+    """Draw all panels of a camera, or one of `CAMERA_PANELS`; the same subject gives the same bytes."""
     panels = panels_of(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
     evaluation = subject.evaluation
     title = (
         f"{plain(subject.camera.name)}: rms {evaluation.rmse_px:.4g} px, max {evaluation.max_px:.4g} px, "
-        f"{evaluation.n_points} points, {len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
+        f"{evaluation.n_points} points, {plural(len(evaluation.views), 'view')}"
     )
     return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, title, _PAGE, kind)
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw both cameras of a rig side by side, or one of `plots.RIG_PANELS` for both; see `draw_camera`."""
+    """Draw both cameras of a rig side by side, or one of `RIG_PANELS` for both; see `draw_camera`."""
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
         f"{side} {name}": _with_side(side, draw)
@@ -64,6 +65,8 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
 
 
 def _with_side(side: str, draw: Draw) -> Draw:
+    """A panel with the side of its camera in the title."""
+
     def titled(axes: Axes) -> None:
         draw(axes)
         axes.set_title(f"{side}: {axes.get_title()}")
@@ -74,14 +77,14 @@ def _with_side(side: str, draw: Draw) -> Draw:
 def draw_points_in_space(
     evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
-    """Draw the errors of triangulated points, or one of `plots.SPACE_PANELS`; see `draw_camera`."""
+    """Draw the errors of triangulated points, or one of `SPACE_PANELS`; see `draw_camera`."""
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig
     unit = plain(evaluation.unit)
     errors = found.errors[np.isfinite(found.errors[:, 0])]
     others = [] if rig is None else [(rig.right.camera, rig.pose)]
     panels: dict[str, Draw] = {
-        "across": lambda axes: _draw_cloud(axes, errors[:, :2], ("X right", "Y down"), unit),
-        "depth": lambda axes: _draw_cloud(axes, errors[:, [0, 2]], ("X right", "Z depth"), unit),
+        "across": lambda axes: _draw_cloud(axes, errors[:, :2], "Y down", unit),
+        "depth": lambda axes: _draw_cloud(axes, errors[:, [0, 2]], "Z depth", unit),
         "depths": lambda axes: _draw_depths(axes, found, unit),
         "views": lambda axes: _draw_space_views(axes, evaluation, unit),
         "poses": lambda axes: draw_poses(axes, None if rig is None else rig.left, others),
@@ -120,18 +123,19 @@ def _page(
 
 
 def _alone(name: str, draw: Draw, kind: str) -> bytes:
+    """Draw a single panel."""
     how = {"projection": "3d"} if name == "poses" else {}
     return picture(lambda figure: draw(figure.add_subplot(**how)), _PANEL, _PAD, kind)
 
 
-def _draw_cloud(axes: Axes, errors: Array, names: tuple[str, str], unit: str) -> None:
-    """Draw the errors in a plane of the left camera's frame."""
+def _draw_cloud(axes: Axes, errors: Array, name: str, unit: str) -> None:
+    """Draw the errors in the plane of X and another axis of the left camera's frame, such as "Y down"."""
     axes.plot(*errors.T, ".", color=INK, markersize=3, alpha=0.5, rasterized=len(errors) > 2000)
     axes.plot(0, 0, "+", color=ACCENT, markersize=11)
-    style(axes, f"Errors in {names[0].split()[0]} and {names[1].split()[0]}, triangulated minus true")
-    axes.set(xlabel=f"{names[0]} [{unit}]", ylabel=f"{names[1]} [{unit}]", aspect="equal")
+    style(axes, f"Errors in X and {name[0]}, triangulated minus true")
+    axes.set(xlabel=f"X right [{unit}]", ylabel=f"{name} [{unit}]", aspect="equal")
     axes.set_adjustable("datalim")
-    if names[1].startswith("Y"):
+    if name == "Y down":
         axes.invert_yaxis()
 
 

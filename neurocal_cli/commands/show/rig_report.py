@@ -1,24 +1,27 @@
-"""Reports of rigs and their evaluations as text, tables and JSON."""
+"""A rig and its errors in space, as text, as rows of tables and as JSON."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.calibration.verdict.findings import two_digits
-from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.commands.show.camera_report import (
+from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
+from neurocal_cli.commands.show.text import (
+    UNITS,
+    Table,
     align,
-    calibration_json,
+    align_views,
+    joined,
+    labelled,
     number_or_none,
+    parameters,
     printable,
     rounded,
-    target_lines,
     verdict_json,
     verdict_lines,
 )
@@ -26,11 +29,129 @@ from neurocal_cli.errors import plural
 
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
 _NAMED = 10  # views named in a remark
-_MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
 
-def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
+def rig_report(rig: Rig) -> str:
+    """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
+    headline = [f"rig: {plural(len(rig.pairs), 'pair')} of views"]
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        seen = f"{plural(len(camera.points), 'point')} in {plural(len(camera.views), 'view')}"
+        headline.append(f"{name} {seen}")
+    pairs = []
+    for a, b in rig.pairs:
+        views = rig.left.views[a], rig.right.views[b]
+        cells = [cell for view in views for cell in (str(view.n_points), _figure(view.rmse_px))]
+        pairs.append((max(view.rmse_px for view in views), [pair_name(a, b), *cells]))
+    return joined(
+        [", ".join(headline)],
+        align(camera_rows(rig)),
+        align(rig_rows(rig)),
+        align_views(["view", "left points", "rms [px]", "right points", "rms [px]"], pairs, "pairs"),
+        _fit_lines(rig),
+        verdict_lines(rig.verdict),
+    )
+
+
+def pair_name(left: str, right: str) -> str:
+    """The names of the views of a pair, or the one that both have."""
+    return printable(left if left == right else f"{left} / {right}")
+
+
+def camera_rows(rig: Rig) -> Table:
+    """Both cameras' parameters side by side."""
+    rows = [["parameter", "left", "std", "right", "std"]]
+    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
+    cells = [
+        {
+            name: (f"{value:.7g}", "fixed")
+            if name in camera.fixed
+            else rounded(value, camera.std.get(name, math.nan))
+            for name, value in parameters(camera).items()
+        }
+        for camera in (rig.left, rig.right)
+    ]
+    for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
+        estimates = [cell for own in cells for cell in own.get(name, ("", ""))]
+        rows.append([labelled(name, UNITS.get(name, "")), *estimates])
+    return rows
+
+
+def rig_rows(rig: Rig) -> Table:
+    """Rows of the pose of the right camera and the baseline, with their standard deviations."""
+    rows = [["X_right = R X_left + t", "value", "std"]]
+    length = printable(rig.unit)
+    for name, value in _pose_values(rig).items():
+        unit = "rad" if name.startswith("R") else length
+        rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
+    return [*rows, [f"baseline [{length}]", *rounded(rig.baseline, rig.std["baseline"])]]
+
+
+def _pose_values(rig: Rig) -> dict[str, float]:
+    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
+
+
+def _fit_lines(rig: Rig) -> list[str]:
+    """How the cameras and the rig were fitted, and what the fit found."""
+    lines = []
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        record = camera.network
+        if record is not None:
+            lines.append(
+                f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
+                f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
+            )
+    lines.append(
+        f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+        f"{plural(rig.iterations, 'iteration')}"
+    )
+    lines += target_lines(rig.left.target or rig.right.target, rig.unit)
+    measures = {} if rig.verdict is None else rig.verdict.measures
+    growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
+    if growth > _MUCH_WORSE:
+        lines.append(
+            f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
+            f"it is {growth:.2g} times as much"
+        )
+    return [*lines, rig.stop_reason]
+
+
+def rig_json(rig: Rig) -> dict[str, Any]:
+    """The summary of a rig as JSON values; None for numbers that do not exist."""
+    return {
+        "left": calibration_json(rig.left),
+        "right": calibration_json(rig.right),
+        "unit": rig.unit,
+        "R": rig.R.tolist(),
+        "t": rig.t.tolist(),
+        "baseline": rig.baseline,
+        "parameters": {
+            name: {"value": value, "std": number_or_none(rig.std[name])}
+            for name, value in _pose_values(rig).items()
+        },
+        "baseline_std": number_or_none(rig.std["baseline"]),
+        "rmse_px": number_or_none(rig.rmse_px),
+        "max_px": number_or_none(rig.max_px),
+        "pairs": [list(pair) for pair in rig.pairs],
+        "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
+        "converged": bool(rig.converged),
+        "stop_reason": str.__str__(rig.stop_reason),
+        "warnings": list(rig.warnings),
+        **verdict_json(rig.verdict),
+    }
+
+
+def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
+    """Remarks that name the views of one camera alone."""
+    return [
+        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
+        + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
+        for side, names in zip(("left", "right"), alone, strict=True)
+        if names
+    ]
+
+
+def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
     """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit
     ways, heads = [evaluation.by_view], ["poses of each view"]
@@ -61,10 +182,22 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[st
     views = [["view", "points", *(f"{head} [{unit}]" for head in heads)]]
     right_names = dict(evaluation.pairs)
     for name, (count, _) in ways[0].views.items():
-        label = name if right_names[name] == name else f"{name} / {right_names[name]}"
         errors = [_figure(way.views.get(name, (0, math.nan))[1]) for way in ways]
-        views.append([printable(label), str(count), *errors])
+        views.append([pair_name(name, right_names[name]), str(count), *errors])
     return (overall, depths, views) if len(views) > 2 else (overall, depths)
+
+
+def _figure(value: float) -> str:
+    """Four significant digits."""
+    if not math.isfinite(value):
+        return "-"
+    if value != 0 and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.3e}"
+    return f"{value:#.4g}".rstrip(".")
+
+
+def _share(value: float) -> str:
+    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
 
 
 def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
@@ -77,7 +210,7 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
         "fitted_views": list(evaluation.fitted),
         "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
-        **({} if evaluation.verdict is None else {"verdict": verdict_json(evaluation.verdict)}),
+        **verdict_json(evaluation.verdict),
     }
 
 
@@ -98,144 +231,3 @@ def _error_json(error: SpaceError) -> dict[str, Any]:
             for part in error.depths
         ],
     }
-
-
-def _figure(value: float) -> str:
-    """Four significant digits."""
-    if not math.isfinite(value):
-        return "-"
-    if value != 0 and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.3e}"
-    return f"{value:#.4g}".rstrip(".")
-
-
-def _share(value: float) -> str:
-    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
-
-
-def rig_report(rig: Rig) -> str:
-    """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
-    tables = align(camera_rows(rig)), align(rig_rows(rig)), _view_lines(rig)
-    blocks = [[_headline(rig)], *tables, _fit_lines(rig)]
-    if rig.verdict is not None:
-        blocks.append(verdict_lines(rig.verdict))
-    return "\n\n".join("\n".join(block) for block in blocks if block)
-
-
-def rig_json(rig: Rig) -> dict[str, Any]:
-    """The summary of a rig as JSON values; None for numbers that do not exist."""
-    return {
-        "left": calibration_json(rig.left),
-        "right": calibration_json(rig.right),
-        "unit": rig.unit,
-        "R": rig.R.tolist(),
-        "t": rig.t.tolist(),
-        "baseline": rig.baseline,
-        "parameters": {
-            name: {"value": value, "std": number_or_none(rig.std[name])}
-            for name, value in _pose_values(rig).items()
-        },
-        "baseline_std": number_or_none(rig.std["baseline"]),
-        "rmse_px": number_or_none(rig.rmse_px),
-        "max_px": number_or_none(rig.max_px),
-        "pairs": [list(pair) for pair in rig.pairs],
-        "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
-        "converged": bool(rig.converged),
-        "stop_reason": str.__str__(rig.stop_reason),
-        "warnings": list(rig.warnings),
-        **({} if rig.verdict is None else {"verdict": verdict_json(rig.verdict)}),
-    }
-
-
-def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
-    """Remarks that name the views of one camera alone."""
-    return [
-        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
-        + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
-        for side, names in zip(("left", "right"), alone, strict=True)
-        if names
-    ]
-
-
-def _headline(rig: Rig) -> str:
-    parts = [f"rig: {plural(len(rig.pairs), 'pair')} of views"]
-    for name, camera in (("left", rig.left), ("right", rig.right)):
-        parts.append(f"{name} {plural(len(camera.points), 'point')} in {plural(len(camera.views), 'view')}")
-    return ", ".join(parts)
-
-
-def camera_rows(rig: Rig) -> list[list[str]]:
-    """Both cameras' parameters side by side."""
-    rows = [["parameter", "left", "std", "right", "std"]]
-    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
-    cells = [_estimates(camera) for camera in (rig.left, rig.right)]
-    for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
-        unit = " [rad]" if name == "theta" else " [px]" if name in INTRINSIC_NAMES else ""
-        rows.append([name + unit, *cells[0].get(name, ("", "")), *cells[1].get(name, ("", ""))])
-    return rows
-
-
-def _estimates(camera: Calibration) -> dict[str, tuple[str, str]]:
-    """Value and standard deviation of each parameter."""
-    names = (*INTRINSIC_NAMES, *coefficient_names(camera.distortion_model))
-    values = [*camera.intrinsics.values().tolist(), *camera.distortion.tolist()]
-    found = {}
-    for name, value in zip(names, values, strict=True):
-        known = name in camera.fixed
-        found[name] = (f"{value:.7g}", "fixed") if known else rounded(value, camera.std.get(name, math.nan))
-    return found
-
-
-def rig_rows(rig: Rig) -> list[list[str]]:
-    """Rows of the pose of the right camera and the baseline, with their standard deviations."""
-    rows = [["X_right = R X_left + t", "value", "std"]]
-    for name, value in _pose_values(rig).items():
-        unit = "rad" if name.startswith("R") else printable(rig.unit)
-        rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
-    rows.append([f"baseline [{printable(rig.unit)}]", *rounded(rig.baseline, rig.std["baseline"])])
-    return rows
-
-
-def _pose_values(rig: Rig) -> dict[str, float]:
-    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
-
-
-def _view_lines(rig: Rig) -> list[str]:
-    """Errors of both cameras in each pair of views, or in the worst ones if there are many."""
-    if len(rig.pairs) == 1:
-        return []
-    shown = [((a, b), (rig.left.views[a], rig.right.views[b])) for a, b in rig.pairs]
-    if len(rig.pairs) > _MOST_VIEWS:
-        shown = sorted(shown, key=lambda row: -max(view.rmse_px for view in row[1]))[:_MOST_VIEWS]
-    rows = [["view", "left points", "rms [px]", "right points", "rms [px]"]]
-    for (a, b), views in shown:
-        cells = [cell for view in views for cell in (str(view.n_points), _figure(view.rmse_px))]
-        rows.append([printable(a if a == b else f"{a} / {b}"), *cells])
-    lines = align(rows)
-    if len(rig.pairs) > _MOST_VIEWS:
-        lines.append(f"the {_MOST_VIEWS} pairs with the largest error, of {len(rig.pairs)} pairs")
-    return lines
-
-
-def _fit_lines(rig: Rig) -> list[str]:
-    lines = []
-    for name, camera in (("left", rig.left), ("right", rig.right)):
-        record = camera.network
-        if record is not None:
-            lines.append(
-                f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
-                f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
-            )
-    lines.append(
-        f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
-        f"{plural(rig.iterations, 'iteration')}"
-    )
-    lines += target_lines(rig.left.target or rig.right.target, rig.unit)
-    measures = {} if rig.verdict is None else rig.verdict.measures
-    growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
-    if growth > _MUCH_WORSE:
-        lines.append(
-            f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
-            f"it is {growth:.2g} times as much"
-        )
-    return [*lines, rig.stop_reason]

@@ -52,6 +52,9 @@ def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kin
 
 
 def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bool) -> None:
+    """Draw each method's rms error of one parameter over the noise, and the bounds."""
+    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
+
     p = study.names.index(name)
     bounds = {method: one.bound[p] for method, one in study.methods.items() if one.bound[p] > 0}
     widest = max(bounds.values(), default=0.0)
@@ -73,19 +76,13 @@ def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bo
     style(axes, name)
     axes.set(xlabel="noise sigma [px]", ylabel=f"rms error [{unit}]".replace("$", r"\$"))
     axes.grid(True, which="minor", color="0.95", linewidth=0.4)
-    _plain_ticks(axes, study.sigma)
+    axes.xaxis.set_major_locator(FixedLocator(study.sigma.tolist()))
+    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     if legend:
         axes.legend(frameon=False, fontsize=8, loc="upper left")
     elif told:
         axes.legend(*zip(*told, strict=True), frameon=False, fontsize=8, loc="lower right")
-
-
-def _plain_ticks(axes: Axes, values: np.ndarray) -> None:
-    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
-
-    axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
-    axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_starts(axes: Axes, starts: StartStudy) -> None:
@@ -117,12 +114,12 @@ def draw_rates(study: RateStudy, kind: str = "png") -> bytes:
         left, right = figure.subplots(1, 2)
         share = 100 * study.converged / study.sets
         labels = [[str(count) for count in row] for row in study.converged]
-        _draw_grid(left, study, share, labels, "viridis", (0.0, 100.0))
+        _draw_grid(left, study, share, labels, (0.0, 100.0), dark_is_low=True)
         left.set_title(f"Data sets of {study.sets} on which one start converges")
         known = np.log10(np.where(study.epochs > 0, study.epochs, np.nan))
         texts = [["" if np.isnan(e) else f"{e:.0f}" for e in row] for row in study.epochs]
         limits = float(np.nanmin(known)), float(np.nanmax(known))
-        _draw_grid(right, study, known, texts, "viridis_r", limits)
+        _draw_grid(right, study, known, texts, limits, dark_is_low=False)
         right.set_title("Median epochs of these")
 
     return picture(draw, (12.0, 5.2), 0.12, kind)
@@ -133,14 +130,16 @@ def _draw_grid(
     study: RateStudy,
     values: np.ndarray,
     texts: list[list[str]],
-    colours: str,
     limits: tuple[float, float],
+    *,
+    dark_is_low: bool,
 ) -> None:
+    """Draw a coloured square with a text for each pair of rates, and a frame about the default ones."""
     from matplotlib.patches import Rectangle
 
+    colours = "viridis" if dark_is_low else "viridis_r"
     axes.imshow(values, origin="lower", cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto")
     middle = 0.5 * (limits[0] + limits[1])
-    dark_is_low = not colours.endswith("_r")
     for a, row in enumerate(texts):
         for b, text in enumerate(row):
             dark = (values[a, b] < middle) == dark_is_low

@@ -12,8 +12,8 @@ from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
 from neurocal_cli.calibration.zoom.initialisation import local_covariance
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
+from neurocal_cli.commands.show.text import UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,7 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
         axes.plot(along, middle, color=color, linewidth=1.2, label=label)
         places, found = lens.settings[members, 0], lens.tables.local[members, j]
         axes.errorbar(places, found, error[members], fmt="o", markersize=2.8, elinewidth=0.7, color=color)
-    unit = "px" if name in INTRINSIC_NAMES[:4] else lens.unit if name == "t_z" else ""
+    unit = UNITS.get(name, lens.unit if name == "t_z" else "")
     style(axes, name)
     axes.set(xlabel=lens.controls[0], ylabel=unit.replace("$", r"\$"))
     if j == 0 and len(slices) > 1:

@@ -1,8 +1,7 @@
-"""Reports of zoom lenses and their evaluations as text and as JSON."""
+"""A zoom lens, its camera at a setting and its errors, as text and as JSON."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -12,19 +11,22 @@ from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.settings import CONTROLS
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
-from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.commands.show.camera_report import (
+from neurocal_cli.commands.show.camera_report import target_json, target_lines
+from neurocal_cli.commands.show.text import (
+    UNITS,
+    Table,
     align,
+    joined,
+    labelled,
+    number,
     number_or_none,
+    parameters,
     rounded,
-    target_json,
-    target_lines,
     verdict_json,
     verdict_lines,
 )
 
-_MOST_SETTINGS = 8
+_MOST_SETTINGS = 8  # rows of a table
 _SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}
 _TRAININGS = {
     "joint": "trained jointly",
@@ -54,8 +56,30 @@ def lens_report(lens: ZoomLens) -> str:
         f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}",
         "converged" if lens.converged else "not converged: training stopped before the error settled",
     ]
-    blocks = [[head], align(_network_rows(lens)), tail, verdict_lines(judge_lens(lens))]
-    return "\n\n".join("\n".join(block) for block in blocks)
+    return joined([head], align(_network_rows(lens)), tail, verdict_lines(judge_lens(lens)))
+
+
+def _camera_errors(lens: ZoomLens) -> str:
+    """The median std of the given parameters; that of alpha is relative."""
+    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.H), axis1=1, axis2=2))
+    share = 100 * float(np.median(std[:, 0] / lens.tables.local[:, 0]))
+    others = [f"{name} {value:.3g}" for name, value in zip(lens.names, np.median(std, axis=0), strict=True)]
+    return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
+
+
+def _network_rows(lens: ZoomLens) -> Table:
+    """What each network learnt: its hidden units, and the range and the uncertainty of its parameter."""
+    prediction = lens.predict(lens.settings)
+    rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
+    for j, name in enumerate(lens.names):
+        topologies = {member.nets.nets[j].topology for member in lens.members}
+        units = " ".join(f"{own}+{hidden}" for own, hidden in sorted((t.own, t.hidden) for t in topologies))
+        std = float(np.median(prediction.std[:, j]))
+        values = prediction.local[:, j]
+        low, high = rounded(float(values.min()), std), rounded(float(values.max()), std)
+        label = labelled(name, UNITS.get(name, lens.unit if name == "t_z" else ""))
+        rows.append([label, units, low[0], high[0], low[1]])
+    return rows
 
 
 def lens_json(lens: ZoomLens) -> dict[str, Any]:
@@ -75,50 +99,18 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "target": target_json(lens.target, lens.unit),
         "converged": bool(lens.converged),
         "warnings": list(lens.warnings),
-        "verdict": verdict_json(judge_lens(lens)),
+        **verdict_json(judge_lens(lens)),
     }
-
-
-def _camera_errors(lens: ZoomLens) -> str:
-    """The median std of the given parameters; that of alpha is relative."""
-    std = np.sqrt(np.diagonal(np.linalg.inv(lens.tables.normal.H), axis1=1, axis2=2))
-    share = 100 * float(np.median(std[:, 0] / lens.tables.local[:, 0]))
-    others = [f"{name} {value:.3g}" for name, value in zip(lens.names, np.median(std, axis=0), strict=True)]
-    return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
-
-
-def _network_rows(lens: ZoomLens) -> list[list[str]]:
-    prediction = lens.predict(lens.settings)
-    rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
-    for j, name in enumerate(lens.names):
-        topologies = {member.nets.nets[j].topology for member in lens.members}
-        units = " ".join(f"{own}+{hidden}" for own, hidden in sorted((t.own, t.hidden) for t in topologies))
-        std = float(np.median(prediction.std[:, j]))
-        values = prediction.local[:, j]
-        low, high = rounded(float(values.min()), std), rounded(float(values.max()), std)
-        label = _labelled(name, lens.unit if name == "t_z" else "")
-        rows.append([label, units, low[0], high[0], low[1]])
-    return rows
-
-
-def _labelled(name: str, unit: str) -> str:
-    """A parameter with its unit: pixels for four of them, or the given one."""
-    unit = "px" if name in INTRINSIC_NAMES[:4] else unit
-    return f"{name} [{unit}]" if unit else name
 
 
 def camera_report(calibration: Calibration) -> str:
     """Table of the parameters of the camera at a setting."""
-    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
-    values = [*calibration.intrinsics.values(), *calibration.distortion]
     rows = [["parameter", "value", "std"]]
-    for name, value in zip(names, values, strict=True):
-        label = _labelled(name, "rad" if name == "theta" else "")
-        if name in calibration.fixed:
-            rows.append([label, f"{value:.7g}", "given"])
-        else:
-            rows.append([label, *rounded(float(value), calibration.std[name])])
-    return f"{calibration.camera_name}: {calibration.stop_reason}\n\n" + "\n".join(align(rows))
+    for name, value in parameters(calibration).items():
+        given = name in calibration.fixed
+        cells = (f"{value:.7g}", "given") if given else rounded(value, calibration.std[name])
+        rows.append([labelled(name, UNITS.get(name, "")), *cells])
+    return joined([f"{calibration.camera_name}: {calibration.stop_reason}"], align(rows))
 
 
 def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict) -> str:
@@ -133,12 +125,12 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...], ver
         f"{_pixels(evaluation.rmse_px)} px, maximum {_pixels(evaluation.max_px)} px"
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
-    tables = align(_baseline_rows(evaluation)), [title, *align(settings)]
-    blocks = [[head], *tables, verdict_lines(verdict)]
-    return "\n\n".join("\n".join(block) for block in blocks)
+    return joined(
+        [head], align(_baseline_rows(evaluation)), [title, *align(settings)], verdict_lines(verdict)
+    )
 
 
-def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
+def _baseline_rows(evaluation: LensEvaluation) -> Table:
     """A row for each baseline: fitted one parameter at a time, and jointly."""
     rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
     baselines = evaluation.baselines
@@ -165,9 +157,10 @@ def evaluation_json(evaluation: LensEvaluation, verdict: Verdict) -> dict[str, A
             for setting in evaluation.settings
         ],
         "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
-        "verdict": verdict_json(verdict),
+        **verdict_json(verdict),
     }
 
 
 def _pixels(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
+    """Three decimals."""
+    return number(value, ".3f")

@@ -1,0 +1,141 @@
+"""What the reports share: numbers and names as text, aligned tables, and the verdict.
+
+Values are rounded by their standard deviation: it keeps two significant digits, and the value has the same
+number of decimals, so that no meaningless digit is shown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.calibration import Calibration, Verdict
+
+Table = list[list[str]]
+"""Rows of cells, the heading first."""
+
+UNITS = dict.fromkeys(INTRINSIC_NAMES, "px") | {"theta": "rad"}
+"""Of the intrinsic parameters; the coefficients of the distortion have none."""
+
+_MOST_VIEWS = 20  # rows of a table that fit on a screen
+_MOST_DECIMALS = 9  # further digits are rounding errors
+# The main measures of a verdict, in words.
+_FACTS: dict[str, Callable[[float], str]] = {
+    "held_out_px": "cross-validation error {:.3g} px".format,
+    "precision_px": "noise floor {:.3g} px".format,
+    "projection_px": lambda std: f"std of predicted pixels {two_digits(std)} px at most",
+    "depth_share": lambda std: f"std of triangulated depth {100 * std:.2g} % of the depth",
+    "coverage": lambda share: f"{100 * share:.0f} % of the image covered",
+}
+
+
+def joined(*blocks: Sequence[str]) -> str:
+    """Blocks of lines with an empty line between them, without blocks that have no lines."""
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def align(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table: the first column to the left, the others to the right."""
+    rows = list(rows)
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if k == 0 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def align_views(heading: list[str], rows: Sequence[tuple[float, list[str]]], what: str) -> list[str]:
+    """Lines of a table of views, or what else `what` says, each row with its error; none for a single row.
+
+    They are in the order of the data; if there are too many, only those with the largest errors are shown.
+    """
+    if len(rows) == 1:
+        return []
+    if len(rows) <= _MOST_VIEWS:
+        return align([heading, *(cells for _, cells in rows)])
+    worst = sorted(rows, key=lambda row: -row[0])[:_MOST_VIEWS]
+    below = f"the {_MOST_VIEWS} {what} with the largest error, of {len(rows)} {what}"
+    return [*align([heading, *(cells for _, cells in worst)]), below]
+
+
+def rounded(value: float, std: float) -> tuple[str, str]:
+    """Format a value and its standard deviation, both to the deviation's second significant digit.
+
+    Examples
+    --------
+    >>> rounded(556.01234, 0.4321)
+    ('556.01', '0.43')
+    >>> rounded(5560.1, 432.1)
+    ('5560', '430')
+    """
+    if not (math.isfinite(value) and math.isfinite(std)) or std <= 0:
+        return f"{value:.7g}", "unknown" if not math.isfinite(std) else "0"
+    decimals = 1 - int(f"{std:.1e}".partition("e")[2])
+    if decimals > _MOST_DECIMALS:
+        return f"{value:.{_MOST_DECIMALS}f}", f"{std:.1e}"
+    places = max(decimals, 0)
+    return f"{round(value, decimals):.{places}f}", f"{round(std, decimals):.{places}f}"
+
+
+def number(value: float, form: str) -> str:
+    """The number in a format such as ``.3g``, or a dash if it is not finite."""
+    return format(value, form) if math.isfinite(value) else "-"
+
+
+def number_or_none(value: float) -> float | None:
+    """The number, or None if it is not finite, as JSON has no such numbers."""
+    return value if math.isfinite(value) else None
+
+
+def printable(name: str) -> str:
+    """The name as printable text on one line, with other characters escaped."""
+    return name if name.isprintable() else ascii(name)[1:-1]
+
+
+def labelled(name: str, unit: str) -> str:
+    """A quantity with its unit, if it has one."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def parameters(calibration: Calibration) -> dict[str, float]:
+    """The intrinsic parameters and the coefficients of the distortion."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    values = [*calibration.intrinsics.values().tolist(), *calibration.distortion.tolist()]
+    return dict(zip(names, values, strict=True))
+
+
+def verdict_lines(verdict: Verdict | None) -> list[str]:
+    """Lines of a verdict: the word, the main measures, reasons and advice."""
+    if verdict is None:
+        return []
+    found = facts(verdict)
+    return [
+        f"verdict: {verdict.word}",
+        *([f"  {found}"] if found else []),
+        *(f"  reason: {reason}" for reason in verdict.reasons),
+        *(f"  advice: {advice}" for advice in verdict.advice),
+    ]
+
+
+def verdict_json(verdict: Verdict | None) -> dict[str, Any]:
+    """The entry `verdict` of a summary, empty without a verdict; measures that are not finite become None."""
+    if verdict is None:
+        return {}
+    measures = {name: number_or_none(value) for name, value in verdict.measures.items()}
+    reasons, advice = list(verdict.reasons), list(verdict.advice)
+    return {"verdict": {"word": verdict.word, "reasons": reasons, "advice": advice, "measures": measures}}
+
+
+def facts(verdict: Verdict) -> str:
+    """The main measures of a verdict in one line."""
+    m = verdict.measures
+    return ", ".join(text(m[name]) for name, text in _FACTS.items() if math.isfinite(m.get(name, math.nan)))
