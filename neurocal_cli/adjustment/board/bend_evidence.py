@@ -107,11 +107,9 @@ def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:
     """
     if not _consistent(bends):
         return False
-    views = sight.views.index
-    rank = np.arange(len(views)) - sight.views.first[views]
     ratio = 0.0  # log ratio, so that a fold whose camera comes from few views does not outweigh the others
     n_folds = min(sight.views.n_views, _FOLDS)
-    halves = [without_points(sight.of_points(rank % 2 == half)) for half in (0, 1)]
+    halves = [without_points(sight.of_points(sight.views.rank % 2 == half)) for half in (0, 1)]
     whole = halves[0] + halves[1]
     for fold in range(n_folds):
         out = np.arange(sight.views.n_views) % n_folds == fold
