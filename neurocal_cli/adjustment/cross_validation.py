@@ -12,7 +12,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.leave_out import (
+    Quadratics,
+    folds_of,
+    inverse_or_nan,
+    quietly,
+    solve_or_nan,
+)
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, free_columns, normal_blocks
@@ -25,11 +31,9 @@ FOLDS = 5
 _RIDGE = 1e-13  # added to the scaled diagonal, so that one undetermined pose does not spoil the other views
 _GOLDEN = 0.6180339887498949
 _Penalty = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
-# Undetermined parameters become inf or nan; the results are tested for that.
-_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@_quietly
+@quietly
 def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadratics:
     """Eliminate the poses from normal matrices (..., 12 + K, 12 + K) of `reprojection.normal_blocks`.
 
@@ -60,7 +64,7 @@ class Minimum:
     repeated: RepeatedPoses | None = None  # views that repeat a pose; they stay in the same fold
 
 
-@_quietly
+@quietly
 def held_out(m: Minimum) -> Array:
     """Squared error of parts of the data when they are held out; (parts,).
 
@@ -74,7 +78,7 @@ def held_out(m: Minimum) -> Array:
     return held_out_points(m.views, m.state, m.free, m.free_poses)
 
 
-@_quietly
+@quietly
 def held_out_views(
     normal: Array,
     free: NDArray[np.bool_],
@@ -93,7 +97,7 @@ def held_out_views(
     return q.held_out(fold, penalty)
 
 
-@_quietly
+@quietly
 def held_out_points(
     views: Views,
     state: CameraState,
@@ -141,7 +145,7 @@ def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
     return blocks.reshape(views.n_views, FOLDS, *found.shape[1:])
 
 
-@_quietly
+@quietly
 def disagreement(m: Minimum) -> tuple[Array, Array]:
     """Difference (f,) between the shared parameters of two halves of the data, and its covariance (f, f).
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.covariance import Covariance, residual_variance
 from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan, quietly, solve_or_nan
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.adjustment.reprojection import free_columns, pose_response
@@ -40,8 +40,7 @@ _GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
-# Undetermined parameters become inf or nan; the results are tested for that.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+@quietly
 def counting_views(
     found: Covariance,
     normal: Array,
@@ -114,7 +113,7 @@ def _determined(S: Array) -> tuple[Array, Array] | None:
     return scale[:, None] * vectors, vectors.T / scale
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+@quietly
 def scores_of_poses(
     normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
 ) -> Quadratics:
@@ -126,15 +125,14 @@ def scores_of_poses(
 
 
 def _weighed(q: Quadratics, times: Array) -> Quadratics:
-    S, g = q.S / times[:, None, None], q.g / times[:, None]
-    return Quadratics(S, g - S @ solve_or_nan(S.sum(axis=0), g.sum(axis=0)), q.cost / times)
+    return Quadratics(q.S / times[:, None, None], q.g / times[:, None], q.cost / times).centred()
 
 
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
     """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
     if not repeated.none:
         q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
-    return Quadratics(q.S, q.g - q.S @ solve_or_nan(q.S.sum(axis=0), q.g.sum(axis=0)), q.cost)
+    return q.centred()
 
 
 def _contradict(q: Quadratics, variance: float) -> bool:
