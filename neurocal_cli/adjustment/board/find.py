@@ -32,8 +32,8 @@ from neurocal_cli.adjustment.board.posterior import (
     posterior_of,
 )
 from neurocal_cli.adjustment.board.prior import SINGLE, nearest_to_given, prior_of
-from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median

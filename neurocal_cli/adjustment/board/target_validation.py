@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.information import Information, joined
 from neurocal_cli.adjustment.board.posterior import camera_step, minimum_of
 from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
-from neurocal_cli.adjustment.board.system import WithoutPoses, points_first, sum_of
+from neurocal_cli.adjustment.board.system import points_first
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses, sum_of
 from neurocal_cli.camera.geometry import Array
 
 _FEWEST = 4  # fewest views, so that the others determine a camera

@@ -16,24 +16,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.board.derivatives import blocks_by_batch, linearised
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    blocks_by_batch,
     folded_information,
     information_of,
     joined,
-    labelled,
-    linearised,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
-from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import without_each
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.covariance import CovarianceBasis
 from neurocal_cli.adjustment.normal_equations import eliminate
-from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.adjustment.views import Views, products
 from neurocal_cli.camera.geometry import Array
@@ -107,7 +104,7 @@ def covariance_basis(
     found = posterior(variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for label -1
-    normal = _efficient(sight, labelled(views, label), followed)
+    normal = _efficient(sight, followed)
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
     poses = found.poses if free_poses else None
@@ -117,10 +114,9 @@ def covariance_basis(
     )  # fmt: skip
 
 
-def _efficient(sight: Sight, label: NDArray[np.intp], followed: Array) -> Array:
+def _efficient(sight: Sight, followed: Array) -> Array:
     """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns."""
-    batches = sight.views.batches
-    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    batches, columns, label = sight.views.batches, sight.columns, sight.slots
     by_batch = blocks_by_batch(batches, sight.state, sight.shapes)
     for chunk, part, by_point in linearised(batches, sight.state, sight.views.scale, label, sight.shapes):
         J = part.copy()
