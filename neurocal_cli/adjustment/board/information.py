@@ -8,7 +8,7 @@ coupled only through c and d, and different points only through c and q, so both
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
@@ -246,6 +246,11 @@ def joined(parts: Sequence[Information]) -> Information:
         own = [getattr(part, field.name) for part in parts]
         blocks[field.name] = np.concatenate(own) if field.name in _OF_POSES else sum(own)
     return Information(**blocks)
+
+
+def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
+    """Sums over all parts but one, for each part left out."""
+    return (joined([part for part in parts if part is not out]) for out in parts)
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> Array:

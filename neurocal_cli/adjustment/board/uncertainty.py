@@ -22,7 +22,7 @@ from neurocal_cli.adjustment.board.information import (
     Sight,
     folded_information,
     information_of,
-    joined,
+    joined_without_each,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
@@ -73,10 +73,6 @@ def covariance_basis(
         """The quadratic in the whole offsets."""
         return info.turned(prior.axes).around_given(offsets)
 
-    def held(info: Information) -> Information:
-        """Add the prior of the bends of single views, if there are any."""
-        return info if target.bends is None else info.held(variance / target.bends.size**2)
-
     if prior.stated is None:
         unknowns = int(free.sum()) + (6 * views.n_views if free_poses else 0)
         spare = views.n_equations - unknowns - bent
@@ -89,11 +85,13 @@ def covariance_basis(
         if n_poses > _MOST_POSES:
             return None
         folded = folded_information([sight], n, [group])
-        parts = folded.parts(held(in_offsets(folded.whole)), in_offsets)
+        whole = in_offsets(folded.whole)
+        if target.bends is not None:
+            whole = whole.held(variance / target.bends.size**2)
+        parts = folded.parts(whole, in_offsets)
         try:
             if target.only_bends:
-                others = (joined([part for part in parts if part is not out]) for out in parts)
-                return np.stack([camera_step_of(some) for some in others])
+                return np.stack([camera_step_of(rest) for rest in joined_without_each(parts)])
             without = [WithoutPoses(part) for part in parts]
             return np.stack([step for step, _ in without_each(without, prior, target.sizes, variance)])
         except np.linalg.LinAlgError:
@@ -102,9 +100,7 @@ def covariance_basis(
     if posterior is None:
         posterior = partial(posterior_of, target, in_offsets(information_of([sight], n)), prior)
     found = posterior(variance)
-    followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
-    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for label -1
-    normal = _efficient(sight, followed)
+    normal = _efficient(sight, np.einsum("fni,nji->fnj", found.followed, prior.axes))
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
     poses = found.poses if free_poses else None
@@ -115,7 +111,11 @@ def covariance_basis(
 
 
 def _efficient(sight: Sight, followed: Array) -> Array:
-    """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns."""
+    """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns.
+
+    `followed` (f, n, 3) is the regression of the camera's scores on those of the offsets in the world's axes.
+    """
+    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for padding, labelled -1
     batches, columns, label = sight.views.batches, sight.columns, sight.slots
     by_batch = blocks_by_batch(batches, sight.state, sight.shapes)
     for chunk, part, by_point in linearised(batches, sight.state, sight.views.scale, label, sight.shapes):
