@@ -3,9 +3,9 @@
     E = sum_k sum_i |m_ki - pi(A (R_k M_i + t_k))|^2
 
 The unknowns are the free entries of A and the distortion coefficients, shared by all views, and one pose for
-each view. Rotations are updated as R -> exp(omega) R, so they stay rotations. `least_squares` runs the
-descent. Views that share unknowns form one group; its poses are eliminated view by view (Schur complement),
-so the work grows linearly with the number of views. Views that share nothing are a group each.
+each view. Rotations are updated as R -> exp(omega) R, so they stay rotations. `levenberg_marquardt`
+runs the descent. Views that share unknowns form one group; its poses are eliminated view by view (Schur
+complement), so the work grows linearly with the number of views. Views that share nothing are a group each.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import damped_step, schur_step
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import PointBatches
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, orthonormalised
@@ -102,8 +102,8 @@ class _Reprojection:
         # Columns of the camera's parameters, and indices of the free ones among them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
-        self.shared, self.pose = self.camera[self.free], np.arange(POSE.start, POSE.stop)
-        self.columns = np.concatenate([self.shared, self.pose]) if free_pose else self.shared
+        self.shared = self.camera[self.free]
+        self.columns = np.concatenate([self.shared, POSE_COLUMNS]) if free_pose else self.shared
         self.together = len(start.entries) == 1 and bool(self.free.size) and batches.n_views > 1
         self.normal, _ = self._blocks(start)
 
@@ -125,7 +125,10 @@ class _Reprojection:
                 self.normal.sum(axis=0, keepdims=True), damping, active
             )
             return (by_camera, np.zeros((self.batches.n_views, 6))), promised
-        return self._solve_together(float(damping[0]))
+        step, by_pose, gain = schur_step(self.normal, self.shared, POSE_COLUMNS, float(damping[0]))
+        by_camera = np.zeros((1, len(self.camera)))
+        by_camera[0, self.free] = step
+        return (by_camera, by_pose), np.array([gain])
 
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
         """The state after a step, its costs, and whether it is valid.
@@ -180,10 +183,3 @@ class _Reprojection:
         whole[active[:, None], columns] = step
         by_camera = whole[:, self.camera] if self.free.size else np.zeros((1, len(self.camera)))
         return (by_camera, whole[:, POSE]), promised
-
-    def _solve_together(self, damping: float) -> tuple[_Step, Array]:
-        """One A, a pose for each view: the poses are eliminated by the Schur complement."""
-        step, by_pose, promised = schur_step(self.normal, self.shared, self.pose, damping)
-        by_camera = np.zeros((1, len(self.camera)))
-        by_camera[0, self.free] = step
-        return (by_camera, by_pose), np.array([promised])

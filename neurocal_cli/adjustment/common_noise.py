@@ -8,7 +8,8 @@ the noise is modelled as
 
 where k is the level of the residuals. If the residuals do not contradict m = 0, m is 0. Otherwise it is the
 largest m that they do not contradict, because overweighting a few points does more harm than underweighting
-them. If C does not predict the residuals at all, m is 1 and all points have equal weight.
+them. If C does not predict the residuals at all, m is 1 and all points have equal weight. Adjusting and
+estimating m alternate (`reweighted`).
 
 Isotropic covariances (a column ``sigma``) are weights that the user chose; they are used as they are.
 
@@ -16,8 +17,6 @@ For points measured across edges (`measured_directions`), C and the residuals ar
 covariances contain the measurement noise and the board's unevenness. If k is 4 or more, most of the residuals
 are model errors of the target or the lens, which appear along the edges as much as across them: then all
 points are weighted equally in both directions. Up to k = 2 they are weighted as measured.
-
-Reweight points: their measured covariances count only as far as the residuals support them.
 """
 
 from __future__ import annotations
@@ -49,6 +48,8 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEPS = 12  # of golden section and of bisection
 _CONTRADICTED = 3.0  # standard deviations
 _MEASURED, _MISFIT = 2.0, 4.0  # levels: measurement noise up to the first, model error from the second
+_PASSES = 10
+_SETTLED = 0.005  # change of the share that is negligible for every result
 
 
 @frozen_dataclass
@@ -57,6 +58,54 @@ class Noise:
 
     share: float = 0.0  # m, the share of the noise that is common to all points
     along: float = LEAST  # weight along the edge of points measured across it
+
+
+def reweighted(solution: Solution) -> Solution:
+    """Alternate between adjusting and estimating the noise common to all points.
+
+    The given solution is adjusted with the stated covariances alone.
+    """
+    points = solution.problem.points
+    if points.covariance is None or not measured(points.covariance):
+        return solution
+    # Start from equal weights: if a few points dominated the fit, their small residuals would confirm that.
+    noise = Noise(share=1.0)
+    solution = _adjusted_with(solution, noise)
+    for _ in range(_PASSES):
+        views = solution.problem.views
+        residuals = point_residuals(views, solution.state) * views.pixel_scale
+        last, noise = noise, noise_of(_stated(points, views), residuals, views.across)
+        if max(abs(noise.share - last.share), abs(noise.along - last.along)) < _SETTLED:
+            break
+        solution = _adjusted_with(solution, noise)
+    return replace(solution, common_noise=noise.share)
+
+
+def _adjusted_with(solution: Solution, noise: Noise) -> Solution:
+    problem = solution.problem
+    problem = replace(problem, views=_with_noise(problem.views, problem.points, noise))
+    return replace(solution, problem=problem, adjusted=problem.adjust(solution.adjusted))
+
+
+def weighed(points: Correspondences, residuals: Array) -> Views:
+    """Arrange points and weight them as far as the residuals (N, 2) [px] of a calibration support that."""
+    views = arrange(points)
+    if points.covariance is None or not measured(points.covariance):
+        return views
+    rows = slice(None) if views.order is None else views.order
+    return _with_noise(views, points, noise_of(_stated(points, views), residuals[rows], views.across))
+
+
+def _stated(points: Correspondences, views: Views) -> Array:
+    """The stated covariances in the order of the views."""
+    assert points.covariance is not None
+    return points.covariance if views.order is None else points.covariance[views.order]
+
+
+def _with_noise(views: Views, points: Correspondences, noise: Noise) -> Views:
+    believed = with_common_share(_stated(points, views), noise.share, views.across)
+    whitening = noise_model(believed, views.across, noise.along)[1]
+    return replace(views, whitening=whitening, along=noise.along)
 
 
 def noise_of(covariance: Array, residuals: Array, across: Array | None) -> Noise:
@@ -154,55 +203,3 @@ def _unlikelihood(covariance: Array, residuals: Array, across: Array | None) -> 
         return float(0.5 * count * np.log(chi / len(one)) + 0.5 * log_det / len(one))
 
     return at
-
-
-_PASSES = 10
-_SETTLED = 0.005  # change of the share that is negligible for every result
-
-
-def reweighted(solution: Solution) -> Solution:
-    """Alternate between adjusting and estimating the noise common to all points; see `common_noise`.
-
-    The given solution is adjusted with the stated covariances alone.
-    """
-    points = solution.problem.points
-    if points.covariance is None or not measured(points.covariance):
-        return solution
-    # Start from equal weights: if a few points dominated the fit, their small residuals would confirm that.
-    noise = Noise(share=1.0)
-    solution = _weighed(solution, noise)
-    for _ in range(_PASSES):
-        views = solution.problem.views
-        residuals = point_residuals(views, solution.state) * views.pixel_scale
-        last, noise = noise, noise_of(_stated(points, views), residuals, views.across)
-        if max(abs(noise.share - last.share), abs(noise.along - last.along)) < _SETTLED:
-            break
-        solution = _weighed(solution, noise)
-    return replace(solution, common_noise=noise.share)
-
-
-def weighed(points: Correspondences, residuals: Array) -> Views:
-    """Arrange points and weight them as far as the residuals (N, 2) [px] of a calibration support that."""
-    views = arrange(points)
-    if points.covariance is None or not measured(points.covariance):
-        return views
-    rows = slice(None) if views.order is None else views.order
-    return _with_noise(views, points, noise_of(_stated(points, views), residuals[rows], views.across))
-
-
-def _stated(points: Correspondences, views: Views) -> Array:
-    """The stated covariances in the order of the views."""
-    assert points.covariance is not None
-    return points.covariance if views.order is None else points.covariance[views.order]
-
-
-def _with_noise(views: Views, points: Correspondences, noise: Noise) -> Views:
-    believed = with_common_share(_stated(points, views), noise.share, views.across)
-    whitening = noise_model(believed, views.across, noise.along)[1]
-    return replace(views, whitening=whitening, along=noise.along)
-
-
-def _weighed(solution: Solution, noise: Noise) -> Solution:
-    problem = solution.problem
-    problem = replace(problem, views=_with_noise(problem.views, problem.points, noise))
-    return replace(solution, problem=problem, adjusted=problem.adjust(solution.adjusted))

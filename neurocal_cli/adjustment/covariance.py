@@ -4,17 +4,13 @@ For Gaussian noise this is the Cramer-Rao bound at the estimate. The block of th
 Schur complement over the views. The block of each pose is that of its own view plus the part propagated from
 the intrinsics.
 
-Uncertainty of poses that comes from the uncertainty of a given camera (type 3).
-
-The poses of a view follow an error of the given camera as they would follow that parameter if it were
-estimated, d pose = -B^-1 C d camera, where B and C are the blocks of the view's normal matrix for its pose
-and for its pose and the camera. With the covariance S of the camera, the pose of the view has the additional
-covariance B^-1 C S C^T B^-1. It does not fall with the number of points.
-
-Standard deviations of the user's parameters from the covariance of the normalised unknowns, with warnings.
+The pose of a view follows an error of the camera as d pose = -B^-1 C d camera, where B and C are the blocks
+of the view's normal matrix for its pose and for its pose and the camera. So if a camera with the covariance S
+was given (type 3), each pose has the additional covariance B^-1 C S C^T B^-1. It does not fall with the
+number of points.
 
 The estimators work with A's entries in normalised pixels and with poses about the centre of their target.
-Users want the paper's parameters in pixels, radians and world units.
+Users want standard deviations of the paper's parameters, in pixels, radians and world units.
 """
 
 from __future__ import annotations
@@ -24,8 +20,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import inverse_scaled, schur_covariance, solve_scaled
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.normal_equations import inverse_scaled, schur_covariance
+from neurocal_cli.adjustment.reprojection import (
+    POSE,
+    POSE_COLUMNS,
+    camera_columns,
+    free_columns,
+    normal_blocks,
+    pose_response,
+)
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
@@ -33,6 +36,11 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.camera.state import CameraState
+
+# These limits decide only about warnings; no result depends on them.
+_POOR = 0.05  # std of a parameter over its value (for the centre: over alpha)
+_POOR_THETA = 0.02  # rad
+_TOLD_APART = 2.0  # standard deviations from which on a coefficient differs significantly from 0
 
 
 @frozen_dataclass(eq=False)
@@ -72,10 +80,8 @@ def covariance(
     the number of equations: two for most points; see `measured_directions`. If the covariance `shared` (f, f)
     of the free entries and coefficients comes from elsewhere, the poses' covariance is propagated from it.
     """
-    f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
-    V = len(normal)
-    unknowns = len(f) + (6 * V if free_pose else 0)
-    variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
+    f, V = free_columns(free), len(normal)
+    variance = residual_variance(normal, free, free_pose, n_residuals)
     if not free_pose:
         if shared is not None:
             return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
@@ -83,12 +89,18 @@ def covariance(
         inverse, smallest = inverse_scaled(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
     if shared is None:
-        found = schur_covariance(normal, f, np.arange(POSE.start, POSE.stop))
+        found = schur_covariance(normal, f, POSE_COLUMNS)
         return Covariance(variance * found.shared, variance * found.own, found.smallest)
     B = normal[:, POSE, POSE]
     B_inverse, smallest = inverse_scaled(B, B)
     gain = normal[:, f, POSE] @ B_inverse
     return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
+
+
+def residual_variance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float) -> float:
+    """Variance of the residuals, with the parameters of `covariance`."""
+    unknowns = int(free.sum()) + (6 * len(normal) if free_pose else 0)
+    return float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
 
 
 def entry_covariance(
@@ -111,15 +123,8 @@ def covariance_by_camera(views: Views, state: CameraState, entries: Array) -> Ar
     `entries` (5 + K, 5 + K) is as from `entry_covariance`, and `state` is normalised and at its minimum.
     """
     normal, _ = normal_blocks(views.batches, state)
-    columns = camera_columns(state.k.shape[-1])
-    gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2))  # (V, 6, 5 + K)
+    gain = pose_response(normal, camera_columns(state.k.shape[-1]))
     return np.asarray(gain @ entries @ np.swapaxes(gain, 1, 2))
-
-
-# These limits decide only about warnings; no result depends on them.
-_POOR = 0.05  # std of a parameter over its value (for the centre: over alpha)
-_POOR_THETA = 0.02  # rad
-_TOLD_APART = 2.0  # standard deviations from which on a coefficient differs significantly from 0
 
 
 def parameter_covariance(
@@ -164,41 +169,31 @@ def parameter_warnings(
 ) -> tuple[str, ...]:
     """Warn of poorly determined parameters, and of coefficients that are not significantly different from 0.
 
-    A model selected by cross-validation may well have such a coefficient, so no warning is given then.
+    Alpha alone means nothing in models with xi. A model selected by cross-validation may well have a
+    coefficient that is not significant, so no warning is given then.
     """
-    return (
-        *_poor(intrinsics, distortion.model, std),
-        *(() if model_chosen else _noise_coefficients(distortion, std)),
-    )
-
-
-def _poor(intrinsics: Intrinsics, model: str, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Warn of poorly determined parameters; alpha alone means nothing in models with xi."""
     alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
     limits = {
-        "alpha_u": np.inf if model in WITH_XI else _POOR * intrinsics.alpha_u,
-        "alpha_v": np.inf if model in WITH_XI else _POOR * intrinsics.alpha_v,
+        "alpha_u": np.inf if distortion.model in WITH_XI else _POOR * intrinsics.alpha_u,
+        "alpha_v": np.inf if distortion.model in WITH_XI else _POOR * intrinsics.alpha_v,
         "u0": _POOR * alpha,
         "v0": _POOR * alpha,
         "theta": _POOR_THETA,
     }
     poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
-    if not poor:
-        return ()
-    return (
-        f"poorly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-        "the target more, or give known parameters (--no-skew, --type 2)",
-    )
-
-
-def _noise_coefficients(distortion: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Warn of coefficients that are not significantly different from 0."""
-    pairs = zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
     noise = [
         f"{name} ({k:.2g} +- {std[name]:.2g})"
-        for name, k in pairs
-        if name[0] in "kpst" and 0 < abs(k) < _TOLD_APART * std[name]
+        for name, k in zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
+        if not model_chosen and name[0] in "kpst" and 0 < abs(k) < _TOLD_APART * std[name]
     ]
-    if not noise:
-        return ()
-    return (f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion",)
+    warnings = []
+    if poor:
+        warnings.append(
+            f"poorly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
+            "the target more, or give known parameters (--no-skew, --type 2)"
+        )
+    if noise:
+        warnings.append(
+            f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion"
+        )
+    return tuple(warnings)

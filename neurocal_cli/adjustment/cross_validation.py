@@ -12,10 +12,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
+from neurocal_cli.adjustment.leave_out import (
+    Quadratics,
+    folds_of,
+    inverse_or_nan,
+    quietly,
+    solve_or_nan,
+)
 from neurocal_cli.adjustment.normal_equations import eliminate
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, free_columns, normal_blocks
 from neurocal_cli.adjustment.views import Views, batches_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -24,13 +30,10 @@ from neurocal_cli.camera.state import CameraState
 FOLDS = 5
 _RIDGE = 1e-13  # added to the scaled diagonal, so that one undetermined pose does not spoil the other views
 _GOLDEN = 0.6180339887498949
-_POSE = np.arange(POSE.start, POSE.stop)
 _Penalty = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
-# Undetermined parameters become inf or nan; the results are tested for that.
-_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@_quietly
+@quietly
 def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadratics:
     """Eliminate the poses from normal matrices (..., 12 + K, 12 + K) of `reprojection.normal_blocks`.
 
@@ -41,17 +44,12 @@ def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadrat
 
 def _eliminated(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> tuple[Quadratics, Array]:
     """Quadratics, and the poses' response to the shared parameters with their own step; (..., 6, f + 1)."""
-    kept = np.append(_shared(free), normal.shape[-1] - 1)
+    kept = np.append(free_columns(free), normal.shape[-1] - 1)
     if free_poses:
-        left, solved = eliminate(normal, kept, _POSE, _RIDGE)
+        left, solved = eliminate(normal, kept, POSE_COLUMNS, _RIDGE)
     else:
         left, solved = normal[..., kept[:, None], kept], np.zeros((*normal.shape[:-2], 6, len(kept)))
     return Quadratics(left[..., :-1, :-1], left[..., :-1, -1], left[..., -1, -1]), solved
-
-
-def _shared(free: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Columns of the free shared parameters."""
-    return camera_columns(len(free) - 5)[np.flatnonzero(free)]
 
 
 @frozen_dataclass(eq=False)
@@ -66,7 +64,7 @@ class Minimum:
     repeated: RepeatedPoses | None = None  # views that repeat a pose; they stay in the same fold
 
 
-@_quietly
+@quietly
 def held_out(m: Minimum) -> Array:
     """Squared error of parts of the data when they are held out; (parts,).
 
@@ -80,7 +78,7 @@ def held_out(m: Minimum) -> Array:
     return held_out_points(m.views, m.state, m.free, m.free_poses)
 
 
-@_quietly
+@quietly
 def held_out_views(
     normal: Array,
     free: NDArray[np.bool_],
@@ -99,7 +97,7 @@ def held_out_views(
     return q.held_out(fold, penalty)
 
 
-@_quietly
+@quietly
 def held_out_points(
     views: Views,
     state: CameraState,
@@ -114,28 +112,23 @@ def held_out_points(
     """
     normal = _by_fold(views, state, _wedges(views))  # (V, F, W, W)
     rest = normal.sum(axis=1, keepdims=True) - normal
-    step = _whole_steps(rest, free, free_poses, penalty)
+    q, solved = _eliminated(rest, free, free_poses)
+    S, g = q.S.sum(axis=0), q.g.sum(axis=0)
+    camera = solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])  # (F, f)
+    step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
+    step[..., free_columns(free)] = camera
+    step[..., POSE] = solved[..., -1] - (solved[..., :-1] @ camera[:, :, None])[..., 0]
     return Quadratics(normal[..., :-1, :-1], normal[..., :-1, -1], normal[..., -1, -1]).at(step).reshape(-1)
 
 
 def _wedges(views: Views) -> NDArray[np.intp]:
     """(N,) fold of each point: five wedges of each view's image with equally many points."""
-    du, dv = (views.pixels - np.repeat(_means(views.pixels, views), views.counts, axis=0)).T
+    centre = np.add.reduceat(views.pixels, views.first) / views.counts[:, None]
+    du, dv = (views.pixels - np.repeat(centre, views.counts, axis=0)).T
     order = np.lexsort((np.arctan2(dv, du), views.index))
     fold = np.empty(len(order), dtype=np.intp)
-    rank = np.arange(len(order)) - np.repeat(views.first, views.counts)
-    fold[order] = rank * FOLDS // np.repeat(views.counts, views.counts)
+    fold[order] = views.rank * FOLDS // np.repeat(views.counts, views.counts)
     return fold
-
-
-def _means(values: Array, views: Views) -> Array:
-    return np.asarray(np.add.reduceat(values, views.first) / views.counts[:, None])
-
-
-def _dealt(views: Views) -> NDArray[np.intp]:
-    """(N,) fold of each point, spread over the target by an irrational stride, to avoid rows and columns."""
-    rank = np.arange(len(views.index)) - np.repeat(views.first, views.counts)
-    return np.asarray((rank * _GOLDEN % 1.0 * FOLDS).astype(np.intp))
 
 
 def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
@@ -152,20 +145,7 @@ def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
     return blocks.reshape(views.n_views, FOLDS, *found.shape[1:])
 
 
-def _whole_steps(normal: Array, free: NDArray[np.bool_], free_poses: bool, penalty: _Penalty | None) -> Array:
-    """Steps to the minimum of each fold's normal matrices (V, F, W, W), poses included; (V, F, W - 1)."""
-    step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
-    q, solved = _eliminated(normal, free, free_poses)
-    S, g = q.S.sum(axis=0), q.g.sum(axis=0)
-    if penalty is not None:
-        S, g = S + penalty[0], g + penalty[1]
-    camera = solve_or_nan(S, g)  # (F, f)
-    step[..., _shared(free)] = camera
-    step[..., POSE] = solved[..., -1] - (solved[..., :-1] @ camera[:, :, None])[..., 0]
-    return step
-
-
-@_quietly
+@quietly
 def disagreement(m: Minimum) -> tuple[Array, Array]:
     """Difference (f,) between the shared parameters of two halves of the data, and its covariance (f, f).
 
@@ -185,7 +165,8 @@ def disagreement(m: Minimum) -> tuple[Array, Array]:
             if repeated is not None and not repeated.none:
                 cov = cov @ q.summed(half * repeated.variance[pose])[0] @ cov
             return step[0] - step[1], cov.sum(axis=0)
-    by_fold = _by_fold(m.views, m.state, _dealt(m.views))
+    # Spread the folds over the target by an irrational stride, to avoid rows and columns.
+    by_fold = _by_fold(m.views, m.state, (m.views.rank * _GOLDEN % 1.0 * FOLDS).astype(np.intp))
     two = np.stack([by_fold[:, :2].sum(axis=1), by_fold[:, 2:4].sum(axis=1)], axis=1)
     q = reduced(two, m.free, m.free_poses)
     S, g = q.S.sum(axis=0), q.g.sum(axis=0)

@@ -11,6 +11,8 @@ these few small matrices: exactly if the problem is linear, otherwise to second 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ from neurocal_cli.camera.geometry import Array
 
 _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal that is not mere rounding
 # Undetermined unknowns become inf or nan; the results are tested for that.
-_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @frozen_dataclass(eq=False)
@@ -31,18 +33,22 @@ class Quadratics:
     g: Array  # (G, f)
     cost: Array  # (G,)
 
-    @_quietly
+    @quietly
     def at(self, step: Array) -> Array:
         """(G,) error of each group after a step (f,), or a step of its own (G, f)."""
         step = np.broadcast_to(step, self.g.shape)
         square = (step * (self.S @ step[..., None])[..., 0]).sum(axis=-1)
         return np.asarray(self.cost - 2 * (self.g * step).sum(axis=-1) + square)
 
+    def centred(self) -> Quadratics:
+        """The same with the scores g at the minimum of the sum."""
+        return replace(self, g=self.g - self.S @ solve_or_nan(self.S.sum(axis=0), self.g.sum(axis=0)))
+
     def summed(self, member: Array) -> tuple[Array, Array]:
         """S (F, f, f) and g (F, f) of sets of groups; member (F, G) is 1 where a group belongs to a set."""
         return np.einsum("fg,gij->fij", member, self.S), member @ self.g
 
-    @_quietly
+    @quietly
     def steps(self, member: Array, penalty: tuple[Array, Array] | None = None) -> Array:
         """Steps (F, f) to the minimum over F sets of groups; nan where a set does not determine the unknowns.
 
@@ -52,18 +58,18 @@ class Quadratics:
         S, g = self.summed(member)
         return solve_or_nan(S, g) if penalty is None else solve_or_nan(S + penalty[0], g + penalty[1])
 
-    @_quietly
+    @quietly
     def held_out(self, fold: NDArray[np.intp], penalty: tuple[Array, Array] | None = None) -> Array:
         """(G,) error of each group with the unknowns estimated from all groups outside its fold (G,)."""
         member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
         return self.at(self.steps(1.0 - member, penalty)[fold])
 
-    @_quietly
+    @quietly
     def moves_without_each(self) -> Array:
         """(G, f) how far the unknowns move when one group is left out."""
         return solve_or_nan(self.S.sum(axis=0) - self.S, self.g.sum(axis=0) - self.g)
 
-    @_quietly
+    @quietly
     def cost_without_each(self) -> Array:
         """(G,) error of all other groups, fitted again without the group."""
         gained = ((self.g.sum(axis=0) - self.g) * self.moves_without_each()).sum(axis=-1)
@@ -85,7 +91,7 @@ def inverse_or_nan(S: Array) -> Array:
     return _solved(S, np.broadcast_to(np.eye(S.shape[-1]), S.shape))
 
 
-@_quietly
+@quietly
 def _solved(S: Array, right: Array) -> Array:
     """S^-1 times right sides (..., f, m)."""
     if right.size == 0:

@@ -186,7 +186,7 @@ class LevenbergMarquardt:
         self.growth = np.where(better, 2.0, 2 * self.growth)
         self.cost = after
         exact = self.cost <= self.floor
-        negligible = self._last_gain(before)
+        negligible = options.tolerance * before + options.negligible
         gain = promised if options.by_promise else gained
         next_gain = gain * (gain / self.gain)  # nan after a failed step
         converged = better & ((gain < negligible) | (next_gain < _FORETOLD * negligible))
@@ -204,11 +204,6 @@ class LevenbergMarquardt:
                 stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
             stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
             self._retire(done, stop)
-
-    def _last_gain(self, cost: Array) -> Array:
-        """Least gain of an accepted step after which the descent goes on."""
-        share = self.options.tolerance * cost
-        return share + self.options.negligible if self.options.negligible else share
 
     def renew(self) -> None:
         """Read the costs again after the problem has changed; all groups must be active.

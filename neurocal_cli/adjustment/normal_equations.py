@@ -1,10 +1,9 @@
 """Stacks of normal equations: solved, damped and inverted, always scaled to a unit diagonal.
 
-Least squares with unknowns shared by all blocks and unknowns of each block's own.
-
-The normal matrix is an arrowhead: the own unknowns of different blocks (the poses of views) are coupled only
-through the shared ones (the cameras). The Schur complement eliminates each block's own unknowns and leaves a
-small system, so the work grows linearly with the number of blocks.
+With unknowns shared by all blocks (cameras) and unknowns of each block's own (the poses of views), the normal
+matrix is an arrowhead: the own unknowns of different blocks are coupled only through the shared ones. The
+Schur complement eliminates each block's own unknowns and leaves a small system, so the work grows linearly
+with the number of blocks.
 """
 
 from __future__ import annotations
@@ -21,6 +20,9 @@ from neurocal_cli.camera.geometry import Array
 NOTHING = 1e-300  # avoids a division by 0 for a zero diagonal
 ROUNDING = 1e-14  # a ridge that regularises a singular system and is negligible in a regular one
 _ABSENT = 1e-30  # an eigenvalue of the scaled matrix below this counts as 0
+
+Columns = NDArray[np.intp]
+State = TypeVar("State")
 
 
 def unit_diagonal(H: Array) -> tuple[Array, Array]:
@@ -77,18 +79,17 @@ def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
     return inverse * outer, smallest
 
 
-Columns = NDArray[np.intp]
-State = TypeVar("State")
+def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:
+    """Eliminate a block's own unknowns from its normal matrix N (..., D, D) (Schur complement).
 
-
-@frozen_dataclass(eq=False)
-class SchurCovariance:
-    """Blocks of the inverse of an arrowhead matrix."""
-
-    shared: Array  # (f, f)
-    own: Array  # (V, p, p)
-    cross: Array  # (V, f, p) between the shared unknowns and each block's own
-    smallest: float  # smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular
+    `own` (p,) are the columns of these unknowns, and `kept` (k,) those that stay; include the residual's
+    column to keep the right side and the sum of squares. `ridge` is as for `solve_scaled`. Returns the
+    reduced matrix N_kk - N_ko N_oo^-1 N_ok (..., k, k), and N_oo^-1 N_ok (..., p, k): the response of the own
+    unknowns to the others; in the residual's column, their step.
+    """
+    cross = N[..., own[:, None], kept]
+    solved = solve_scaled(N[..., own[:, None], own], cross, ridge)
+    return N[..., kept[:, None], kept] - np.swapaxes(cross, -1, -2) @ solved, solved
 
 
 def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple[Array, Array, float]:
@@ -120,6 +121,32 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
     by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
     gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
     return step, by_own, float(gain)
+
+
+@frozen_dataclass(eq=False)
+class SchurCovariance:
+    """Blocks of the inverse of an arrowhead matrix."""
+
+    shared: Array  # (f, f)
+    own: Array  # (V, p, p)
+    cross: Array  # (V, f, p) between the shared unknowns and each block's own
+    smallest: float  # smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular
+
+
+def schur_covariance(N: Array, shared: Columns, own: Columns) -> SchurCovariance:
+    """Inverse of the normal matrix, block by block; see `schur_step` for the parameters.
+
+    Times the residual variance it is the Cramer-Rao bound at the estimate.
+    """
+    U = N[:, shared[:, None], shared].sum(axis=0)
+    B_inverse, smallest = inverse_scaled(B := N[:, own[:, None], own], B)
+    C = N[:, shared[:, None], own]
+    gain = C @ B_inverse
+    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
+    S_inverse, smallest_shared = inverse_scaled(S, U)
+    cross = -S_inverse @ gain
+    covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
+    return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
 
 
 class SharedAndOwn(Generic[State]):
@@ -159,32 +186,3 @@ class SharedAndOwn(Generic[State]):
         """Accept the trial."""
         if better[0]:
             self.state = trial
-
-
-def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:
-    """Eliminate a block's own unknowns from its normal matrix N (..., D, D) (Schur complement).
-
-    `own` (p,) are the columns of these unknowns, and `kept` (k,) those that stay; include the residual's
-    column to keep the right side and the sum of squares. `ridge` is as for `solve_scaled`. Returns the
-    reduced matrix N_kk - N_ko N_oo^-1 N_ok (..., k, k), and N_oo^-1 N_ok (..., p, k): the response of the own
-    unknowns to the others; in the residual's column, their step.
-    """
-    cross = N[..., own[:, None], kept]
-    solved = solve_scaled(N[..., own[:, None], own], cross, ridge)
-    return N[..., kept[:, None], kept] - np.swapaxes(cross, -1, -2) @ solved, solved
-
-
-def schur_covariance(N: Array, shared: Columns, own: Columns) -> SchurCovariance:
-    """Inverse of the normal matrix, block by block; see `schur_step` for the parameters.
-
-    Times the residual variance it is the Cramer-Rao bound at the estimate.
-    """
-    U = N[:, shared[:, None], shared].sum(axis=0)
-    B_inverse, smallest = inverse_scaled(B := N[:, own[:, None], own], B)
-    C = N[:, shared[:, None], own]
-    gain = C @ B_inverse
-    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
-    S_inverse, smallest_shared = inverse_scaled(S, U)
-    cross = -S_inverse @ gain
-    covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
-    return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))

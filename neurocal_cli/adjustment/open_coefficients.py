@@ -24,7 +24,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.leave_out import inverse_or_nan
+from neurocal_cli.adjustment.leave_out import inverse_or_nan, quietly
 from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, coefficient_names
@@ -187,7 +187,7 @@ def open_at_points(
     return open_coefficients(state.model, state.k, free, tried, _farthest(seen), corner)
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+@quietly
 def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
     """Posterior of the open unknowns by model averaging.
 

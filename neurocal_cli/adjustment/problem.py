@@ -1,9 +1,7 @@
 """A calibration problem: the points, and the given parameters of the camera (the paper's section 4.1).
 
 Given are: type 1: nothing. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
-Type 4: the extrinsics, V.
-
-Convert a state between normalised units and pixels with world units.
+Type 4: the extrinsics, V. Adjustments work in normalised units; `in_pixels` and `normalised` convert states.
 """
 
 from __future__ import annotations
@@ -108,10 +106,7 @@ class Problem:
         Raises InputError if the given distortion maps no ray to one of the pixels, and
         DegenerateGeometryError if all pixels coincide.
         """
-        if self.free_distortion:
-            views, turned = arrange(points), None
-        else:
-            views, turned = _undistorted_views(points, self.distortion, self.entries)
+        views, turned = _views_of(points, self.distortion, self.entries, self.free_distortion)
         penalty = self.penalty if self.distortion.model == "rich" else None
         return replace(self, points=points, views=views, turned=turned, penalty=penalty)
 
@@ -159,13 +154,6 @@ class Problem:
             self.views.batches, state, free, self.free_poses, max_iterations, self.penalty, damping
         )
         return replace(adjusted, iterations=done + adjusted.iterations)
-
-
-def intrinsic_matrix(entries: Array) -> Array:
-    """(3, 3) upper triangular A from its entries (5,), in any unit."""
-    A = np.eye(3)
-    A[ENTRIES] = entries
-    return A
 
 
 def problem_for(
@@ -225,18 +213,50 @@ def problem_for(
     free_distortion = type != 3 and distortion.model != "none"
     if type == 3:
         fixed |= set(coefficient_names(distortion.model))
-    views, turned = (
-        (arrange(points), None) if free_distortion else _undistorted_views(points, distortion, entries)
-    )
+    views, turned = _views_of(points, distortion, entries, free_distortion)
     given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
     return Problem(points, views, *given, turned=turned)
 
 
-def _undistorted_views(
-    points: Correspondences, distortion: Distortion, entries: Array
+def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
+    centre = image_center if image_center is not None else points.image_center
+    if centre is None and points.image_size is not None:
+        # Pixel centres run from 0 to the size less 1.
+        centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
+    if centre is None:
+        raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
+    try:
+        values = np.array(centre, dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
+        raise InputError("the image centre must be two finite numbers of the size of an image; correct it")
+    return values
+
+
+def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
+    if extrinsics is None:
+        raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
+    wrong = "the extrinsics must be a dict with a Pose for each view"
+    if not isinstance(extrinsics, Mapping):
+        raise UsageError(wrong)
+    missing = [name for name in points.view_names if name not in extrinsics]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"the extrinsics have no view named {missing[0]!r}{more}; they have "
+            f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
+        )
+    if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
+        raise UsageError(wrong)
+    return {name: extrinsics[name] for name in points.view_names}
+
+
+def _views_of(
+    points: Correspondences, distortion: Distortion, entries: Array, free_distortion: bool
 ) -> tuple[Views, Array | None]:
     """Views with a given distortion removed from their pixels, and the rotations of their pinholes."""
-    if distortion.is_identity:
+    if free_distortion or distortion.is_identity:
         return arrange(points), None
     camera = Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), distortion)
     seen = _seen_nearby(camera, points.pixels)
@@ -297,38 +317,11 @@ def _turned_pixels(points: Correspondences, rays: Array, camera: Camera) -> tupl
         return np.column_stack(image_points(camera.entries, "none", (), X / depth, Y / depth)), turned
 
 
-def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
-    centre = image_center if image_center is not None else points.image_center
-    if centre is None and points.image_size is not None:
-        # Pixel centres run from 0 to the size less 1.
-        centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
-    if centre is None:
-        raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
-    try:
-        values = np.array(centre, dtype=float)
-    except (TypeError, ValueError):
-        values = np.zeros(0)
-    if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
-        raise InputError("the image centre must be two finite numbers of the size of an image; correct it")
-    return values
-
-
-def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
-    if extrinsics is None:
-        raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
-    wrong = "the extrinsics must be a dict with a Pose for each view"
-    if not isinstance(extrinsics, Mapping):
-        raise UsageError(wrong)
-    missing = [name for name in points.view_names if name not in extrinsics]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"the extrinsics have no view named {missing[0]!r}{more}; they have "
-            f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
-        )
-    if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
-        raise UsageError(wrong)
-    return {name: extrinsics[name] for name in points.view_names}
+def intrinsic_matrix(entries: Array) -> Array:
+    """(3, 3) upper triangular A from its entries (5,), in any unit."""
+    A = np.eye(3)
+    A[ENTRIES] = entries
+    return A
 
 
 def in_pixels(problem: Problem, state: CameraState) -> CameraState:

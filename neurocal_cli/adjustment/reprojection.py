@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.views import PointBatches, Views, products
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
@@ -19,6 +20,7 @@ from neurocal_cli.camera.projection import project_points, project_with_jacobian
 from neurocal_cli.camera.state import CameraState
 
 POSE = slice(5, 11)  # omega, tau
+POSE_COLUMNS = np.arange(POSE.start, POSE.stop)
 _OMEGA, _TAU = slice(5, 8), slice(8, 11)
 _COEFFICIENTS = 11  # first column of the coefficients of the distortion
 
@@ -26,6 +28,16 @@ _COEFFICIENTS = 11  # first column of the coefficients of the distortion
 def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
     """Columns (5 + K,) of the parameters that all views share: the entries of A, then the coefficients."""
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
+
+
+def free_columns(free: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Columns (f,) of the shared parameters that are free (5 + K,)."""
+    return camera_columns(len(free) - 5)[np.flatnonzero(free)]
+
+
+def pose_response(normal: Array, columns: NDArray[np.intp]) -> Array:
+    """(V, 6, f) how the poses follow the parameters with these columns (f,), with the opposite sign."""
+    return solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2))
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
@@ -136,14 +148,10 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
     np.subtract(pixels[:, 0], u, out=out[:, -1, 0])
     np.subtract(pixels[:, 1], v, out=out[:, -1, 1])
     if batches.whitening is not None:
-        _whiten(out[:, :, 0], out[:, :, 1], batches.whitening[chunk])
+        du, dv, factors = out[:, :, 0], out[:, :, 1], batches.whitening[chunk][:, None]
+        # The buffer is reused: structural zeros must be set again before whitening mixes the rows.
+        du[:, 2] = du[:, 4] = dv[:, 0] = dv[:, 1] = dv[:, 3] = 0.0
+        du *= factors[:, :, 0]
+        du += dv * factors[:, :, 1]
+        dv *= factors[:, :, 2]
     return np.asarray(valid.all(axis=1))
-
-
-def _whiten(u: Array, v: Array, factors: Array) -> None:
-    """Multiply each point's two rows by its upper triangular factor, in place."""
-    # The buffer is reused: structural zeros must be set again before whitening mixes the rows.
-    u[:, 2] = u[:, 4] = v[:, 0] = v[:, 1] = v[:, 3] = 0.0
-    u *= factors[:, None, 0]
-    u += v * factors[:, None, 1]
-    v *= factors[:, None, 2]

@@ -69,5 +69,4 @@ def point_residuals(views: Views, state: CameraState) -> Array:
     errors = np.swapaxes(residuals(batches, state), 1, 2).reshape(-1, 2)
     if len(errors) == len(views.index):  # no batch is padded
         return errors
-    rank = np.arange(len(views.index)) - np.repeat(views.first, views.counts)
-    return errors[np.repeat(batches.first * batches.local.shape[2], views.counts) + rank]
+    return errors[np.repeat(batches.first * batches.local.shape[2], views.counts) + views.rank]

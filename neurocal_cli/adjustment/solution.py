@@ -1,18 +1,14 @@
 """`Solution`, which the stages of a calibration pass on: the problem, its minimum, and how it was found.
 
-Ambiguity of xi: cameras of one model that fit almost as well as the best one, and their share of its std.
-
-A unified or double-sphere model may have several minima of nearly the same cost, or a flat valley, because xi
-and the scale compensate. The covariance at one minimum does not include the others. The probability of a
-value of xi is the posterior mass of all cameras with that xi. To second order (Laplace approximation, MacKay
-1992) it is w = V exp(-chi^2 / 2), where V is the posterior volume around the best of these cameras, including
-the prior on lenses. The mean squared error of a parameter is
+It may tell that xi is ambiguous. A unified or double-sphere model may have several minima of nearly the same
+cost, or a flat valley, because xi and the scale compensate. The covariance at one minimum does not include
+the others. The probability of a value of xi is the posterior mass of all cameras with that xi. To second
+order (Laplace approximation, MacKay 1992) it is w = V exp(-chi^2 / 2), where V is the posterior volume around
+the best of these cameras, including the prior on lenses. The mean squared error of a parameter is
 
     E (p - p0)^2 = var(p | xi) + sum_j w_j (p_j - p0)^2.
 
 All these cameras project nearly alike, so the covariance at the minimum still holds for the projection.
-
-Adjust a known solution again to other points: fewer of them, or those of fewer views.
 """
 
 from __future__ import annotations
@@ -39,6 +35,10 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
+
+# Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens
+# explain a twentieth of 300 residuals.
+_SAME = 0.9
 
 
 @frozen_dataclass(eq=False)
@@ -203,17 +203,12 @@ class Ambiguity:
         return given + self.spread(free, inflation)
 
 
-# Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens
-# explain a twentieth of 300 residuals.
-_SAME = 0.9
-
-
 def restarted(solution: Solution, points: Correspondences) -> Solution:
     """Adjust a solution to other points of the same views, or of some of them."""
     known = solution.problem
     if points is known.points and points.covariance is None and known.penalty is None:  # it is there already
         return Solution(known, solution.adjusted, solution.record, would_take=solution.would_take)
-    problem = solution.problem.with_points(points)
+    problem = known.with_points(points)
     if not problem.free_distortion:
         problem = problem.with_seen_pixels()
     place = _places(problem, solution)
@@ -247,5 +242,6 @@ def _start(problem: Problem, solution: Solution) -> CameraState:
 
 
 def _places(problem: Problem, solution: Solution) -> list[int]:
+    """Index of each view of a problem among those of a solution."""
     place = {name: k for k, name in enumerate(solution.problem.views.names)}
     return [place[name] for name in problem.views.names]

@@ -23,13 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
-from neurocal_cli.adjustment.covariance import Covariance
+from neurocal_cli.adjustment.covariance import Covariance, residual_variance
 from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan, solve_or_nan
-from neurocal_cli.adjustment.normal_equations import solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.leave_out import Quadratics, inverse_or_nan, quietly, solve_or_nan
+from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.adjustment.reprojection import free_columns, pose_response
 from neurocal_cli.camera.geometry import Array
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
@@ -41,8 +40,7 @@ _GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
-# Undetermined parameters become inf or nan; the results are tested for that.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+@quietly
 def counting_views(
     found: Covariance,
     normal: Array,
@@ -64,22 +62,24 @@ def counting_views(
     """
     if not free.any() or not np.isfinite(found.entries).all():
         return found
-    unknowns = int(free.sum()) + (6 * len(normal) if free_poses else 0)
-    variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
+    variance = residual_variance(normal, free, free_poses, n_residuals)
     whole = reduced(normal, free, free_poses)
+    entries = found.entries
     told = _determined(whole.S.sum(axis=0))
     if told is not None:
-        whole = Quadratics(told.into.T @ whole.S @ told.into, whole.g @ told.into, whole.cost)
-    q = _by_pose(whole, repeated)
-    entries = before = found.entries if told is None else told.back @ found.entries @ told.back.T
-    if not repeated.none:
-        entries = _of_copies(q, repeated.variance, variance)
+        into, back = told
+        whole = Quadratics(into.T @ whole.S @ into, whole.g @ into, whole.cost)
+        entries = back @ entries @ back.T
+    before, q = entries, _by_pose(whole, repeated)
+    if not repeated.none:  # S^-1 (sum of the variances of the poses' scores) S^-1
+        S_inverse = inverse_or_nan(q.S.sum(axis=0))
+        entries = variance * S_inverse @ np.tensordot(repeated.variance, q.S, 1) @ S_inverse
     enough = len(q.cost) >= _FEWEST
     contradict = enough and _contradict(q if repeated.none else _weighed(q, repeated.variance), variance)
     if contradict or (bends and enough):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
-            moves = moves @ told.back.T
+            moves = moves @ back.T
         jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
         noise = _expected(q, repeated.variance, variance)
         if contradict or _size(jackknife, entries) > _GROWN * _size(noise, entries):
@@ -87,22 +87,19 @@ def counting_views(
     if entries is before or not np.isfinite(entries).all():
         return found
     if told is not None:
-        entries = found.entries + told.into @ (entries - before) @ told.into.T
-    return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
+        entries = found.entries + into @ (entries - before) @ into.T
+    poses = found.poses
+    if free_poses:
+        gain = pose_response(normal, free_columns(free))
+        poses = poses + gain @ (entries - found.entries) @ np.swapaxes(gain, 1, 2)
+    return replace(found, entries=entries, poses=poses)
 
 
-@frozen_dataclass(eq=False)
-class _Determined:
-    """Directions of the unknowns that the points determine: p = into z, z = back p."""
+def _determined(S: Array) -> tuple[Array, Array] | None:
+    """Directions z of the unknowns p that are not dominated by rounding; None if these are all or none.
 
-    into: Array  # (f, r)
-    back: Array  # (r, f)
-
-
-def _determined(S: Array) -> _Determined | None:
-    """Directions not dominated by rounding; None if these are all or none.
-
-    Coefficients of a rational model are almost degenerate, although the projection is well determined.
+    Two matrices, (f, r) and (r, f), with p = into z and z = back p. Coefficients of a rational model are
+    almost degenerate, although the projection is well determined.
     """
     scaled, scale = unit_diagonal(S)
     try:
@@ -113,10 +110,10 @@ def _determined(S: Array) -> _Determined | None:
     if kept.all() or not kept.any():
         return None
     vectors = vectors[:, kept]
-    return _Determined(scale[:, None] * vectors, vectors.T / scale)
+    return scale[:, None] * vectors, vectors.T / scale
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+@quietly
 def scores_of_poses(
     normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
 ) -> Quadratics:
@@ -128,21 +125,14 @@ def scores_of_poses(
 
 
 def _weighed(q: Quadratics, times: Array) -> Quadratics:
-    S, g = q.S / times[:, None, None], q.g / times[:, None]
-    return Quadratics(S, g - S @ solve_or_nan(S.sum(axis=0), g.sum(axis=0)), q.cost / times)
+    return Quadratics(q.S / times[:, None, None], q.g / times[:, None], q.cost / times).centred()
 
 
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
     """Quadratics summed over repeated views, with the scores at their own minimum (without a penalty)."""
     if not repeated.none:
         q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
-    return Quadratics(q.S, q.g - q.S @ solve_or_nan(q.S.sum(axis=0), q.g.sum(axis=0)), q.cost)
-
-
-def _of_copies(q: Quadratics, times: Array, variance: float) -> Array:
-    """S^-1 (sum of the variances of the poses' scores) S^-1."""
-    S_inverse = inverse_or_nan(q.S.sum(axis=0))
-    return np.asarray(variance * S_inverse @ np.tensordot(times, q.S, 1) @ S_inverse)
+    return q.centred()
 
 
 def _contradict(q: Quadratics, variance: float) -> bool:
@@ -208,14 +198,3 @@ def _at_least(jackknife: Array, entries: Array) -> Array:
         return entries
     axes = root @ vectors
     return np.asarray(axes * np.maximum(values, 1.0) @ axes.T)
-
-
-def _followed(
-    found: Covariance, normal: Array, free: NDArray[np.bool_], free_poses: bool, entries: Array
-) -> Array:
-    """Covariances of the poses, propagated from those of the shared parameters."""
-    if not free_poses:
-        return found.poses
-    f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
-    gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, f, POSE], 1, 2))  # (V, 6, f)
-    return np.asarray(found.poses + gain @ (entries - found.entries) @ np.swapaxes(gain, 1, 2))

@@ -107,11 +107,9 @@ def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:
     """
     if not _consistent(bends):
         return False
-    views = sight.views.index
-    rank = np.arange(len(views)) - sight.views.first[views]
     ratio = 0.0  # log ratio, so that a fold whose camera comes from few views does not outweigh the others
     n_folds = min(sight.views.n_views, _FOLDS)
-    halves = [without_points(sight.of_points(rank % 2 == half)) for half in (0, 1)]
+    halves = [without_points(sight.of_points(sight.views.rank % 2 == half)) for half in (0, 1)]
     whole = halves[0] + halves[1]
     for fold in range(n_folds):
         out = np.arange(sight.views.n_views) % n_folds == fold
@@ -139,18 +137,11 @@ def _lost(others: Information, halves: list[Information], precision: float | Non
         held = others, *halves
     else:
         held = tuple(info.held(precision) for info in (others, *halves))
-    camera = camera_step_of(held[0])
-    return sum(_error(halves[1 - k], camera, _own(held[1 + k], camera)) for k in (0, 1))
-
-
-def _own(info: Information, camera: Array) -> Array:
-    """(P, p) steps of the poses and bends, given the step of the cameras."""
-    right = info.pose_right - info.pose_camera @ camera
-    return np.asarray(solve_scaled(info.pose, right[..., None])[..., 0])
-
-
-def _error(info: Information, camera: Array, own: Array) -> float:
-    """Squared error after these steps."""
-    by_own = info.pose_camera @ camera + 0.5 * (info.pose @ own[..., None])[..., 0] - info.pose_right
-    by_camera = 0.5 * info.camera @ camera - info.camera_right
-    return float(info.cost + 2 * (camera @ by_camera + (own * by_own).sum()))
+    camera, lost = camera_step_of(held[0]), 0.0
+    for known, info in zip(held[1:], halves[::-1], strict=True):
+        right = known.pose_right - known.pose_camera @ camera
+        own = solve_scaled(known.pose, right[..., None])[..., 0]  # (P, p) steps of poses and bends
+        by_own = info.pose_camera @ camera + 0.5 * (info.pose @ own[..., None])[..., 0] - info.pose_right
+        by_camera = 0.5 * info.camera @ camera - info.camera_right
+        lost += float(info.cost + 2 * (camera @ by_camera + (own * by_own).sum()))
+    return lost

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, covariance
+from neurocal_cli.adjustment.covariance import Covariance, CovarianceBasis, covariance, residual_variance
 from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import free_columns, normal_blocks, pose_response
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.adjustment.view_covariance import counting_views
@@ -116,15 +115,16 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
     from neurocal_cli.adjustment import open_coefficients as coefficients
 
     views, state = seen.views, seen.state
-    reach = coefficients.radius(views, state)
     corner = coefficients.corner_radius(
         state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size
     )
-    richer = coefficients.open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
+    richer = coefficients.open_coefficients(
+        state.model, state.k, seen.free, seen.choice, coefficients.radius(views, state), corner
+    )
     if richer is None:
         return known
     state = richer.state(state)
-    normal, _ = normal_blocks(seen.views.batches, state)
+    normal, _ = normal_blocks(views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
     left_out = richer.prior.left_out
@@ -135,8 +135,7 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
         return known
     poses = known.found.poses
     if seen.free_poses:
-        columns = camera_columns(len(richer.free) - 5)[np.flatnonzero(richer.free)]
-        gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ follow
+        gain = pose_response(normal, free_columns(richer.free)) @ follow
         poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
     found = replace(known.found, entries=entries[np.ix_(~left_out, ~left_out)], poses=poses)
     return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
@@ -162,10 +161,9 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
     """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
     views = seen.views
-    unknowns = int(seen.free.sum()) + (6 * views.n_views if seen.free_poses else 0)
     alike = correlation(views, point_residuals(views, seen.state))
     worth = effective_number(views.n_equations, alike) / views.n_equations * seen.repeated.worth
-    return float(basis.normal[:, -1, -1].sum()) / max(basis.n_equations - unknowns, 1) / worth
+    return residual_variance(basis.normal, seen.free, seen.free_poses, basis.n_equations) / worth
 
 
 def _basis(

@@ -32,8 +32,8 @@ from neurocal_cli.adjustment.board.posterior import (
     posterior_of,
 )
 from neurocal_cli.adjustment.board.prior import SINGLE, nearest_to_given, prior_of
-from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import folds_of, passes_cross_validation
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
@@ -117,7 +117,14 @@ def find_target(
     if some is None:
         return None
     found = Search(some, flat, known).result(least_gain, least)
-    return found if found is None or some is fits else _of_all_views(found, fits, known)
+    if found is None or some is fits:
+        return found
+    moved = []
+    for problem, adjusted in fits:
+        points = problem.points if known is None else known.as_given(problem.points)
+        world = found.target.applied(points).world
+        moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
+    return replace(found, fits=tuple(moved), posterior=None)
 
 
 def _few_enough(
@@ -149,15 +156,13 @@ def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple
 
 def evidence_of_views(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
     """Log evidence of the given target, of all views; -inf if the points do not determine the cameras."""
-
-    def of_camera(problem: Problem, adjusted: Adjusted) -> Information:
-        """The quadratic of one camera, with fixed target points."""
+    of_cameras = []
+    for problem, adjusted in fits:
         views, no_label = problem.views, np.zeros(0, dtype=np.intp)
-        normal = views.pixel_scale**2 * adjusted.normal
-        return of_views(sight_of(problem, adjusted, no_label), normal, np.ones(views.n_views, dtype=bool))
-
+        normal, all_views = views.pixel_scale**2 * adjusted.normal, np.ones(views.n_views, dtype=bool)
+        of_cameras.append(of_views(sight_of(problem, adjusted, no_label), normal, all_views))
     try:
-        return evidence_of_given(*(of_camera(*fit) for fit in fits))
+        return evidence_of_given(*of_cameras)
     except np.linalg.LinAlgError:
         return -np.inf
 
@@ -171,16 +176,6 @@ def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Proble
     place = [problem.views.names.index(name) for name in points.view_names]
     state = replace(known, R=known.R[place], t=known.t[place])
     return at_world(replace(problem, points=points), adjusted, state, points.world)
-
-
-def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
-    """Apply a target estimated from some views to all views."""
-    moved = []
-    for problem, adjusted in fits:
-        points = problem.points if known is None else known.as_given(problem.points)
-        world = found.target.applied(points).world
-        moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
-    return replace(found, fits=tuple(moved), posterior=None)
 
 
 class Search:
@@ -200,18 +195,17 @@ class Search:
     ) -> None:
         self.fits, self.flat = list(fits), flat
         self.still = still or (known is not None and known.only_bends)
-        worlds = [problem.points.world for problem, _ in fits]
+        all_points = [problem.points for problem, _ in fits]
         self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
         if known is None:
-            self.given, label, self.ids = distinct_points([problem.points for problem, _ in fits])
+            self.given, label, self.ids = distinct_points(all_points)
             self.plane = planes_of(self.given, self.ids)
             self.sizes = None
         else:
             self.given, self.ids, self.plane = known.given, known.point, known.plane
-            worlds = [known.straightened(problem.points).world for problem, _ in fits]
-            label = known.rows_of(np.concatenate(worlds))
+            label = known.rows_of(np.concatenate([known.straightened(one).world for one in all_points]))
             self.sizes = dict(known.sizes)
-        self.label = np.split(label, np.cumsum([len(world) for world in worlds])[:-1])
+        self.label = np.split(label, np.cumsum([len(points) for points in all_points])[:-1])
         self.prior = prior_of(self.given, self.plane)
         self.largest = (_LARGEST_OF_FOLDED if self.plane.any() else _LARGEST) * self.prior.size
         # Errors of points that are seen once look like noise.
@@ -228,25 +222,34 @@ class Search:
         """As for `find_target`."""
         try:
             with np.errstate(all="ignore"):
-                return self._run(least_gain, least)
+                end = self._descended(least_gain, least)
+                return None if end is None else self._accepted(*end, least_gain, least)
         except np.linalg.LinAlgError:
             return None
 
-    def _run(self, least_gain: float, least: float) -> Found | None:
-        """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
+    def _descended(
+        self, least_gain: float, least: float
+    ) -> tuple[Posterior, Information, list[WithoutPoses], list[CameraState]] | None:
+        """Linearise, solve and move; None if the gain is too small or the offsets are too large.
+
+        Returns the last step's posterior, its quadratic, the parts by fold, and predicted states in pixels.
+        """
         noise: float | None = None
         last = 0.0
-        one_fold = [np.zeros(problem.views.n_views, dtype=np.intp) for problem, _ in self.fits]
-        n_folds = folds_of([problem.views.n_views for problem, _ in self.fits])
+        n_views = [problem.views.n_views for problem, _ in self.fits]
+        one_fold, folds = [np.zeros(n, dtype=np.intp) for n in n_views], folds_of(n_views)
         for step in range(_STEPS):
             # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
             folded = folded_information(
-                self.sights(), len(self.given), n_folds if known and not self.still else one_fold
+                self.sights(), len(self.given), folds if known and not self.still else one_fold
             )
             here = folded.whole.turned(self.prior.axes)
             noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
-            info = self._around_given(here)
+            if self.surface is not None:
+                self.precision = most_probable_precision(here, self.prior.size)
+            info = here.around_given(self.offsets)
+            info = info if self.surface is None else info.held(self.precision)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
             parts: list[WithoutPoses] = []
@@ -276,13 +279,38 @@ class Search:
                 break
             self._place(states)
         assert states is not None
+        return found, info, parts, states
+
+    def _accepted(
+        self,
+        found: Posterior,
+        info: Information,
+        parts: list[WithoutPoses],
+        states: list[CameraState],
+        least_gain: float,
+        least: float,
+    ) -> Found | None:
+        """Adjust the cameras to the target; None if it fails for held-out views, or is another target."""
         without = self._without(info)
-        if found.evidence < max(least, without + least_gain) or not self._adjust(self._aligned(states)):
+        if found.evidence < max(least, without + least_gain):
             return None
-        if not self._passes_cross_validation(found, parts):
+        self._place(self._aligned(states))
+        self.fits = [(problem, problem.adjust(start)) for problem, start in self.fits]
+        if not all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits):
             return None
-        given = without if self.surface is None else evidence_of_given(info.straight())
-        target = self._target(found, found.evidence - given)
+        if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
+            return None
+        if not (self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)):
+            return None
+        given, bends = without, None
+        if self.surface is not None:
+            given, size = evidence_of_given(info.straight()), float(np.sqrt(found.variance / self.precision))
+            bends = Bends(size, self.fits[0][0].views.names, self.bends)
+        std = np.sqrt(np.einsum("nij,nj->ni", self.prior.axes**2, found.std**2))
+        target = Target(
+            self.given, self._common(), std, self.plane, found.sizes, self.flat, found.evidence - given,
+            self.ids, bends=bends,
+        )  # fmt: skip
         stretch, lean = target.sides()
         if not (max(stretch, target.unequal()) < self.most_stretched and lean < _LEANING):
             return None
@@ -291,21 +319,6 @@ class Search:
     def _without(self, info: Information) -> float:
         """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
-
-    def _passes_cross_validation(self, found: Posterior, parts: list[WithoutPoses]) -> bool:
-        if self.surface is not None and not bends_are_valid(self.sights()[0], self.bends, self.precision):
-            return False
-        return self.still or passes_cross_validation(parts, self.prior, found.sizes, found.variance)
-
-    def _around_given(self, info: Information) -> Information:
-        """The quadratic in the whole offsets; with bends, also with their prior of the most probable size."""
-        if self.surface is not None:
-            self.precision = most_probable_precision(info, self.prior.size)
-        return self._held(info.around_given(self.offsets))
-
-    def _held(self, info: Information) -> Information:
-        """With bends, add their prior."""
-        return info if self.surface is None else info.held(self.precision)
 
     def _posterior_of(self, target: Target, found: Posterior) -> Callable[[float], Posterior]:
         """The posterior of the estimated target for a variance of the noise [px^2].
@@ -334,14 +347,6 @@ class Search:
         """(n, 3) current common points of all views."""
         return self.given + self.prior.in_world(self.offsets)
 
-    def _world(self, k: int) -> Array:
-        """(N, 3) current world coordinates of the points of one fit, with the bend of their view."""
-        common, points = self._common(), self.fits[k][0].points
-        if self.surface is None:
-            return common[self.label[k]]
-        shapes = self.surface.offsets(common)[self.label[k]]
-        return common[self.label[k]] + (shapes @ self.bends[points.view_index][..., None])[..., 0]
-
     def _moved(self, found: Posterior, info: Information) -> list[CameraState] | None:
         """Move the target, and return the cameras' predicted states in pixels; None if it moves too far."""
         if not np.abs(found.offsets).max() < self.largest:
@@ -353,67 +358,45 @@ class Search:
             if not np.abs(bent).max() < self.largest:
                 return None
         self.offsets, self.sizes = found.offsets, found.sizes
-        return self._predicted(found.camera_step, own[:, :6])
-
-    def _place(self, states: list[CameraState]) -> None:
-        """Take the cameras to states in pixels, and their points to the current target."""
-        self.fits = [
-            placed(*fit, state, self._world(k))
-            for k, (fit, state) in enumerate(zip(self.fits, states, strict=True))
-        ]
-
-    def _adjust(self, states: list[CameraState]) -> bool:
-        """Adjust the cameras to the current target, from states in pixels; whether that succeeded."""
-        self._place(states)
-        self.fits = [(problem, problem.adjust(start)) for problem, start in self.fits]
-        return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
-
-    def _predicted(self, camera_step: Array, pose_steps: Array) -> list[CameraState]:
-        """The state of each camera in pixels after these steps, (f,) and (P, 6), of all."""
         states, first, view = [], 0, 0
         for problem, adjusted in self.fits:
             free, V = np.flatnonzero(problem.free_camera), problem.views.n_views
             by_camera, by_pose = np.zeros((1, len(problem.free_camera))), np.zeros((V, 6))
-            by_camera[0, free] = camera_step[first : first + len(free)]
+            by_camera[0, free] = found.camera_step[first : first + len(free)]
             if problem.free_poses:
-                by_pose[:] = pose_steps[view : view + V]
+                by_pose[:] = own[view : view + V, :6]
                 view += V
             first += len(free)
             states.append(in_pixels(problem, adjusted.state.moved(by_camera, by_pose)))
         return states
 
-    def _nearest(self, world: Array) -> tuple[float, Array, Array]:
-        """Scale, rotation and shift that hold the gauge of the common points (n, 3).
+    def _place(self, states: list[CameraState]) -> None:
+        """Take the cameras to states in pixels, and their points to the current target and its bends."""
+        common, moved = self._common(), []
+        for fit, state, label in zip(self.fits, states, self.label, strict=True):
+            world = common[label]
+            if self.surface is not None:
+                bends = self.bends[fit[0].points.view_index][..., None]
+                world = world + (self.surface.offsets(common)[label] @ bends)[..., 0]
+            moved.append(placed(*fit, state, world))
+        self.fits = moved
+
+    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
+        """Scale, rotate and shift the target to hold its gauge, and the cameras with it.
 
         Measured distances determine the scale, if there are any.
         """
-        if self.still or not all(problem.free_poses for problem, _ in self.fits):
-            return 1.0, np.eye(3), np.zeros(3)
-        s, R, t = nearest_to_given(world, self.given, self.plane)
-        held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
-        return held * s, R, held * t
-
-    def _aligned(self, states: list[CameraState]) -> list[CameraState]:
-        """Scale, rotate and shift the target, and the cameras with it."""
         world = self._common()
-        s, R, t = self._nearest(world)
+        s, R, t = 1.0, np.eye(3), np.zeros(3)
+        if not self.still and all(problem.free_poses for problem, _ in self.fits):
+            s, R, t = nearest_to_given(world, self.given, self.plane)
+            held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
+            s, t = held * s, held * t
         self.offsets = self.prior.along_axes(s * world @ R.T + t - self.given)
         turned = [state.R @ R.T for state in states]
         return [
             replace(state, R=own, t=s * state.t - own @ t) for state, own in zip(states, turned, strict=True)
         ]
-
-    def _target(self, found: Posterior, gain: float) -> Target:
-        axes = self.prior.axes
-        variance = np.einsum("nij,nj->ni", axes**2, found.std**2)
-        bends = None
-        if self.surface is not None:
-            size = float(np.sqrt(found.variance / self.precision))
-            bends = Bends(size, self.fits[0][0].views.names, self.bends)
-        std = np.sqrt(variance)
-        return Target(
-            self.given, self._common(), std, self.plane, found.sizes, self.flat, gain, self.ids, bends=bends
-        )
 
 
 def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:

@@ -10,17 +10,21 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, derivatives
+from neurocal_cli.adjustment.board.derivatives import blocks_by_batch, linearised, pose_columns
+from neurocal_cli.adjustment.reprojection import free_columns
 from neurocal_cli.adjustment.views import PointBatches, Views, batches_of, products
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.target import N_SHAPES
+
+_OF_POSES = ("pose", "pose_camera", "pose_right", "pose_point")  # blocks with an axis for the poses
 
 
 @frozen_dataclass(eq=False)
@@ -39,6 +43,16 @@ class Sight:
     label: NDArray[np.intp]
     shapes: Array | None = None
     bends: Array | None = None
+
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Columns (f,) of the camera's free parameters in normal matrices."""
+        return free_columns(self.free)
+
+    @cached_property
+    def slots(self) -> NDArray[np.intp]:
+        """(T, n) index of the target point in each slot of the batches; -1 for padding."""
+        return labelled(self.views, self.label)
 
     def of_views(self, which: NDArray[np.intp]) -> Sight:
         """The observations of some views."""
@@ -101,13 +115,7 @@ class Information:
 
     def with_poses_of(self, other: Information, which: NDArray[np.bool_] | slice) -> Information:
         """The same sums, with the blocks of some poses (P,) of another."""
-        return replace(
-            self,
-            pose=other.pose[which],
-            pose_camera=other.pose_camera[which],
-            pose_right=other.pose_right[which],
-            pose_point=other.pose_point[which],
-        )
+        return replace(self, **{name: getattr(other, name)[which] for name in _OF_POSES})
 
     def of_cameras(self, kept: NDArray[np.bool_]) -> Information:
         """The quadratic in some parameters (f,) of the cameras, where the others are held."""
@@ -236,20 +244,24 @@ def joined(parts: Sequence[Information]) -> Information:
     blocks: dict[str, Any] = {}
     for field in fields(Information):
         own = [getattr(part, field.name) for part in parts]
-        blocks[field.name] = np.concatenate(own) if field.name.startswith("pose") else sum(own)
+        blocks[field.name] = np.concatenate(own) if field.name in _OF_POSES else sum(own)
     return Information(**blocks)
+
+
+def joined_without_each(parts: Sequence[Information]) -> Iterator[Information]:
+    """Sums over all parts but one, for each part left out."""
+    return (joined([part for part in parts if part is not out]) for out in parts)
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice, fold: NDArray[np.intp]) -> Array:
     """Add the observations of one camera to the sums of the folds (V,) of its views; return their costs."""
-    views = sight.views
-    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
-    label, (n_folds, n_points) = labelled(views, sight.label), found.point.shape[:2]
+    views, columns, (n_folds, n_points) = sight.views, sight.columns, found.point.shape[:2]
     # Filled where it stays, because allocating these blocks took half of the time of all with 1000 views.
     cross = found.pose_point[poses] if sight.free_poses else None
     terms = folded_terms(
-        views.batches, sight.state, views.scale, label, columns, n_points, fold, n_folds, sight.shapes, cross
-    )
+        views.batches, sight.state, views.scale, sight.slots, columns, n_points, fold, n_folds, sight.shapes,
+        cross,
+    )  # fmt: skip
     normal, px2 = terms.normal, views.pixel_scale**2
     by_fold = px2 * np.stack([normal[fold == k].sum(axis=0) for k in range(n_folds)])
     found.camera[:, own, own] += by_fold[:, columns[:, None], columns]
@@ -292,8 +304,8 @@ def point_terms(
 ) -> PointTerms:
     """Sums of one camera over its observations of `n_points` target points.
 
-    `scale` (V,) is S2 of each view, `label` (T, n) from `labelled`, `columns` (f,) those of the camera's free
-    parameters, and `shapes` as in `Sight`.
+    `scale` (V,) is S2 of each view, `label` (T, n) is from `labelled`, `columns` (f,) are those of the
+    camera's free parameters, and `shapes` is as in `Sight`.
     """
     fold = np.zeros(batches.n_views, dtype=np.intp)
     terms = folded_terms(batches, state, scale, label, columns, n_points, fold, 1, shapes)
@@ -322,7 +334,9 @@ def folded_terms(
     whole = by_batch.shape[1]
     of_pose = pose_columns(whole, shapes is not None)
     p, kept = len(of_pose), np.append(columns, whole - 1)
-    once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
+    ordered = np.sort(label, axis=1)
+    twice = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)
+    once = len(label) == V and not twice.any()  # each view is one batch, in which no point is twice
     alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
     summed = np.zeros((n_folds, n_points, 3, f + 4))
     cross = np.zeros((V, p, n_points, 3)) if out is None else out
@@ -354,12 +368,6 @@ def folded_terms(
     )
 
 
-def _is_once(label: NDArray[np.intp]) -> bool:
-    """Whether no batch contains a point twice."""
-    ordered = np.sort(label, axis=1)
-    return not ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any()
-
-
 def _of_each(a: Array, b: Array) -> Array:
     """(T, i, j, n) products of rows (T, i, 2, n) and (T, j, 2, n) of each point, summed over u and v."""
     product = a[:, :, None, 0] * b[:, None, :, 0]
@@ -368,45 +376,32 @@ def _of_each(a: Array, b: Array) -> Array:
 
 
 def without_points(sight: Sight) -> Array:
-    """(V, w, w) normal matrices of one camera's views [px], with the columns of `PointTerms.normal`."""
+    """(V, w, w) normal matrices of one camera's views [px], for given target points."""
     views, state = sight.views, sight.state
-    label, by_batch = labelled(views, sight.label), blocks_by_batch(views.batches, state, sight.shapes)
-    for chunk, part, _ in linearised(views.batches, state, views.scale, label, sight.shapes):
+    by_batch = blocks_by_batch(views.batches, state, sight.shapes)
+    for chunk, part, _ in linearised(views.batches, state, views.scale, sight.slots, sight.shapes):
         products(part, by_batch[chunk])
     return views.pixel_scale**2 * views.batches.sum_by_view(by_batch)
 
 
-def linearised(
-    batches: PointBatches, state: CameraState, scale: Array, label: NDArray[np.intp], shapes: Array | None
-) -> Iterator[tuple[slice, Array, Array]]:
-    """Chunks of batches, their rows of derivatives and residuals, and the derivatives by the points.
+def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(T, n) index of the target point in each slot of the batches, from those (N,) of the views' points.
 
-    With bends (`shapes`), the rows have those by each view's bend. A single row of labels holds for all
-    batches. The rows are overwritten in the next chunk.
+    It is -1 for padding.
     """
-    buffer = batches.memory(12 + len(state.k))
-    for chunk in batches.chunks():
-        view = batches.view[chunk]
-        part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part[:, :-1])
-        by_point = _by_world(part, state, scale, view)
-        if shapes is not None:
-            part = _with_bends(part, by_point, shapes[label if len(label) == 1 else label[chunk]])
-        yield chunk, part, by_point
-
-
-def blocks_by_batch(batches: PointBatches, state: CameraState, shapes: Array | None) -> Array:
-    """Memory for the normal matrices of all batches; with bends, with three more columns."""
-    whole = 12 + len(state.k) + (0 if shapes is None else N_SHAPES)
-    return np.empty((len(batches.view), whole, whole))
+    numbers = np.column_stack([label, label]).astype(float)
+    laid = batches_of(views.local, numbers, None, views.index, views.n_views)
+    found = np.rint(laid.pixels[:, 0]).astype(np.intp)
+    if laid.whitening is not None:
+        found[laid.whitening[:, 0] == 0] = -1
+    return found
 
 
 def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
     """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
     N = normal[which]
-    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
-    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N) if sight.free_poses else 0
-    p, f = len(of_pose), len(columns)
+    columns, of_pose = sight.columns, pose_columns(N.shape[1], sight.shapes is not None)
+    p, f, P = len(of_pose), len(columns), len(N) if sight.free_poses else 0
     camera, own = N.sum(axis=0), N[:P]
     found = Information(
         camera[columns[:, None], columns], camera[columns, -1],
@@ -415,42 +410,6 @@ def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Informati
         float(camera[-1, -1]), float(sight.views.equations[which].sum()),
     )  # fmt: skip
     return found if sight.bends is None else found.around_straight(sight.bends[which])
-
-
-def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
-    """Columns of a view's own unknowns in normal matrices of this width: omega, tau, and bends if any."""
-    last = np.arange(width - 1 - N_SHAPES, width - 1) if bends else np.arange(0)
-    return np.concatenate([np.arange(POSE.start, POSE.stop), last])
-
-
-def _with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
-    """(T, width + 4, 2, n) derivatives with those by the view's bend before the residual.
-
-    `shapes` (T, n, 3, 3) or (1, n, 3, 3) are the offsets of the points for unit coefficients.
-    """
-    along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
-    by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
-    return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
-
-
-def _by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
-    """(T, 3, 2, n) derivatives by the world's coordinates, from those of `derivatives`.
-
-    d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
-    """
-    turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
-    by_tau = part[:, POSE.start + 3 : POSE.stop]
-    return np.asarray((turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape))
-
-
-def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
-    numbers = np.column_stack([label, label]).astype(float)
-    laid = batches_of(views.local, numbers, None, views.index, views.n_views)
-    found = np.rint(laid.pixels[:, 0]).astype(np.intp)
-    if laid.whitening is not None:
-        found[laid.whitening[:, 0] == 0] = -1
-    return found
 
 
 def _summed_by(label: NDArray[np.intp], rows: Array, n: int) -> Array:

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.board.prior import LEAN, STRETCH
 from neurocal_cli.adjustment.cross_validation import reduced
 from neurocal_cli.adjustment.leave_out import solve_or_nan
-from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, displaced_blocks
+from neurocal_cli.adjustment.reprojection import displaced_blocks, free_columns, pose_response
 from neurocal_cli.adjustment.views import PointBatches, Views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -64,8 +63,7 @@ def open_stretch(
     found = spread_of_stretch(q.S.sum(axis=0), q.g.sum(axis=0), variance)
     if found is None:
         return None
-    columns = camera_columns(len(both) - 5)[np.flatnonzero(both)]
-    gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ found.follow
+    gain = pose_response(normal, free_columns(both)) @ found.follow
     T = found.follow[:-2]
     return StretchedCovariance(found.probability, T @ found.E @ T.T, gain @ found.E @ np.swapaxes(gain, 1, 2))
 

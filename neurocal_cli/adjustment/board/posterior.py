@@ -34,9 +34,9 @@ from neurocal_cli.adjustment.board.system import (
     PointsFirst,
     PosesFirst,
     Solved,
-    WithoutPoses,
     system_of,
 )
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -303,15 +303,16 @@ class _Climb:
             self.least[self.names.index("fold")] = _BY_HAND * prior.size
         self.most = np.where(held, self.least, prior.size)
         self.switched = [self.names.index(name) for name in _SWITCHED if name in self.names]
-        self.of_prints = STRETCH * prior.size, _MOST * prior.size
+        self.of_prints, self.most_of_prints = STRETCH * prior.size, _MOST * prior.size
 
     def allowed(self, ratios: Array, noise: float) -> Array:
         """Ratios in the range of each part; stretch and lean have the least size of prints."""
         ratios = np.maximum(ratios, self.least / noise)
-        ratios[self.switched] = self.of_prints[0] / noise
+        ratios[self.switched] = self.of_prints / noise
         return ratios
 
     def at(self, ratios: Array) -> _Solution:
+        """The solution for these sizes of the parts."""
         return self._solution(ratios, self.system.solve(self._named(ratios)))
 
     def _named(self, ratios: Array) -> dict[str, float]:
@@ -327,13 +328,14 @@ class _Climb:
         """(G,) least and largest ratios; the same for a part that is held."""
         least, most = self.least.copy(), self.most.copy()
         for k in self.switched:
-            least[k], most[k] = self.of_prints if self.is_on(now, k) else (least[k], least[k])
+            on = self.is_on(now, k)
+            least[k], most[k] = (self.of_prints, self.most_of_prints) if on else (least[k], least[k])
         return least / math.sqrt(now.variance), most / math.sqrt(now.variance)
 
     def is_on(self, now: _Solution, part: int) -> bool:
         """Whether a stretch or a lean has the size of prints."""
         size = float(now.ratios[part]) * math.sqrt(now.variance)
-        return size > math.sqrt(self.of_prints[0] * self.least[0])
+        return size > math.sqrt(self.of_prints * self.least[0])
 
     def changed(self, now: _Solution, new: Mapping[int, float]) -> _Solution:
         """The solution with new ratios of some parts, for which the system need not be solved again."""
@@ -345,7 +347,7 @@ class _Climb:
     def on_or_off(self, now: _Solution, part: int) -> _Solution:
         """The solution with or without a stretch or a lean, whichever is more probable."""
         on = self.is_on(now, part)
-        size = self.least[0] if on else self.of_prints[0]
+        size = self.least[0] if on else self.of_prints
         wanted = now.evidence + (-_SEEN if on else _SEEN)
         other = self.climbed(self.changed(now, {part: size / math.sqrt(now.variance)}), wanted)
         return other if other.evidence > wanted else now
@@ -361,7 +363,7 @@ class _Climb:
         for part in self.switched:
             if self.is_on(now, part):
                 continue
-            on = self.changed(now, {part: self.of_prints[0] / noise})
+            on = self.changed(now, {part: self.of_prints / noise})
             # In units of the prior's variance.
             v = max(1.0 - float(on.solved.parts.determined[part]), _LEAST_SHARE)
             squared = float(on.solved.parts.squares[part]) / on.variance
@@ -370,7 +372,7 @@ class _Climb:
             share = 1.0 / math.sqrt(precision) if precision > 1.0 else 1.0
             if self.names[part] == "lean":
                 share = max(share, LEAN / STRETCH)
-            ratio = share * self.of_prints[0] / noise
+            ratio = share * self.of_prints / noise
             if ratio > now.ratios[part]:
                 wider[part] = ratio
         return self.changed(now, wider) if wider else now
@@ -416,6 +418,7 @@ class _Climb:
         return now
 
     def posterior(self, now: _Solution) -> Posterior:
+        """The posterior for the sizes of a solution."""
         solved, noise = now.solved, math.sqrt(now.variance)
 
         def with_open() -> tuple[Array, Callable[[], JointCovariance]]:

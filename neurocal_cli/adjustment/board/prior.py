@@ -17,19 +17,17 @@ Surveyed points have only the standard deviations that the survey states, indepe
 The smooth parts are Gaussian processes with the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a
 plane, represented by its largest eigenfunctions. A solid target warps in all directions alike.
 
-What images do not determine: where a target is, how it is turned, and how large it is.
+The offsets have coordinates that are independent under the prior, whatever the sizes of its parts
+(`Coordinates`). Along its eigenfunctions, and along what is orthogonal to them, a smooth part has independent
+coordinates, and so have the single points, whose prior is the same in all directions. So the sum of both is
+independent as well: with the eigenvalue v of an eigenfunction, the variance of its coordinate is
+``size_smooth^2 v + size_single^2``. Folds and stretches have coordinates of their own.
 
-An estimated target is moved and rotated as a whole to be nearest to the given one. Its scale is such that its
-planes, each by itself, are on average as large as given: their squares are printed, but a folded target is
-set up by hand. If planes were 0.5 mm from their place, the size of the whole would be wrong by 0.2 %, ten
-times the standard deviation of a rig's baseline (tests/test_target.py).
-
-Coordinates of the offsets that are independent under the prior, whatever the sizes of its parts.
-
-Along its eigenfunctions, and along what is orthogonal to them, a smooth part has independent coordinates, and
-so have the single points, whose prior is the same in all directions. So the sum of both is independent as
-well: with the eigenvalue v of an eigenfunction, the variance of its coordinate is ``size_smooth^2 v +
-size_single^2``. Folds and stretches have coordinates of their own.
+Images do not determine where a target is, how it is turned, and how large it is (`Gauge`). An estimated
+target is moved and rotated as a whole to be nearest to the given one. Its scale is such that its planes, each
+by itself, are on average as large as given: their squares are printed, but a folded target is set up by hand.
+If planes were 0.5 mm from their place, the size of the whole would be wrong by 0.2 %, ten times the standard
+deviation of a rig's baseline (tests/test_target.py).
 """
 
 from __future__ import annotations
@@ -44,54 +42,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_similarity
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
-
-
-@frozen_dataclass(eq=False)
-class Gauge:
-    """The shifts, rotations and the scale of a target of n points, as changes of their offsets."""
-
-    directions: Array  # (3 n, g) orthonormal
-    held: Array  # (3 n, g) their products with the offsets are held at 0; ``held^T directions = 1``
-
-    @classmethod
-    def none(cls, n: int) -> Gauge:
-        """The gauge of a target in a known place, of known size."""
-        return cls(np.zeros((3 * n, 0)), np.zeros((3 * n, 0)))
-
-
-def gauge_of(given: Array, plane: NDArray[np.intp], axes: Array) -> Gauge:
-    """The gauge of points (n, 3) on planes (n,), along the axes of each point (n, 3, 3)."""
-    centred = given - given.mean(axis=0)
-    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
-    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
-    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
-    along = np.swapaxes(axes, 1, 2)
-    directions = np.linalg.qr((along @ world).reshape(3 * len(given), 7))[0]
-    if not plane.any():
-        return Gauge(directions, directions)
-    # A scale changes no shift and no rotation, and the planes' own sizes are changed by the scale only.
-    held, own = directions.copy(), (along @ _around_planes(given, plane)[..., None]).ravel()
-    held[:, -1] = own / (own @ directions[:, -1])
-    return Gauge(directions, held)
-
-
-def nearest_to_given(found: Array, given: Array, plane: NDArray[np.intp]) -> tuple[float, Array, Array]:
-    """Scale s, rotation R (3, 3) and shift t (3,) with which found points x (n, 3) hold it: ``s R x + t``."""
-    s, R, t = nearest_similarity(found, given)
-    if not plane.any():
-        return s, R, t
-    parts = [(found[plane == k], given[plane == k]) for k in range(int(plane.max()) + 1)]
-    weights = [float(((own - own.mean(axis=0)) ** 2).sum()) for own, _ in parts]
-    s = float(np.average([nearest_similarity(*part)[0] for part in parts], weights=weights))
-    return s, R, given.mean(axis=0) - s * R @ found.mean(axis=0)
-
-
-def _around_planes(points: Array, plane: NDArray[np.intp]) -> Array:
-    """Points (n, 3) around the centre of their plane."""
-    sums = np.zeros((int(plane.max()) + 1, 3))
-    np.add.at(sums, plane, points)
-    return points - (sums / np.bincount(plane)[:, None])[plane]
-
 
 _LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
@@ -111,35 +61,20 @@ SINGLE = ("place", "place", "height")
 """The part of single points along each axis."""
 STATED = "stated"
 """The only part of surveyed points: the factor of their stated standard deviations."""
+_SMOOTH = ("bend", "warp")
 
 
 @frozen_dataclass(eq=False)
-class Parts:
-    """The coefficients of each part of the offsets, in units of their prior's standard deviations."""
+class Gauge:
+    """The shifts, rotations and the scale of a target of n points, as changes of their offsets."""
 
-    squares: Array  # (G,) of the most probable coefficients
-    determined: Array  # (G,) effective number that the data determine
-    # (G, G) w_g (1 - C) w_h, with the most probable coefficients w and their posterior covariance C
-    coupling: Array
+    directions: Array  # (3 n, g) orthonormal
+    held: Array  # (3 n, g) their products with the offsets are held at 0; ``held^T directions = 1``
 
     @classmethod
-    def of(
-        cls, variances: Array, found: Array, posterior: Array, covariance: Callable[[Array], Array]
-    ) -> Parts:
-        """The parts of independent unknowns, each a sum of parts with the prior variances (k, G).
-
-        Of an unknown x (k,) with the prior variance t and the posterior variance v (k,), a part with the
-        prior variance s is ``s x / t``, and the data determine ``s (1 - v / t) / t`` of it. `covariance`
-        returns the posterior covariances (G, G) of sums of the unknowns with the factors (k, G).
-        """
-        whole = variances.sum(axis=1)
-        along = found / whole
-        factors = variances * (along / whole)[:, None]
-        return cls(
-            along**2 @ variances,
-            (1.0 - posterior / whole) / whole @ variances,
-            factors.T @ (whole[:, None] * factors) - covariance(factors),
-        )
+    def none(cls, n: int) -> Gauge:
+        """The gauge of a target in a known place, of known size."""
+        return cls(np.zeros((3 * n, 0)), np.zeros((3 * n, 0)))
 
 
 @frozen_dataclass(eq=False)
@@ -192,7 +127,8 @@ def _prior_of(given_bytes: bytes, plane_bytes: bytes) -> Prior:
     parts: list[tuple[str, Array]] = []
     for k in range(planes):
         rows = np.flatnonzero(plane == k)
-        own, centred = _axes(given[rows])
+        centred = given[rows] - given[rows].mean(axis=0)
+        own = np.linalg.svd(centred, full_matrices=False)[2].T  # principal axes as columns
         axes[rows] = own
         for name, part in _of_plane(centred @ own, is_flat(given[rows])):
             parts.append((name, _at(rows, part, n)))
@@ -224,12 +160,6 @@ def prior_of_target(target: Target) -> Prior:
     if target.stated is not None:
         return surveyed_prior(target.given, target.stated)
     return prior_of(target.given, target.plane)
-
-
-def _axes(given: Array) -> tuple[Array, Array]:
-    """Principal axes as columns, and the points around their centre."""
-    centred = given - given.mean(axis=0)
-    return np.linalg.svd(centred, full_matrices=False)[2].T, centred
 
 
 def _at(rows: NDArray[np.intp], part: Array, n: int) -> Array:
@@ -284,7 +214,34 @@ def _smooth(places: Array) -> Array:
     return np.asarray(kernel(places, nodes) @ (vectors[:, used] / np.sqrt(values[used])))
 
 
-_SMOOTH = ("bend", "warp")
+def gauge_of(given: Array, plane: NDArray[np.intp], axes: Array) -> Gauge:
+    """The gauge of points (n, 3) on planes (n,), along the axes of each point (n, 3, 3)."""
+    centred = given - given.mean(axis=0)
+    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
+    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
+    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
+    along = np.swapaxes(axes, 1, 2)
+    directions = np.linalg.qr((along @ world).reshape(3 * len(given), 7))[0]
+    if not plane.any():
+        return Gauge(directions, directions)
+    # A scale changes no shift and no rotation, and the planes' own sizes are changed by the scale only.
+    sums = np.zeros((int(plane.max()) + 1, 3))
+    np.add.at(sums, plane, given)
+    around_planes = given - (sums / np.bincount(plane)[:, None])[plane]
+    held, own = directions.copy(), (along @ around_planes[..., None]).ravel()
+    held[:, -1] = own / (own @ directions[:, -1])
+    return Gauge(directions, held)
+
+
+def nearest_to_given(found: Array, given: Array, plane: NDArray[np.intp]) -> tuple[float, Array, Array]:
+    """Scale s, rotation R (3, 3) and shift t (3,) with which found points x (n, 3) hold it: ``s R x + t``."""
+    s, R, t = nearest_similarity(found, given)
+    if not plane.any():
+        return s, R, t
+    parts = [(found[plane == k], given[plane == k]) for k in range(int(plane.max()) + 1)]
+    weights = [float(((own - own.mean(axis=0)) ** 2).sum()) for own, _ in parts]
+    s = float(np.average([nearest_similarity(*part)[0] for part in parts], weights=weights))
+    return s, R, given.mean(axis=0) - s * R @ found.mean(axis=0)
 
 
 @frozen_dataclass(eq=False)
@@ -356,3 +313,32 @@ def coordinates_of(prior: Prior) -> Coordinates:
     linear = np.concatenate([np.zeros(0, dtype=np.intp), *places])
     units = np.concatenate([prior.units[linear], of_points])
     return Coordinates(prior, prior.basis[:, :, linear].reshape(3 * n, -1), groups, vectors, units)
+
+
+@frozen_dataclass(eq=False)
+class Parts:
+    """The coefficients of each part of the offsets, in units of their prior's standard deviations."""
+
+    squares: Array  # (G,) of the most probable coefficients
+    determined: Array  # (G,) effective number that the data determine
+    # (G, G) w_g (1 - C) w_h, with the most probable coefficients w and their posterior covariance C
+    coupling: Array
+
+    @classmethod
+    def of(
+        cls, variances: Array, found: Array, posterior: Array, covariance: Callable[[Array], Array]
+    ) -> Parts:
+        """The parts of independent unknowns, each a sum of parts with the prior variances (k, G).
+
+        Of an unknown x (k,) with the prior variance t and the posterior variance v (k,), a part with the
+        prior variance s is ``s x / t``, and the data determine ``s (1 - v / t) / t`` of it. `covariance`
+        returns the posterior covariances (G, G) of sums of the unknowns with the factors (k, G).
+        """
+        whole = variances.sum(axis=1)
+        along = found / whole
+        factors = variances * (along / whole)[:, None]
+        return cls(
+            along**2 @ variances,
+            (1.0 - posterior / whole) / whole @ variances,
+            factors.T @ (whole[:, None] * factors) - covariance(factors),
+        )

@@ -11,13 +11,15 @@ the work grows linearly with the number of views or of points.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache, cached_property
+from functools import cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.board.information import Information
 from neurocal_cli.adjustment.board.prior import Gauge, Parts, Prior, coordinates_of
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses, sum_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
@@ -158,8 +160,9 @@ class PosesFirst:
             inner = np.linalg.solve(factor, gain)
             by_inner, own = across @ inner, x[rows]
 
-            def changed_covariance(of_rows: Array) -> Array:
-                return np.asarray(of_rows.T @ inner @ of_rows)
+            def covariance_after(factors: Array) -> Array:
+                of_rows = across[self.f :].T @ factors
+                return np.asarray(covariance(factors) - of_rows.T @ inner @ of_rows)
 
             def joint() -> JointCovariance:
                 try:  # larger variances add rows to the root of the covariance
@@ -175,7 +178,7 @@ class PosesFirst:
                 cost + float(own @ inner @ own),
                 logdet + float(more),
                 camera.T @ camera - by_inner[: self.f] @ across[: self.f].T,
-                lambda factors: covariance(factors) - changed_covariance(across[self.f :].T @ factors),
+                covariance_after,
                 cache(joint),
                 lambda new, others: changed(new, list(dict.fromkeys([*names, *others]))),
             )
@@ -272,32 +275,26 @@ class PointsFirst:
         flat = basis.reshape(3 * self.n, self.m)
         across = info.point_camera.reshape(3 * self.n, self.f).T @ flat
         inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
-        shared = np.block([[info.camera, across], [across.T, inner]])
-        right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
         pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
-        pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2)
-        self.bordered = self._with_points(shared, right, pose_shared)
+        # The matrix of cameras, smooth parts and poses before points are eliminated, bordered by the right
+        # side and the cost.
+        s, dim = self.s, self.s + self.p * self.P
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = np.block([[info.camera, across], [across.T, inner]])
+        M[s:dim, : self.f], M[s:dim, self.f : s] = info.pose_camera.reshape(dim - s, self.f), pose_basis
+        M[:s, s:dim] = M[s:dim, :s].T
+        at = s + self.p * np.arange(self.P)
+        for i, j in product(range(self.p), repeat=2):
+            M[at + i, at + j] = info.pose[:, i, j]
+        M[: self.f, -1], M[self.f : s, -1] = info.camera_right, info.point_right.ravel() @ flat
+        M[s:dim, -1], M[-1, -1] = info.pose_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        self.bordered = M
         # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
         by_shared = [info.point_camera, by_basis]
         self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
         self.rows = np.empty_like(self.by_point)  # large arrays are quicker to fill again than to allocate
-
-    def _with_points(self, shared: Array, right: Array, pose_shared: Array) -> Array:
-        """The bordered matrix of cameras, smooth parts and poses, before points are eliminated."""
-        info, s, P, p = self.info, self.s, self.P, self.p
-        dim = s + p * P
-        M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = shared
-        M[:s, s:dim] = pose_shared.reshape(p * P, s).T
-        M[s:dim, :s] = M[:s, s:dim].T
-        at = s + p * np.arange(P)
-        for i in range(p):
-            for j in range(p):
-                M[at + i, at + j] = info.pose[:, i, j]
-        M[:s, -1], M[s:dim, -1], M[-1, -1] = right, info.pose_right.reshape(-1), info.cost
-        M[-1, :dim] = M[:dim, -1]
-        return M
 
     def solve(self, ratios: Mapping[str, float]) -> Solved:
         """Solve for given sizes of the parts, in units of the noise's standard deviation."""
@@ -363,67 +360,8 @@ class PointsFirst:
         return M, root, rows, float(logdet + np.log(of_smooth).sum() + np.log(of_single).sum())
 
 
-class WithoutPoses:
-    """Information with the poses eliminated (Schur complement); results for different views can be added.
-
-    With the lower triangular Cholesky factors L of the poses' matrices, `root` (P, p, p) is their inverses,
-    and `rows` (P p, f + 3 n + 1) the products of these with the coupling to cameras, offsets and the right
-    side. `logdet` is the log determinant of the poses' part, and `poses` (P,) are the indices of the poses
-    among those of all views.
-    """
-
-    def __init__(self, info: Information, poses: NDArray[np.intp] | None = None) -> None:
-        self.info, (P, p), d = info, info.pose.shape[:2], info.point_right.size
-        self.poses = np.arange(P) if poses is None else poses
-        self.root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        f = len(info.camera)
-        rows = np.empty((P, p, f + d + 1))
-        np.matmul(self.root, info.pose_camera, out=rows[:, :, :f])
-        np.matmul(self.root, info.pose_point.reshape(P, p, d), out=rows[:, :, f:-1])
-        np.matmul(self.root, info.pose_right[..., None], out=rows[:, :, -1:])
-        self.rows = rows.reshape(P * p, f + d + 1)
-        self.logdet = -2 * float(np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum())
-
-    @cached_property
-    def matrix(self) -> Array:
-        """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
-        info, f, n = self.info, len(self.info.camera), len(self.info.point)
-        M = self.rows.T @ self.rows
-        np.negative(M, out=M)
-        M[:f, :f] += info.camera
-        across = info.point_camera.reshape(3 * n, f)
-        M[f:-1, :f] += across
-        M[:f, f:-1] += across.T
-        blocks = M[f:-1, f:-1].reshape(n, 3, n, 3)
-        np.einsum("ninj->nij", blocks)[...] += info.point
-        right = np.concatenate([info.camera_right, info.point_right.ravel(), [info.cost]])
-        M[-1] += right
-        M[:-1, -1] += right[:-1]
-        return np.asarray(M)
-
-    def at(self, offsets: Array) -> tuple[Array, Array, Array]:
-        """The cameras' matrix (f, f), right sides (f, k) and costs (k,) for given offsets (k, n, 3)."""
-        info, f, k = self.info, len(self.info.camera), len(offsets)
-        flat = offsets.reshape(k, -1).T
-        by_camera, left = self.rows[:, :f], self.rows[:, -1:] - self.rows[:, f:-1] @ flat
-        by_point = (info.point @ offsets[..., None])[..., 0] - 2 * info.point_right
-        right = info.camera_right[:, None] - info.point_camera.reshape(len(flat), f).T @ flat
-        return (
-            info.camera - by_camera.T @ by_camera,
-            right - by_camera.T @ left,
-            info.cost + (offsets * by_point).sum(axis=(1, 2)) - (left**2).sum(axis=0),
-        )
-
-
-def sum_of(matrices: Sequence[Array]) -> Array:
-    """The sum; several times as fast as NumPy's over an axis of a stack."""
-    total = matrices[0].copy()
-    for matrix in matrices[1:]:
-        total += matrix
-    return total
-
-
 def _squared(rows: Array) -> Array:
+    """Products of the columns."""
     return np.asarray(rows.T @ rows)
 
 

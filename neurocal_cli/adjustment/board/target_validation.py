@@ -16,10 +16,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.board.information import Information, joined
+from neurocal_cli.adjustment.board.information import Information, joined, joined_without_each
 from neurocal_cli.adjustment.board.posterior import camera_step, minimum_of
 from neurocal_cli.adjustment.board.prior import Prior, coordinates_of
-from neurocal_cli.adjustment.board.system import WithoutPoses, points_first, sum_of
+from neurocal_cli.adjustment.board.system import points_first
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses, sum_of
 from neurocal_cli.camera.geometry import Array
 
 _FEWEST = 4  # fewest views, so that the others determine a camera
@@ -51,7 +52,7 @@ def passes_cross_validation(
         if by_parts:
             estimated = [found for _, found in without_each(without, prior, sizes, variance)]
         else:
-            others = [_seen(joined([part for part in parts if part is not out])) for out in parts]
+            others = [_seen(rest) for rest in joined_without_each(parts)]
             estimated = [minimum_of(some, prior, sizes, variance)[1] for some in others]
     except np.linalg.LinAlgError:
         return True
@@ -93,7 +94,7 @@ def without_each(
     determine the cameras.
     """
     if points_first(sum(part.info.pose_right.size for part in parts), prior):
-        others = (joined([part.info for part in parts if part is not out]) for out in parts)
+        others = joined_without_each([part.info for part in parts])
         return [minimum_of(some, prior, sizes, variance) for some in others]
     matrices = [part.matrix for part in parts]
     f = len(parts[0].info.camera)

@@ -16,24 +16,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.board.derivatives import blocks_by_batch, linearised
 from neurocal_cli.adjustment.board.information import (
     Information,
     Sight,
-    blocks_by_batch,
     folded_information,
     information_of,
-    joined,
-    labelled,
-    linearised,
+    joined_without_each,
 )
 from neurocal_cli.adjustment.board.posterior import camera_step_of, posterior_of
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
-from neurocal_cli.adjustment.board.system import WithoutPoses
 from neurocal_cli.adjustment.board.target_validation import without_each
+from neurocal_cli.adjustment.board.without_poses import WithoutPoses
 from neurocal_cli.adjustment.covariance import CovarianceBasis
 from neurocal_cli.adjustment.normal_equations import eliminate
-from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.adjustment.solution import TargetPosterior
 from neurocal_cli.adjustment.views import Views, products
 from neurocal_cli.camera.geometry import Array
@@ -76,10 +73,6 @@ def covariance_basis(
         """The quadratic in the whole offsets."""
         return info.turned(prior.axes).around_given(offsets)
 
-    def held(info: Information) -> Information:
-        """Add the prior of the bends of single views, if there are any."""
-        return info if target.bends is None else info.held(variance / target.bends.size**2)
-
     if prior.stated is None:
         unknowns = int(free.sum()) + (6 * views.n_views if free_poses else 0)
         spare = views.n_equations - unknowns - bent
@@ -92,11 +85,13 @@ def covariance_basis(
         if n_poses > _MOST_POSES:
             return None
         folded = folded_information([sight], n, [group])
-        parts = folded.parts(held(in_offsets(folded.whole)), in_offsets)
+        whole = in_offsets(folded.whole)
+        if target.bends is not None:
+            whole = whole.held(variance / target.bends.size**2)
+        parts = folded.parts(whole, in_offsets)
         try:
             if target.only_bends:
-                others = (joined([part for part in parts if part is not out]) for out in parts)
-                return np.stack([camera_step_of(some) for some in others])
+                return np.stack([camera_step_of(rest) for rest in joined_without_each(parts)])
             without = [WithoutPoses(part) for part in parts]
             return np.stack([step for step, _ in without_each(without, prior, target.sizes, variance)])
         except np.linalg.LinAlgError:
@@ -105,9 +100,7 @@ def covariance_basis(
     if posterior is None:
         posterior = partial(posterior_of, target, in_offsets(information_of([sight], n)), prior)
     found = posterior(variance)
-    followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
-    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for label -1
-    normal = _efficient(sight, labelled(views, label), followed)
+    normal = _efficient(sight, np.einsum("fni,nji->fnj", found.followed, prior.axes))
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
     poses = found.poses if free_poses else None
@@ -117,10 +110,13 @@ def covariance_basis(
     )  # fmt: skip
 
 
-def _efficient(sight: Sight, label: NDArray[np.intp], followed: Array) -> Array:
-    """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns."""
-    batches = sight.views.batches
-    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+def _efficient(sight: Sight, followed: Array) -> Array:
+    """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns.
+
+    `followed` (f, n, 3) is the regression of the camera's scores on those of the offsets in the world's axes.
+    """
+    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for padding, labelled -1
+    batches, columns, label = sight.views.batches, sight.columns, sight.slots
     by_batch = blocks_by_batch(batches, sight.state, sight.shapes)
     for chunk, part, by_point in linearised(batches, sight.state, sight.views.scale, label, sight.shapes):
         J = part.copy()
