@@ -96,9 +96,15 @@ def _summary(ctx: click.Context) -> str:
     return re.split(r"\n\s*\n", inspect.cleandoc(ctx.command.help or ""))[0]
 
 
+def _metavar(ctx: click.Context, option: click.Option) -> str:
+    if "ctx" in inspect.signature(option.make_metavar).parameters:
+        return option.make_metavar(ctx)
+    return option.make_metavar()  # of Click before 8.2
+
+
 def _option(ctx: click.Context, option: click.Option) -> tuple[str, str]:
     names = ", ".join(option.opts)
-    values = "" if option.is_flag or option.count else f" {option.make_metavar(ctx)}"
+    values = "" if option.is_flag or option.count else f" {_metavar(ctx, option)}"
     if isinstance(option.show_default, str):
         default = option.show_default
     else:

@@ -11,7 +11,9 @@ these few small matrices: exactly if the problem is linear, otherwise to second 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +23,15 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
 _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal that is not mere rounding
-# Undetermined unknowns become inf or nan; the results are tested for that.
-quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def quietly(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function whose undetermined unknowns become inf or nan, for which its results are tested."""
+    # One for each function: the same `errstate` twice in a call loses NumPy's state before it.
+    return np.errstate(over="ignore", invalid="ignore", divide="ignore")(function)
 
 
 @frozen_dataclass(eq=False)

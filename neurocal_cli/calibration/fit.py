@@ -7,9 +7,8 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from neurocal_cli.adjustment.common_noise import reweighted
+from neurocal_cli.adjustment.leave_out import quietly
 from neurocal_cli.adjustment.observability import check_points
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import farthest_angle
@@ -35,11 +34,9 @@ from neurocal_cli.observations.points import Correspondences
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60
-# Starts that run into a pole of the distortion or into the camera's plane get an infinite cost and lose.
-_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@_quietly
+@quietly  # starts that run into a pole of the distortion or into the camera's plane lose
 def fit(problem: Problem, options: Options) -> Solution:
     """Fit a camera and its distortion model from random weights.
 
@@ -60,7 +57,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     return _finished(solution, options)
 
 
-@_quietly
+@quietly
 def fit_again(
     solution: Solution, points: Correspondences, options: Options, *, only_from_here: bool = False
 ) -> Solution:

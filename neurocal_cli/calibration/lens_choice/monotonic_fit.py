@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import Adjusted, Penalty
+from neurocal_cli.adjustment.leave_out import quietly
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, radial_part
@@ -53,9 +54,6 @@ _ROUNDS, _STEPS, _MORE_STEPS = 12, 60, 600
 _CHANCE = 10.8  # chi-squared of one condition, exceeded in one case of a thousand
 _TIE = 0.009  # negligible relative increase of the rms error
 
-# Steps that run into a pole get an infinite cost and are rejected.
-_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
-
 
 @frozen_dataclass(eq=False)
 class MonotonicFit:
@@ -65,7 +63,7 @@ class MonotonicFit:
     weight: float  # w, in normalised pixels
     least: float  # s0
 
-    @_quietly
+    @quietly  # steps that run into a pole get an infinite cost and are rejected
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Jacobian (m, 5 + K) and residuals (m,): the shortfall of the slopes."""
         slope, by_k = radial_slope(state.model, state.k, self.radii)
@@ -134,7 +132,7 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
     return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
 
 
-@_quietly
+@quietly
 def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted] | None:
     """Fit a distortion again so that it is monotonic inside the image, whose size the points know.
 
