@@ -63,7 +63,8 @@ def calibration_of(
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
     squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
-    free = [n for n, parameter in enumerate(std) if parameter not in fixed]
+    free = tuple(parameter for parameter in std if parameter not in fixed)
+    places = [n for n, parameter in enumerate(std) if parameter in free]
     reason = StopReason.CONVERGED
     if not adjusted.converged:
         reason = StopReason.MAX_ITERATIONS
@@ -84,8 +85,8 @@ def calibration_of(
         stop_reason=reason.value,
         rmse_px=rmse,
         max_px=float(np.sqrt(squared.max())),
-        covariance=block[np.ix_(free, free)],
-        covariance_names=tuple(parameter for parameter in std if parameter not in fixed),
+        covariance=block[np.ix_(places, places)],
+        covariance_names=free,
         distortion_model=problem.distortion.model,
         distortion=state.k,
         network=_network_record(solution, rmse),
