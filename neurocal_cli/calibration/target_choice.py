@@ -45,7 +45,6 @@ from neurocal_cli.observations.target import Target, distinct_points
 
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
-_OF_LINES = "k1k2p1p2"  # the model that `plumb-line` estimates
 _SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
 _FEWEST = 4  # fewest views for bends
 _EARLY = 0.5  # share of the required gain that the first step must predict
@@ -183,7 +182,9 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
 
     The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
     """
-    problem = solution.problem.with_model(_OF_LINES)
+    from neurocal_cli.calibration.lens_choice.plumb_line_camera import MODEL
+
+    problem = solution.problem.with_model(MODEL)
     adjusted = problem.adjust(solution.adjusted)
     _, label, _ = distinct_points([problem.points])
     if not problem.free_poses or not enough_views(label, problem.views.n_views):

@@ -1,5 +1,7 @@
 """Linear calibration in closed form, without initial values (Faugeras and Toscani 1986; Zhang 2000).
 
+`Found` is the result of this method and of the others.
+
 Solid views. Each point gives two equations that are linear in P,
 
     (p_1.M + p_14) - u (p_3.M + p_34) = 0,   (p_2.M + p_24) - v (p_3.M + p_34) = 0,
@@ -19,8 +21,6 @@ solid view this is the decomposition of Faugeras. A given centre and a given rig
 
 The squares are not those of pixel errors, so this is not the minimum of (3), and noise has more effect than
 necessary.
-
-Result of a baseline.
 """
 
 from __future__ import annotations
@@ -43,10 +43,13 @@ from neurocal_cli.network.network import patterns_of
 from neurocal_cli.network.orthogonality import cameras_from_products
 from neurocal_cli.network.view_networks import Group, begin_flat
 
+_FEWEST = 4, 6  # points of a flat and of a solid view
+_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
+
 
 @frozen_dataclass(eq=False)
 class Found:
-    """Result of a baseline."""
+    """What a method finds."""
 
     problem: Problem  # as solved; a method may take more parameters as given than the user
     state: CameraState  # normalised
@@ -54,18 +57,6 @@ class Found:
     iterations: int = 0
     converged: bool = True  # False if an iteration ended early
     remarks: tuple[str, ...] = ()  # for the user
-
-
-def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
-    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
-    distortion = problem.distortion
-    if distortion.model == "none" or problem.free_distortion:
-        return problem, state
-    return problem.as_seen(state)
-
-
-_FEWEST = 4, 6  # points of a flat and of a solid view
-_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
 
 
 def linear(problem: Problem) -> Found:
@@ -79,8 +70,15 @@ def linear(problem: Problem) -> Found:
     return Found(*as_seen(problem, linear_state(problem)), minimised=False)
 
 
+def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
+    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
+    if problem.distortion.model == "none" or problem.free_distortion:
+        return problem, state
+    return problem.as_seen(state)
+
+
 def linear_state(problem: Problem) -> CameraState:
-    """Camera and poses, normalised, without distortion."""
+    """Camera and poses, normalised, without distortion; refuses points that only a mirrored camera sees."""
     check_points(problem)
     if problem.type == 4:
         return _camera_of_given_poses(problem)
@@ -88,7 +86,14 @@ def linear_state(problem: Problem) -> CameraState:
         Group(members, flat, _products(problem.views, members, flat), np.zeros(len(members)))
         for members, flat in whole_groups(problem, _FEWEST)
     ]
-    _refuse_mirrored(problem, groups)
+    for group in groups:
+        mirrored = np.linalg.det(group.product[:, :, :3]) < 0
+        if not group.flat and mirrored.any():
+            raise DegenerateGeometryError(
+                f"view {problem.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored "
+                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v "
+                "downwards?)"
+            )
     entries = problem.normalised_entries if problem.type == 3 else _intrinsics(problem, groups)
     return cameras_from_products(problem, groups, entries[None])
 
@@ -126,17 +131,6 @@ def _products(views: Views, members: NDArray[np.intp], flat: bool) -> Array:
     product = solution.reshape(K, 3, n)
     product[:, 2] = np.roll(product[:, 2], -1, axis=1)
     return np.asarray(product * np.where(product[:, 2, -1] < 0, -1.0, 1.0)[:, None, None])
-
-
-def _refuse_mirrored(problem: Problem, groups: list[Group]) -> None:
-    for group in groups:
-        mirrored = np.linalg.det(group.product[:, :, :3]) < 0
-        if not group.flat and mirrored.any():
-            raise DegenerateGeometryError(
-                f"view {problem.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored "
-                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v "
-                "downwards?)"
-            )
 
 
 def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
