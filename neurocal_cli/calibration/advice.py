@@ -148,15 +148,16 @@ def candidates(calibration: Calibration) -> list[Candidate]:
     assert camera.image_size is not None
     size = np.array(camera.image_size, dtype=float)
     middle = 0.5 * (world.min(axis=0) + world.max(axis=0))
-    frontal = _frontal(calibration, world - middle)
-    corners = _outline(world - middle, frontal)
-    extent = np.ptp((world - middle) @ frontal.T, axis=0)[:2]
+    centred = world - middle
+    frontal = _frontal(calibration, centred)
+    corners = _outline(centred, frontal)
+    extent = np.ptp(centred @ frontal.T, axis=0)[:2]
     turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
     rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
     R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
     # A flat target is in the image if its corners are.
-    flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
-    checked = corners if flat else world - middle
+    flat = np.ptp(centred @ frontal[2]) <= _FLAT * extent.max()
+    checked = corners if flat else centred
     found = []
     for share in [(a, b) for b in _POSITIONS for a in _POSITIONS]:
         ray = camera.unproject((np.array(share) * (size - 1))[None])[0]
