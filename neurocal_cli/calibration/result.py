@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from neurocal_cli.adjustment.covariance import (
 from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
-from neurocal_cli.adjustment.solution import Solution, TargetPosterior
+from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.given_model import undetermined_coefficients
@@ -43,10 +43,13 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
+    at, posterior = solution.target_posterior or (None, None)
+    if at is not adjusted:  # the camera has been adjusted again
+        posterior = None
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
-            problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
+            problem.points, solution.target, posterior, tuple(solution.model_errors or ()),
             solution.shared, solution.by_prior, solution.target_kept,
             solution.covariance if solution.target is None else None,
         )
@@ -124,12 +127,6 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
         both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
         results[name] = replace(found.views[name], std=both)
     return replace(found, views=results, given_covariance=covariance, given_names=names)
-
-
-def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
-    """The posterior of the target for a variance, unless the camera has been adjusted again."""
-    adjusted, posterior = solution.target_posterior or (None, None)
-    return posterior if adjusted is solution.adjusted else None
 
 
 def _entries(solution: Solution, known: CameraCovariance) -> Array:

@@ -233,8 +233,13 @@ def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | 
     known = None if common is None else common.target
     if not _may_bend(fit[0], known):
         return common
+    # Log evidence without and with bends, for fixed common points.
     try:
-        rigid, bent = _promise(Search([fit] if common is None else common.fits, False, known, bending=True))
+        search = Search([fit] if common is None else common.fits, False, known, bending=True)
+        (sight,) = search.sights()
+        info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
+        held = info.held(most_probable_precision(info, search.prior.size, roughly=True))
+        rigid, bent = evidence_of_given(info.straight()), evidence_of_given(held)
     except np.linalg.LinAlgError:  # the points do not determine the camera
         return common
     if bent < rigid + _EARLY * LEAST_GAIN:
@@ -260,14 +265,6 @@ def _may_bend(problem: Problem, known: Target | None) -> bool:
         return is_flat(known.given) and not known.plane.any()
     given, _, ids = distinct_points([problem.points])
     return is_flat(given) and not planes_of(given, ids).any()
-
-
-def _promise(search: Search) -> tuple[float, float]:
-    """Log evidence without and with bends, for fixed common points."""
-    (sight,) = search.sights()
-    info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
-    bent = info.held(most_probable_precision(info, search.prior.size, roughly=True))
-    return evidence_of_given(info.straight()), evidence_of_given(bent)
 
 
 def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:

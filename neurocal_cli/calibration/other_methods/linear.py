@@ -151,23 +151,17 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     rows = np.concatenate(equations)[:, unknown]
     omega = np.zeros(6)
     omega[unknown] = smallest(rows[None], int(unknown.sum()))[0]
-    A = _upper_factor(omega)
-    entries = A[ENTRIES]
-    entries[3:] += centre
-    return np.asarray(np.where(problem.free, entries, problem.normalised_entries))
-
-
-def _upper_factor(omega: Array) -> Array:
-    """A of ``omega = A^-T A^-1``, with A[2, 2] = 1."""
     try:
-        L = np.linalg.cholesky(omega_of(omega))  # omega = L L^T, so A^-1 is L^T
+        L = np.linalg.cholesky(omega_of(omega))  # omega = A^-T A^-1 = L L^T, so A^-1 is L^T up to scale
     except np.linalg.LinAlgError as error:
         raise DegenerateGeometryError(
             "no camera solves the linear equations of these points; tilt the boards more, give more views, "
             "or use the method neuro"
         ) from error
     A = np.linalg.inv(L.T)
-    return np.asarray(A / A[2, 2])
+    entries = (A / A[2, 2])[ENTRIES]
+    entries[3:] += centre
+    return np.asarray(np.where(problem.free, entries, problem.normalised_entries))
 
 
 def _camera_of_given_poses(problem: Problem) -> CameraState:
