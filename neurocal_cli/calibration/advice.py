@@ -91,7 +91,7 @@ class _Known:
     """Information on a camera from the views taken so far."""
 
     camera: Camera  # with open coefficients that its model lacks (`open_coefficients`), as 0
-    free: NDArray[np.bool_]  # (5 + K,)
+    free: NDArray[np.bool_]  # (5 + K,) entries of A and coefficients that were estimated, or are open
     information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
     places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`
     sigma: float  # noise of the points [px]
@@ -108,14 +108,19 @@ class _Known:
             raise InputError("the calibration holds no points; give a file that was not written with --lean")
         if size is None:
             raise InputError("the size of the images is unknown; calibrate with --image-size W H")
-        free = _free(calibration)
+        free = free_entries(calibration, NODES)
+        if not camera.intrinsics.skewed:
+            free[1] = False
+        if not free.any():
+            raise InputError("all parameters of the camera are given; more views cannot improve it")
         rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
         sigma = max(rms / np.sqrt(2.0), _LEAST_SIGMA)
-        beforehand = np.zeros(int(free.sum()))
         state, tried = calibration.state(points.view_names), tuple(calibration.lens_choice)
-        if (opened := open_at_points(state, points, free, tried)) is not None:
+        opened = open_at_points(state, points, free, tried)
+        if opened is not None:
             camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
-            beforehand = np.zeros(int(free.sum()))
+        beforehand = np.zeros(int(free.sum()))
+        if opened is not None:
             prior = opened.prior
             beforehand[prior.left_out] = (sigma / prior.size[prior.left_out[prior.is_open]]) ** 2
         information, depths = np.diag(beforehand), []
@@ -127,16 +132,6 @@ class _Known:
             depths.append(float(np.median(depth)))
         places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths))
         return cls(camera, free, information, places, sigma)
-
-
-def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) mask of the entries of A and the coefficients that were estimated."""
-    free = free_entries(calibration, NODES)
-    if not calibration.camera.intrinsics.skewed:
-        free[1] = False
-    if not free.any():
-        raise InputError("all parameters of the camera are given; more views cannot improve it")
-    return free
 
 
 def _target(calibration: Calibration) -> Array:
@@ -153,15 +148,16 @@ def candidates(calibration: Calibration) -> list[Candidate]:
     assert camera.image_size is not None
     size = np.array(camera.image_size, dtype=float)
     middle = 0.5 * (world.min(axis=0) + world.max(axis=0))
-    frontal = _frontal(calibration, world - middle)
-    corners = _outline(world - middle, frontal)
-    extent = np.ptp((world - middle) @ frontal.T, axis=0)[:2]
+    centred = world - middle
+    frontal = _frontal(calibration, centred)
+    corners = _outline(centred, frontal)
+    extent = np.ptp(centred @ frontal.T, axis=0)[:2]
     turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
     rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
     R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
     # A flat target is in the image if its corners are.
-    flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
-    checked = corners if flat else world - middle
+    flat = np.ptp(centred @ frontal[2]) <= _FLAT * extent.max()
+    checked = corners if flat else centred
     found = []
     for share in [(a, b) for b in _POSITIONS for a in _POSITIONS]:
         ray = camera.unproject((np.array(share) * (size - 1))[None])[0]

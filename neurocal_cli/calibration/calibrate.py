@@ -1,4 +1,7 @@
-"""`calibrate`: from points to a calibrated camera."""
+"""`calibrate`: check what is given and asked for, solve it, and refuse results that cannot be right.
+
+The package's docstring lists the steps.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,7 @@ def calibrate(
     extrinsics : dict of Pose by view name or Calibration, optional
         For type 4. Of a Calibration, the poses of its views.
     method : {"neuro", "linear", "nonlinear", "tsai"}
-        The network, or one of the methods that the paper compares it with (`baselines`). These use all
+        The network, or one of the methods that the paper compares it with (`other_methods`). These use all
         points, including outliers, and have no random starts.
     trainer : {"lm", "backprop"}
     distortion : {"auto", "plumb-line"} or one of `camera.distortion.MODELS`
@@ -96,7 +99,7 @@ def calibrate(
         Of the random weights; the same seed gives the same result.
     target : {"auto", "given", "flat", "free"} or Target
         How the target's points are treated: "given" uses them as given; "free" estimates them with the
-        camera; "flat" does so within their plane; "auto" does so if the data support it (`target_shape`). A
+        camera; "flat" does so within their plane; "auto" does so if the data support it (`target_choice`). A
         Target that is known already is used as it is. Points with stated standard deviations (`world_std`)
         are adjusted within these, unless "given".
     preferred : str

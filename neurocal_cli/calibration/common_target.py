@@ -47,6 +47,35 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     return None if doubtful and named_lens_is_too_simple(fits, found) else found.target
 
 
+def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
+    """Surveyed points, adjusted with all cameras, starting again from the survey."""
+    stated = [
+        camera if camera.target is None else replace(camera, points=camera.target.as_given(camera.points))
+        for camera in cameras
+    ]
+    try:
+        found = find_surveyed([_fit(camera) for camera in stated])
+    except NeurocalError:
+        return None
+    return None if found is None else found.target
+
+
+def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
+    """The problem that a calibration solves, adjusted to its minimum."""
+    given = calibration.intrinsics
+    problem = problem_for(
+        calibration.points,
+        calibration.type,
+        image_center=(given.u0, given.v0) if calibration.type == 2 else None,
+        intrinsics=given if calibration.type == 3 else None,
+        skew="theta" not in calibration.fixed or calibration.type == 3,
+        distortion=calibration.camera.distortion,
+    ).with_seen_pixels()
+    problem = replace(problem, fixed=problem.fixed | calibration.fixed)
+    state = calibration.state(problem.views.names)
+    return problem, problem.adjust(normalised(state, problem.views))
+
+
 def find_shape(
     fits: Sequence[tuple[Problem, Adjusted]], choice: str, known: Target | None, named: bool
 ) -> Found | None:
@@ -73,19 +102,6 @@ def views_suffice(points: Sequence[Correspondences], known: Target | None, n_dif
     return enough_views(label, n_different, int(plane.max()) + 1)
 
 
-def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
-    """Surveyed points, adjusted with all cameras, starting again from the survey."""
-    stated = [
-        camera if camera.target is None else replace(camera, points=camera.target.as_given(camera.points))
-        for camera in cameras
-    ]
-    try:
-        found = find_surveyed([_fit(camera) for camera in stated])
-    except NeurocalError:
-        return None
-    return None if found is None else found.target
-
-
 def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, Calibration]:
     """Refer the points of two separately calibrated cameras to one target.
 
@@ -104,19 +120,3 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
         return replace(camera, points=target.applied(points), target=target)
 
     return on_it(left), on_it(right)
-
-
-def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
-    """The problem that a calibration solves, adjusted to its minimum."""
-    given = calibration.intrinsics
-    problem = problem_for(
-        calibration.points,
-        calibration.type,
-        image_center=(given.u0, given.v0) if calibration.type == 2 else None,
-        intrinsics=given if calibration.type == 3 else None,
-        skew="theta" not in calibration.fixed or calibration.type == 3,
-        distortion=calibration.camera.distortion,
-    ).with_seen_pixels()
-    problem = replace(problem, fixed=problem.fixed | calibration.fixed)
-    state = calibration.state(problem.views.names)
-    return problem, problem.adjust(normalised(state, problem.views))

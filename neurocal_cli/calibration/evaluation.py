@@ -83,10 +83,6 @@ def evaluate_camera(
         Default: the points of the calibration. If it has estimated its target, points of that target get
         their estimated coordinates.
 
-    Returns
-    -------
-    evaluation : CameraEvaluation
-
     Raises
     ------
     InputError
@@ -138,9 +134,13 @@ def evaluate_camera(
         warnings.append(
             f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
         )
-    on_target = given is not None and points is not given
-    measured = _measure(residuals, points, fitted, tuple(warnings))
-    return replace(measured, renamed=renamed, fit=fit, on_target=on_target)
+    return replace(
+        _measure(residuals, points, fitted),
+        warnings=tuple(warnings),
+        renamed=renamed,
+        fit=fit,
+        on_target=given is not None and points is not given,
+    )
 
 
 def refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
@@ -179,9 +179,7 @@ def predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple
     return camera.project(np.einsum("nij,nj->ni", R, points.world) + t)
 
 
-def _measure(
-    residuals: Array, points: Correspondences, fitted: NDArray[np.bool_], warnings: tuple[str, ...]
-) -> CameraEvaluation:
+def _measure(residuals: Array, points: Correspondences, fitted: NDArray[np.bool_]) -> CameraEvaluation:
     """Averages over the points in front of the camera, of each view and of all."""
     index, n_views = points.view_index, points.n_views
     in_front = ~np.isnan(residuals[:, 0])
@@ -208,5 +206,4 @@ def _measure(
         bias_u=float(bias[0]),
         bias_v=float(bias[1]),
         views=views,
-        warnings=warnings,
     )

@@ -30,8 +30,8 @@ from neurocal_cli.network.options import Options
 from neurocal_cli.observations.points import Correspondences
 
 # Model of a second start, for when the radial start fails, for example because the distortion centre is far
-# from the image centre.
-# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
+# from the image centre. Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no
+# local minimum).
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60
 
@@ -85,6 +85,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
 
 
 def _with_selected_model(solution: Solution, options: Options, only_from_here: bool) -> Solution:
+    """Select the distortion model, again if mirrored poses fit better with it."""
     from neurocal_cli.calibration.lens_choice.model_selection import select_model
 
     if only_from_here:

@@ -1,13 +1,12 @@
-"""Causes of errors on the given target other than its shape.
+"""Causes of errors on the given target other than its shape: of all views, and of one that is left out.
 
-Wrong stated sigmas, a distortion model that is too simple, wrong given parameters, two cameras and a camera
-that changes between the views all leave residuals that a target of another shape explains in part.
+All views. Wrong stated sigmas, a distortion model that is too simple, wrong given parameters, two cameras and
+a camera that changes between the views all leave residuals that a target of another shape explains in part.
 
-Diagnose why a view of a flat target contradicts the camera of the other views.
-
-Each hypothesis changes the view's pixels, its world points or its camera. The view's pose is then estimated
-as in a problem of type 3 and adjusted. The first hypothesis whose rms error matches that of the other views
-is the explanation. If none does, the view keeps the reason for which it was left out.
+One view of a flat target. Each hypothesis about why it contradicts the camera of the other views changes its
+pixels, its world points or its camera. Its pose is then estimated as in a problem of type 3 and adjusted. The
+first hypothesis whose rms error matches that of the other views is the explanation. If none does, the view
+keeps the reason for which it was left out.
 """
 
 from __future__ import annotations
@@ -60,6 +59,16 @@ _SURELY = 0.5
 _TELL_BENDS = 3  # views that tell bent planes from distortion (tests/test_cli_stereo.py)
 _ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
+# Of one view.
+_HOLDS = 2.0  # times the rms error of the other views
+_STEPS = 40
+_STARTS = 20
+_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
+_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
+_CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
+_BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
+_FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
+
 
 def has_other_cause(solution: Solution, found: Found) -> bool:
     """Whether the errors on the given target have another cause than its shape."""
@@ -80,7 +89,7 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
     own = float(least_of_free_networks(solution.adjusted.normal).sum())
     if _are_two_cameras(solution, found, own):
         return True
-    rivals = _Rivals.of(solution, found)
+    rivals = _Rivals(solution, found.evidence - evidence_as_given([(problem, solution.adjusted)]))
     return rivals.may_explain(own) and (_changes_between_views(rivals) or _are_turned(rivals))
 
 
@@ -137,14 +146,12 @@ class _Rivals:
     """Causes that a small number of unknowns describes, on the given target, beside the found target."""
 
     solution: Solution
-    spare: float  # equations beyond the unknowns
     wanted: float  # log evidence of the found target over that of the given one
 
-    @classmethod
-    def of(cls, solution: Solution, found: Found) -> _Rivals:
-        problem = solution.problem
-        wanted = found.evidence - evidence_as_given([(problem, solution.adjusted)])
-        return cls(solution, problem.views.n_equations - problem.n_parameters, wanted)
+    @property
+    def spare(self) -> float:
+        """Number of equations beyond that of the unknowns."""
+        return self.solution.problem.views.n_equations - self.solution.problem.n_parameters
 
     def more_probable(self, after: float, choices: float = 1.0) -> bool:
         """Whether one unknown that leaves this squared error is more probable than the found target.
@@ -186,16 +193,6 @@ def _are_turned(rivals: _Rivals) -> bool:
     q = reduced(adjusted.normal, free, problem.free_poses)
     best, _ = best_turned(views, adjusted, q, free, middle_of(size, views))
     return rivals.more_probable(float(best.cost.sum()), 2.0**views.n_views)
-
-
-_HOLDS = 2.0  # times the rms error of the other views
-_STEPS = 40
-_STARTS = 20
-_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
-_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
-_CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
-_BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
-_FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:

@@ -13,6 +13,7 @@ bit with and without this module. Otherwise
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -28,7 +29,7 @@ from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, why_odd
 from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import pixel_spread
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
     FEWEST_OF_PLANE,
@@ -53,6 +54,19 @@ _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the 
 _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
 
 
+@frozen_dataclass(eq=False)
+class _Kept:
+    """What the search has kept so far."""
+
+    mask: NDArray[np.bool_]  # (N,) which points are kept
+    wrong_views: Mapping[str, str]  # left out as a whole, each with the reason
+
+    def without(self, points: Correspondences, view: str) -> _Kept:
+        """Leave out a view that contradicts the camera of the others."""
+        reason = "it contradicts the camera of the other views"
+        return _Kept(self.mask & ~_is_of(points, view), {**self.wrong_views, view: reason})
+
+
 def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
     """Fit a camera, leaving outliers out.
 
@@ -67,11 +81,10 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
             return first, Rejected()
     except DegenerateGeometryError as error:
         failure = error
-    search = _Search(problem, options)
-    search.agree(first, failure)
-    search.without_outlier_views()
-    search.judge_all_points()
-    return replace(search.solution, of_all=first), search.rejected()
+    kept, solution = _agreeing(problem, options, first, failure)
+    kept, solution = _without_outlier_views(problem, options, kept, solution)
+    kept, solution = _all_judged(problem.points, options, kept, solution)
+    return replace(solution, of_all=first), _rejected(problem.points, kept, solution)
 
 
 def judged_again(
@@ -81,207 +94,22 @@ def judged_again(
 
     It was fitted to the points an earlier lens had kept; that lens had rejected points, but no whole views.
     """
-    search = _Search(problem, options)
-    search.solution = solution
-    if rejected.points is not None:
-        search.kept = ~_among(problem.points, rejected.points)
-    search.judge_all_points()
-    return search.solution, search.rejected()
+    points = problem.points
+    out = set() if rejected.points is None else set(_measurements(rejected.points))
+    mask = np.array([one not in out for one in _measurements(points)])
+    kept, solution = _all_judged(points, options, _Kept(mask, {}), solution)
+    return solution, _rejected(points, kept, solution)
 
 
-def _among(points: Correspondences, some: Correspondences) -> NDArray[np.bool_]:
-    """(N,) which of the points are the same measurements as those in `some`."""
-
-    def keys(of: Correspondences) -> list[tuple[str, float, float]]:
-        names = [of.view_names[v] for v in of.view_index]
-        return list(zip(names, *of.pixels.T.tolist(), strict=True))
-
-    known = set(keys(some))
-    return np.array([key in known for key in keys(points)])
+def _measurements(points: Correspondences) -> list[tuple[str, float, float]]:
+    """View and pixel of each point, which tell it from all others."""
+    names = [points.view_names[v] for v in points.view_index]
+    return list(zip(names, *points.pixels.T.tolist(), strict=True))
 
 
-class _Search:
-    """State of the outlier rejection: which points are kept, and the solution fitted to them."""
-
-    solution: Solution
-
-    def __init__(self, problem: Problem, options: Options) -> None:
-        self.problem, self.options, self.points = problem, options, problem.points
-        self.kept = np.ones(len(self.points), dtype=bool)
-        self.wrong_views: dict[str, str] = {}
-
-    def _fit(self, kept: NDArray[np.bool_], options: Options) -> Solution:
-        return fit(self.problem.with_points(self.points.select(kept)), options)
-
-    def agree(self, first: Solution | None, failure: DegenerateGeometryError | None) -> None:
-        """Keep the points that agree with a robust network of their view, and fit the camera to them.
-
-        A wide lens displaces points by more than outliers do. So once the lens is known, the consensus is
-        repeated on rays.
-        """
-        views = arrange(self._by_plane())
-        rng = np.random.default_rng(self.options.seed)
-        consensus = find_consensus(views, rng)
-        may_be_wide = self.options.distortion == "auto" or self.problem.distortion.wide
-        if may_be_wide and consensus.hopeless.any():
-            middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
-            consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
-        self._keep(views, consensus)
-        if self.kept.all():
-            if first is None:
-                assert failure is not None
-                raise failure
-            self.solution = first
-            return
-        self._enough(failure)
-        try:
-            self.solution = self._fit(self.kept, self.options)
-        except DegenerateGeometryError:
-            if failure is not None:
-                raise failure from None
-            raise
-        for _ in range(_LOOKS):
-            if not self.solution.state.distortion.wide:
-                break
-            again = find_consensus(replace(views, rays=self._rays(views)), rng)
-            if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
-                break
-            self._keep(views, again)
-            self.solution, consensus = self._fit(self.kept, self.options), again
-
-    def _rays(self, views: Views) -> Array:
-        """Rays of all pixels through the current lens, in the order of the views."""
-        rays = self.solution.camera.unproject(self.points.pixels)
-        rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
-        return rays if views.order is None else rays[views.order]
-
-    def _by_plane(self) -> Correspondences:
-        """The points, with a view for each plane of a folded target, which may be set up wrongly.
-
-        Views in which a plane has too few points for a search stay whole.
-        """
-        given, label, ids = distinct_points([self.points])
-        planes, views = planes_of(given, ids)[label], self.points.view_index
-        if not planes.any():
-            return self.points
-        first = views * (planes.max() + 1)
-        few = np.bincount(first + planes)[first + planes] < FEWEST_OF_PLANE
-        whole = np.isin(views, views[few])
-        return replace(self.points, view=np.where(whole, first, first + planes))
-
-    def _keep(self, views: Views, consensus: Consensus) -> None:
-        """Reset the kept points and the wrong views to a consensus."""
-        agreed = consensus.kept & ~consensus.hopeless[views.index]
-        self.kept[slice(None) if views.order is None else views.order] = agreed
-        self.wrong_views = {}
-        left = np.bincount(self.points.view_index, self.kept, self.points.n_views)
-        for view in np.flatnonzero(left == 0):
-            self._drop(self.points.view_names[view], "its pixels do not match its points")
-
-    def _drop(self, name: str, reason: str) -> None:
-        self.wrong_views[name] = reason
-        self.kept &= ~self._of_view(name)
-
-    def _of_view(self, name: str) -> NDArray[np.bool_]:
-        """(N,) which points are of a view."""
-        return self.points.view_index == self.points.view_names.index(name)
-
-    def _enough(self, failure: DegenerateGeometryError | None = None) -> None:
-        share = self.kept.mean()
-        if share > _MAJORITY:
-            return
-        if failure is not None:
-            raise failure
-        if len(self.wrong_views) == self.points.n_views:
-            raise DegenerateGeometryError(
-                "the pixels do not match the points in any view; check that each pixel belongs to its point, "
-                "and the order of the columns"
-            )
-        raise DegenerateGeometryError(
-            f"{100 * (1 - share):.0f} % of the points are outliers"
-            + (f" ({', '.join(map(repr, self.wrong_views))} as whole views)" if self.wrong_views else "")
-            + "; check that each pixel belongs to its point, and that all views are of one camera"
-        )
-
-    def without_outlier_views(self) -> None:
-        """Leave out views of another camera, or of another target than their points say.
-
-        A distortion model that is selected with the outlier views included can absorb and so hide them.
-        Therefore a pinhole looks for them first, unless the lens is wide.
-        """
-        if self.options.distortion == "auto" and not self.solution.state.distortion.wide:
-            pinhole = replace(self.options, distortion="")
-            before = len(self.wrong_views)
-            # Under very strong distortion no pinhole can be fitted; this step is skipped then.
-            with suppress(DegenerateGeometryError):
-                self._drop_outlier_views(pinhole, self._fit(self.kept, pinhole))
-            if len(self.wrong_views) > before:
-                self.solution = self._fit(self.kept, self.options)
-                self._readmit(list(self.wrong_views)[before:])
-        self.solution = self._drop_outlier_views(self.options, self.solution)
-
-    def _readmit(self, names: list[str]) -> None:
-        """Take back views that fit the camera once it has a distortion model."""
-        for name in names:
-            kept = self.kept | self._of_view(name)
-            with suppress(DegenerateGeometryError):
-                solution = self._fit(kept, self.options)
-                if not solution.refusal and rms(solution) <= NO_WORSE * rms(self.solution):
-                    self.solution, self.kept = solution, kept
-                    del self.wrong_views[name]
-
-    def _drop_outlier_views(self, options: Options, solution: Solution) -> Solution:
-        """Leave outlier views out one by one; return the fit without them."""
-        most = (self.points.n_views - 1) // 3
-        while len(self.wrong_views) < most:
-            outlier = find_outlier_view(solution)
-            if outlier is None:
-                break
-            self._drop(outlier, "it contradicts the camera of the other views")
-            solution = self._fit(self.kept, options)
-        return solution
-
-    def judge_all_points(self) -> None:
-        """Classify all points of the kept views by the camera and fit again, until nothing changes."""
-        known = {tuple(np.packbits(self.kept))}
-        for _ in range(_PASSES):
-            kept = self._explained()
-            if (kept == self.kept).all():
-                return
-            self.kept = kept
-            self._enough()
-            state = tuple(np.packbits(kept))
-            self.solution = fit_again(self.solution, self.points.select(kept), self.options)
-            if state in known:  # a cycle: a point near the limit is alternately kept and rejected
-                return
-            known.add(state)
-
-    def _explained(self) -> NDArray[np.bool_]:
-        errors, index = point_errors(self.solution, self.points), self.points.view_index
-        near = errors.length < largest_expected(errors, self.kept, self.points)[index]
-        share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
-        for view in np.flatnonzero(share <= _MAJORITY):
-            name = self.points.view_names[view]
-            self.wrong_views.setdefault(name, "most of its points are outliers")
-        return np.asarray(near & (share > _MAJORITY)[index])
-
-    def rejected(self) -> Rejected:
-        """The points and views that were left out."""
-        error = point_errors(self.solution, self.points).length
-        rows = np.flatnonzero(~self.kept)
-        self._explain()
-        if not rows.size:
-            return Rejected(views=dict(self.wrong_views))
-        known = np.where(np.isfinite(error), error, np.nan)[rows]
-        return Rejected(self.points.select(rows), known, dict(self.wrong_views))
-
-    def _explain(self) -> None:
-        """Diagnose each view that was left out, unless wrong sigmas may be why it was."""
-        if contradicts_sigma(self.solution):
-            return
-        for name, reason in self.wrong_views.items():
-            plain = replace(self.points.select(self._of_view(name)), covariance=None, across=None)
-            self.wrong_views[name] = why_odd(plain, self.solution.camera, rms(self.solution), reason)
+def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
+    """(N,) which points are of a view."""
+    return points.view_index == points.view_names.index(view)
 
 
 def _suspicious(solution: Solution) -> bool:
@@ -299,3 +127,185 @@ def _suspicious(solution: Solution) -> bool:
     if np.sqrt((error**2).mean()) > _ROUGH * pixel_spread(points):
         return True
     return find_outlier_view(solution) is not None
+
+
+def _fitted(problem: Problem, mask: NDArray[np.bool_], options: Options) -> Solution:
+    return fit(problem.with_points(problem.points.select(mask)), options)
+
+
+def _agreeing(
+    problem: Problem, options: Options, first: Solution | None, failure: DegenerateGeometryError | None
+) -> tuple[_Kept, Solution]:
+    """Keep the points that agree with a robust network of their view, and fit the camera to them.
+
+    `first` is the fit of all points, or `failure` the reason why there is none.
+
+    A wide lens displaces points by more than outliers do. So once the lens is known, the consensus is
+    repeated on rays.
+    """
+    points = problem.points
+    views = arrange(_by_plane(points))
+    rng = np.random.default_rng(options.seed)
+    consensus = find_consensus(views, rng)
+    may_be_wide = options.distortion == "auto" or problem.distortion.wide
+    if may_be_wide and consensus.hopeless.any():
+        middle = (middle_of_image(problem) - views.pixel_centre) / views.pixel_scale
+        consensus = find_consensus_through_wide_lens(consensus, views, middle, rng)
+    kept = _kept_by(consensus, views, points)
+    if kept.mask.all():
+        if first is None:
+            assert failure is not None
+            raise failure
+        return kept, first
+    _refuse_few(points, kept, failure)
+    try:
+        solution = _fitted(problem, kept.mask, options)
+    except DegenerateGeometryError:
+        if failure is not None:
+            raise failure from None
+        raise
+    for _ in range(_LOOKS):
+        if not solution.state.distortion.wide:
+            break
+        rays = solution.camera.unproject(points.pixels)
+        rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
+        again = find_consensus(replace(views, rays=rays if views.order is None else rays[views.order]), rng)
+        if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
+            break
+        kept, consensus = _kept_by(again, views, points), again
+        solution = _fitted(problem, kept.mask, options)
+    return kept, solution
+
+
+def _by_plane(points: Correspondences) -> Correspondences:
+    """The points, with a view for each plane of a folded target, which may be set up wrongly.
+
+    Views in which a plane has too few points for a search stay whole.
+    """
+    given, label, ids = distinct_points([points])
+    planes, views = planes_of(given, ids)[label], points.view_index
+    if not planes.any():
+        return points
+    first = views * (planes.max() + 1)
+    few = np.bincount(first + planes)[first + planes] < FEWEST_OF_PLANE
+    whole = np.isin(views, views[few])
+    return replace(points, view=np.where(whole, first, first + planes))
+
+
+def _kept_by(consensus: Consensus, views: Views, points: Correspondences) -> _Kept:
+    """The points that agree; views without any of them are wrong."""
+    mask = np.empty(len(points), dtype=bool)
+    mask[slice(None) if views.order is None else views.order] = (
+        consensus.kept & ~consensus.hopeless[views.index]
+    )
+    left = np.bincount(points.view_index, mask, points.n_views)
+    wrong = [points.view_names[view] for view in np.flatnonzero(left == 0)]
+    return _Kept(mask, dict.fromkeys(wrong, "its pixels do not match its points"))
+
+
+def _refuse_few(points: Correspondences, kept: _Kept, failure: DegenerateGeometryError | None = None) -> None:
+    """Refuse to calibrate from a minority of the points, with the error of the fit of all of them, if any."""
+    share = kept.mask.mean()
+    if share > _MAJORITY:
+        return
+    if failure is not None:
+        raise failure
+    if len(kept.wrong_views) == points.n_views:
+        raise DegenerateGeometryError(
+            "the pixels do not match the points in any view; check that each pixel belongs to its point, "
+            "and the order of the columns"
+        )
+    raise DegenerateGeometryError(
+        f"{100 * (1 - share):.0f} % of the points are outliers"
+        + (f" ({', '.join(map(repr, kept.wrong_views))} as whole views)" if kept.wrong_views else "")
+        + "; check that each pixel belongs to its point, and that all views are of one camera"
+    )
+
+
+def _without_outlier_views(
+    problem: Problem, options: Options, kept: _Kept, solution: Solution
+) -> tuple[_Kept, Solution]:
+    """Leave out views of another camera, or of another target than their points say, one by one.
+
+    A distortion model that is selected with the outlier views included can absorb and so hide them.
+    Therefore a pinhole looks for them first, unless the lens is wide.
+    """
+    points = problem.points
+    if options.distortion == "auto" and not solution.state.distortion.wide:
+        pinhole, fewer = replace(options, distortion=""), kept
+        # Under very strong distortion no pinhole can be fitted; this step ends then.
+        with suppress(DegenerateGeometryError):
+            seen = _fitted(problem, fewer.mask, pinhole)
+            while (outlier := _outlier_view(points, fewer, seen)) is not None:
+                fewer = fewer.without(points, outlier)
+                seen = _fitted(problem, fewer.mask, pinhole)
+        if fewer is not kept:
+            solution = _fitted(problem, fewer.mask, options)
+            left_out = [name for name in fewer.wrong_views if name not in kept.wrong_views]
+            kept, solution = _with_returned(problem, options, fewer, solution, left_out)
+    while (outlier := _outlier_view(points, kept, solution)) is not None:
+        kept = kept.without(points, outlier)
+        solution = _fitted(problem, kept.mask, options)
+    return kept, solution
+
+
+def _outlier_view(points: Correspondences, kept: _Kept, solution: Solution) -> str | None:
+    """The view that contradicts the others most; None if there is none, or a third is left out already."""
+    most = (points.n_views - 1) // 3
+    return find_outlier_view(solution) if len(kept.wrong_views) < most else None
+
+
+def _with_returned(
+    problem: Problem, options: Options, kept: _Kept, solution: Solution, names: list[str]
+) -> tuple[_Kept, Solution]:
+    """Take back those of the named views that fit the camera once it has a distortion model."""
+    for name in names:
+        mask = kept.mask | _is_of(problem.points, name)
+        with suppress(DegenerateGeometryError):
+            more = _fitted(problem, mask, options)
+            if not more.refusal and rms(more) <= NO_WORSE * rms(solution):
+                wrong = {view: reason for view, reason in kept.wrong_views.items() if view != name}
+                kept, solution = _Kept(mask, wrong), more
+    return kept, solution
+
+
+def _all_judged(
+    points: Correspondences, options: Options, kept: _Kept, solution: Solution
+) -> tuple[_Kept, Solution]:
+    """Judge all points, also those left out before, by the camera and fit again, until nothing changes."""
+    known = {kept.mask.tobytes()}
+    for _ in range(_PASSES):
+        last, kept = kept, _judged(points, kept, solution)
+        if (kept.mask == last.mask).all():
+            break
+        _refuse_few(points, kept)
+        solution = fit_again(solution, points.select(kept.mask), options)
+        if kept.mask.tobytes() in known:  # a cycle: a point near the limit is alternately kept and rejected
+            break
+        known.add(kept.mask.tobytes())
+    return kept, solution
+
+
+def _judged(points: Correspondences, kept: _Kept, solution: Solution) -> _Kept:
+    """Keep the points near their predictions, in views of which these are most."""
+    errors, index = point_errors(solution, points), points.view_index
+    near = errors.length < largest_expected(errors, kept.mask, points)[index]
+    share = np.bincount(index, near, points.n_views) / np.bincount(index)
+    reasons = dict(kept.wrong_views)
+    for view in np.flatnonzero(share <= _MAJORITY):
+        reasons.setdefault(points.view_names[view], "most of its points are outliers")
+    return _Kept(near & (share > _MAJORITY)[index], reasons)
+
+
+def _rejected(points: Correspondences, kept: _Kept, solution: Solution) -> Rejected:
+    """What is left out, each view with a diagnosis, unless wrong sigmas may be why it is."""
+    reasons = dict(kept.wrong_views)
+    if not contradicts_sigma(solution):
+        for name, reason in reasons.items():
+            plain = replace(points.select(_is_of(points, name)), covariance=None, across=None)
+            reasons[name] = why_odd(plain, solution.camera, rms(solution), reason)
+    rows = np.flatnonzero(~kept.mask)
+    if not rows.size:
+        return Rejected(views=reasons)
+    error = point_errors(solution, points).length[rows]
+    return Rejected(points.select(rows), np.where(np.isfinite(error), error, np.nan), reasons)

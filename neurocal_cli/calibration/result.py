@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from neurocal_cli.adjustment.covariance import (
 from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
-from neurocal_cli.adjustment.solution import Solution, TargetPosterior
+from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.given_model import undetermined_coefficients
@@ -43,10 +43,13 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
+    at, posterior = solution.target_posterior or (None, None)
+    if at is not adjusted:  # the camera has been adjusted again
+        posterior = None
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, solution.repeated,
-            problem.points, solution.target, _posterior(solution), tuple(solution.model_errors or ()),
+            problem.points, solution.target, posterior, tuple(solution.model_errors or ()),
             solution.shared, solution.by_prior, solution.target_kept,
             solution.covariance if solution.target is None else None,
         )
@@ -63,7 +66,8 @@ def calibration_of(
     block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
     squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
-    free = [n for n, parameter in enumerate(std) if parameter not in fixed]
+    free = tuple(parameter for parameter in std if parameter not in fixed)
+    places = [n for n, parameter in enumerate(std) if parameter in free]
     reason = StopReason.CONVERGED
     if not adjusted.converged:
         reason = StopReason.MAX_ITERATIONS
@@ -84,8 +88,8 @@ def calibration_of(
         stop_reason=reason.value,
         rmse_px=rmse,
         max_px=float(np.sqrt(squared.max())),
-        covariance=block[np.ix_(free, free)],
-        covariance_names=tuple(parameter for parameter in std if parameter not in fixed),
+        covariance=block[np.ix_(places, places)],
+        covariance_names=free,
         distortion_model=problem.distortion.model,
         distortion=state.k,
         network=_network_record(solution, rmse),
@@ -123,12 +127,6 @@ def with_given_covariance(found: Calibration, given: Calibration) -> Calibration
         both = {one: float(np.hypot(std[one], by)) for one, by in zip(POSE_NAMES, more, strict=True)}
         results[name] = replace(found.views[name], std=both)
     return replace(found, views=results, given_covariance=covariance, given_names=names)
-
-
-def _posterior(solution: Solution) -> Callable[[float], TargetPosterior] | None:
-    """The posterior of the target for a variance, unless the camera has been adjusted again."""
-    adjusted, posterior = solution.target_posterior or (None, None)
-    return posterior if adjusted is solution.adjusted else None
 
 
 def _entries(solution: Solution, known: CameraCovariance) -> Array:

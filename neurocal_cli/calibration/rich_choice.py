@@ -51,43 +51,43 @@ def with_rich_lens(
     looked_for = choice == "auto" and options.distortion == "auto" and problem.points.world_std is None
     if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:
         return solution, rejected
-    views = solution.problem.views
-    if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
+    rich = _rich_lens(solution)
+    if rich is None:
         return solution, rejected
-    repeated = solution.repeated
-    rich = None if repeated.n_poses < _FEWEST else _rich(solution, repeated)
-    if rich is None or not _is_the_lens(rich, solution, repeated):
-        return solution, rejected
-    rms = float(np.sqrt(_lost(rich, repeated).sum() / len(views.index))) * rich.problem.views.pixel_scale
-    found = {**(solution.model_errors or {}), "rich": rms}
+    found = rich.model_errors
     if len(rejected):
         rich, rejected = judged_again(problem, rich, rejected, options)
     return replace(rich, model_errors=found), rejected
 
 
-def _rich(solution: Solution, repeated: RepeatedPoses) -> Solution | None:
-    """Fit a rich lens on the given target; None if that fails or the predicted gain is too small."""
-    problem, target = solution.problem, solution.target
-    points = problem.points if target is None else target.as_given(problem.points)
-    problem = problem.with_points(points)
-    fisheye = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
-    start = replace(solution, problem=fisheye[0], adjusted=fisheye[1], target=None)
+def _rich_lens(solution: Solution) -> Solution | None:
+    """Fit a rich lens on the given target; None if it, or already its prediction, is not good enough."""
+    problem, target, views = solution.problem, solution.target, solution.problem.views
+    if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
+        return None
+    repeated = solution.repeated
+    if repeated.n_poses < _FEWEST:
+        return None
+    problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
+    fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
+    start = replace(solution, problem=fisheye, adjusted=adjusted, target=None)
     try:
-        if not promised(start, repeated).sum() * _PROMISED**2 < _lost(solution, repeated).sum():
+        others = _lost(solution, repeated)
+        if not promised(start, repeated).sum() * _PROMISED**2 < others.sum():
             return None
-        return with_displacement(start)
+        rich = with_displacement(start)
     except np.linalg.LinAlgError:
         return None
-
-
-def _is_the_lens(rich: Solution, other: Solution, repeated: RepeatedPoses) -> bool:
-    lost, others = _lost(rich, repeated), _lost(other, repeated)
+    lost = _lost(rich, repeated)
     if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):
-        return False
+        return None
     views, state = rich.problem.views, rich.state
     if correlation(views, point_residuals(views, state)) > _NOISE:
-        return False
-    return view_groups(views, state, rich.adjusted.normal, rich.problem.free_of_prior) is None
+        return None
+    if view_groups(views, state, rich.adjusted.normal, rich.problem.free_of_prior) is not None:
+        return None
+    rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale
+    return replace(rich, model_errors={**(solution.model_errors or {}), "rich": rms})
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:

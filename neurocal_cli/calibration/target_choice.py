@@ -4,15 +4,12 @@ Residuals of a bent board look like lens distortion. So the target is estimated 
 given target, the lens is selected again for that target, and so on until the distortion model stays the same.
 The outliers are judged again as well: many of them contradict only the given target.
 
-Calibrate a camera from surveyed points with stated standard deviations.
-
-First, each point is weighted and tested for outliers with the sum of its pixel noise and its projected survey
-error. Then camera and points are adjusted together, because all views of a point share its survey error.
-
-Estimate a bend of the board in each view if the evidence for it is clear.
-
-Besides the common target, given or estimated, each view has a bend of its own (`bends`). Two models are
+Bends. Besides the common target, given or estimated, each view may have a bend of its own. Two models are
 compared by their evidence: bends of the given target, and bends with a target estimated together with them.
+
+Survey. Points with stated standard deviations are first weighted and tested for outliers with the sum of
+their pixel noise and their projected survey error. Then camera and points are adjusted together, because all
+views of a point share its survey error.
 """
 
 from __future__ import annotations
@@ -46,146 +43,18 @@ from neurocal_cli.observations.board import is_flat, planes_of
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, distinct_points
 
-_FEWEST = 4  # fewest views
-_EARLY = 0.5  # share of the required gain that the first step must predict
-
-
-def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:
-    """Estimate the bend of the board in each view, for a camera at its minimum for the given board.
-
-    `common` is the estimated common shape of the board, if there is one. It is returned if the evidence for
-    bends is not clear.
-    """
-    known = None if common is None else common.target
-    if not _may_bend(fit[0], known):
-        return common
-    try:
-        rigid, bent = _promise(Search([fit] if common is None else common.fits, False, known, bending=True))
-    except np.linalg.LinAlgError:  # the points do not determine the camera
-        return common
-    if bent < rigid + _EARLY * LEAST_GAIN:
-        return common
-    only = Search([fit], False, None, bending=True, still=True).result(LEAST_GAIN)
-    start = only if common is None else common
-    if start is None:
-        return None
-    both = Search(start.fits, False, start.target, bending=True).result(LEAST_GAIN)
-    best = max(filter(None, (only, both)), key=lambda found: found.evidence, default=None)
-    least = LEAST_GAIN + (rigid if common is None else common.evidence)
-    return common if best is None or best.evidence < least else best
-
-
-def _may_bend(problem: Problem, known: Target | None) -> bool:
-    """Whether there are enough views of a single plane, without measured distances.
-
-    `known` is the estimated target, if there is one.
-    """
-    if not problem.free_poses or problem.views.n_views < _FEWEST or problem.points.distances:
-        return False
-    if known is not None:
-        return is_flat(known.given) and not known.plane.any()
-    given, _, ids = distinct_points([problem.points])
-    return is_flat(given) and not planes_of(given, ids).any()
-
-
-def _promise(search: Search) -> tuple[float, float]:
-    """Log evidence without and with bends, for fixed common points."""
-    (sight,) = search.sights()
-    info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
-    bent = info.held(most_probable_precision(info, search.prior.size, roughly=True))
-    return evidence_of_given(info.straight()), evidence_of_given(bent)
-
-
-_MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
-_HALVINGS = 30
-_LEAST_NOISE = 1e-3  # least pixel noise, as a share of the residuals' level
-
-
-def with_survey(
-    problem: Problem, solution: Solution, rejected: Rejected, options: Options
-) -> tuple[Solution, Rejected]:
-    """Adjust camera and points together.
-
-    The problem has all points, at their surveyed coordinates; the solution and the rejected points are
-    calibrated as if the survey were exact. Raises `DegenerateGeometryError` if the points do not determine
-    the camera, and `InputError` if a point has two different standard deviations.
-    """
-    again, outliers = _judged(problem, solution, rejected, options, 1.0)
-    factor = 1.0 if again.target is None else again.target.sizes["stated"]
-    if factor > 1.0 and len(outliers):  # the survey is worse than stated, so fewer points are outliers
-        again, outliers = _judged(problem, again, outliers, options, factor)
-    return again, outliers
-
-
-def _judged(
-    problem: Problem, solution: Solution, rejected: Rejected, options: Options, factor: float
-) -> tuple[Solution, Rejected]:
-    """Adjust camera and points; outliers are judged by `factor` times the stated standard deviations."""
-    points = problem.points
-    covariance = _with_places(solution, points, factor)
-    judged = replace(points, covariance=covariance, lines=np.arange(len(points)))
-    if len(rejected) or rejected.views:
-        weighed, rejected = fit_robustly(problem.with_points(judged), options)
-        if rejected.points is not None:
-            assert rejected.points.lines is not None
-            rejected = replace(rejected, points=points.select(rejected.points.lines))
-    else:
-        weighed = fit_again(solution, judged, options)
-    kept = weighed.problem.points.lines
-    assert kept is not None
-    if weighed.refusal:
-        return weighed, rejected
-    own = weighed.problem.with_points(points.select(kept))
-    if not own.free_distortion:
-        own = own.with_seen_pixels()
-    start = own.adjust(replace(weighed.adjusted, state=normalised(weighed.in_pixels, own.views)))
-    found = find_surveyed([(own, start)])
-    if found is None:
-        return replace(weighed, problem=own, adjusted=start), rejected
-    (own, adjusted), *_ = found.fits
-    return reweighted(replace(weighed, problem=own, adjusted=adjusted, target=found.target)), rejected
-
-
-def _with_places(solution: Solution, points: Correspondences, factor: float) -> Array:
-    """(N, 3) covariance of the pixels, including the projected survey errors of their points [px^2].
-
-    The level of the pixel noise follows from the median residual by bisection.
-    """
-    own = np.array([1.0, 0.0, 1.0]) if points.covariance is None else points.covariance
-    own = np.broadcast_to(own, (len(points), 3))
-    state, view = solution.in_pixels, places_of_views(solution, points)
-    in_camera = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
-    J = solution.camera.project_jacobian(in_camera)[1] @ state.R[view]
-    assert points.world_std is not None
-    J = J * factor * points.world_std[:, None]
-    place = np.stack(
-        [(J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)]
-    )
-    seen, known = predicted_pixels(state, points.world, view)
-    known = known & (view >= 0) & np.isfinite(place).all(axis=0)
-    r, place = seen[known] - points.pixels[known], place.T[known]
-
-    def level(variance: float) -> float:
-        return float(median(squared_whitened(r, variance * own[known] + place))) / _MEDIAN
-
-    high = float(median(squared_whitened(r, own[known]))) / _MEDIAN
-    low = high * _LEAST_NOISE**2
-    for _ in range(_HALVINGS):
-        middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if level(middle) > 1.0 else (low, middle)
-    covariance = high * own
-    covariance[known] += place
-    return covariance
-
-
 _ROUNDS = 3
 _WORTH = 0.8  # least effective share of the views, where some repeat a pose
-_OF_LINES = "k1k2p1p2"  # the model that `plumb-line` estimates
+_SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
+_FEWEST = 4  # fewest views for bends
+_EARLY = 0.5  # share of the required gain that the first step must predict
 # Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
 # most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
 # half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
-_SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
+_MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
+_HALVINGS = 30
+_LEAST_NOISE = 1e-3  # least pixel noise, as a share of the residuals' level
 
 
 def with_target(
@@ -194,13 +63,14 @@ def with_target(
     """Estimate the target's shape, and fit the camera to it.
 
     The problem has all points, at the world coordinates of their file; the solution and the rejected points
-    are for the given target. They are returned unchanged if it stays. The choice is "auto", "given", "flat"
-    or "free".
+    are for the given target. They are returned unchanged if it stays. The choice is "auto", "flat" or
+    "free". Raises `InputError` if a point has two different standard deviations, and, for points with any,
+    `DegenerateGeometryError` if they do not determine the camera.
     """
-    if choice != "given" and problem.points.world_std is not None and not solution.refusal:
-        return with_survey(problem, solution, rejected, options)
+    if problem.points.world_std is not None and not solution.refusal:
+        return _with_survey(problem, solution, rejected, options)
     rich = solution.state.model == "rich"  # flexible enough to absorb a bent target
-    if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
+    if solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
     if not _may_contradict_only_given(problem, *known):
@@ -267,12 +137,54 @@ def _searched(
     return best, rejected
 
 
+def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
+    """Whether there are enough independent views to estimate the target."""
+    problem = solution.problem
+    points = problem.points if known is None else known.straightened(problem.points)
+    if not views_suffice([points], known, solution.repeated.n_poses):
+        return False
+    # Errors common to repeated views look like errors of the target.
+    return choice != "auto" or not solution.repeated.worth < _WORTH
+
+
+def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
+    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
+
+
+def _fitted_to(
+    problem: Problem, target: Target, solution: Solution, rejected: Rejected, options: Options
+) -> tuple[Solution, Rejected] | None:
+    """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
+    try:
+        if len(rejected) or rejected.views:
+            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
+        else:  # the solution has all points, where the target has them
+            again = fit_again(solution, solution.problem.points, options, only_from_here=True)
+    except DegenerateGeometryError:
+        return None
+    return None if again.refusal else (again, rejected)
+
+
+def _is_where_it_was(found: Found, again: Solution) -> bool:
+    """Whether fitting the camera to the found target left it where it was when the target was found."""
+    (problem, adjusted), new = found.fits[0], again.problem
+    if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
+        return False
+    if not np.array_equal(problem.points.pixels, new.points.pixels):
+        return False
+    cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
+    stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    return stays and np.array_equal(problem.free_camera, new.free_camera)
+
+
 def lines_that_are_bent(solution: Solution, unit: str) -> str:
     """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent.
 
     The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
     """
-    problem = solution.problem.with_model(_OF_LINES)
+    from neurocal_cli.calibration.lens_choice.plumb_line_camera import MODEL
+
+    problem = solution.problem.with_model(MODEL)
     adjusted = problem.adjust(solution.adjusted)
     _, label, _ = distinct_points([problem.points])
     if not problem.free_poses or not enough_views(label, problem.views.n_views):
@@ -295,7 +207,7 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
     """
     given = solution.problem, solution.adjusted
-    found = find_bends(given, common)
+    found = _find_bends(given, common)
     if found is None or found.target.bends is None:
         return found
     before, after = given if common is None else common.fits[0], found.fits[0]
@@ -312,47 +224,121 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     return found if groups is None or groups.explained < explained else common
 
 
+def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:
+    """Estimate the bend of the board in each view, for a camera at its minimum for the given board.
+
+    `common` is the estimated common shape of the board, if there is one. It is returned if the evidence for
+    bends is not clear.
+    """
+    known = None if common is None else common.target
+    if not _may_bend(fit[0], known):
+        return common
+    # Log evidence without and with bends, for fixed common points.
+    try:
+        search = Search([fit] if common is None else common.fits, False, known, bending=True)
+        (sight,) = search.sights()
+        info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
+        held = info.held(most_probable_precision(info, search.prior.size, roughly=True))
+        rigid, bent = evidence_of_given(info.straight()), evidence_of_given(held)
+    except np.linalg.LinAlgError:  # the points do not determine the camera
+        return common
+    if bent < rigid + _EARLY * LEAST_GAIN:
+        return common
+    only = Search([fit], False, None, bending=True, still=True).result(LEAST_GAIN)
+    start = only if common is None else common
+    if start is None:
+        return None
+    both = Search(start.fits, False, start.target, bending=True).result(LEAST_GAIN)
+    best = max(filter(None, (only, both)), key=lambda found: found.evidence, default=None)
+    least = LEAST_GAIN + (rigid if common is None else common.evidence)
+    return common if best is None or best.evidence < least else best
+
+
+def _may_bend(problem: Problem, known: Target | None) -> bool:
+    """Whether there are enough views of a single plane, without measured distances.
+
+    `known` is the estimated target, if there is one.
+    """
+    if not problem.free_poses or problem.views.n_views < _FEWEST or problem.points.distances:
+        return False
+    if known is not None:
+        return is_flat(known.given) and not known.plane.any()
+    given, _, ids = distinct_points([problem.points])
+    return is_flat(given) and not planes_of(given, ids).any()
+
+
 def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
     """Residual variance, normalised; `determined` unknowns are counted besides camera and poses."""
     unknowns = int(problem.free_camera.sum()) + 6 * problem.views.n_views + determined
     return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
 
 
-def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
-    """Whether there are enough independent views to estimate the target."""
-    problem = solution.problem
-    points = problem.points if known is None else known.straightened(problem.points)
-    if not views_suffice([points], known, solution.repeated.n_poses):
-        return False
-    # Errors common to repeated views look like errors of the target.
-    return choice != "auto" or not solution.repeated.worth < _WORTH
+def _with_survey(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options
+) -> tuple[Solution, Rejected]:
+    """Adjust camera and surveyed points together; the solution given takes the survey for exact."""
+    again, outliers = _surveyed(problem, solution, rejected, options, 1.0)
+    factor = 1.0 if again.target is None else again.target.sizes["stated"]
+    if factor > 1.0 and len(outliers):  # the survey is worse than stated, so fewer points are outliers
+        again, outliers = _surveyed(problem, again, outliers, options, factor)
+    return again, outliers
 
 
-def _is_where_it_was(found: Found, again: Solution) -> bool:
-    """Whether fitting the camera to the found target left it where it was when the target was found."""
-    (problem, adjusted), new = found.fits[0], again.problem
-    if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
-        return False
-    if not np.array_equal(problem.points.pixels, new.points.pixels):
-        return False
-    cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
-    stays = bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
-    return stays and np.array_equal(problem.free_camera, new.free_camera)
+def _surveyed(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, factor: float
+) -> tuple[Solution, Rejected]:
+    """Adjust camera and points; outliers are judged by `factor` times the stated standard deviations."""
+    points = problem.points
+    judged = replace(points, covariance=_with_places(solution, points, factor), lines=np.arange(len(points)))
+    if len(rejected) or rejected.views:
+        weighed, rejected = fit_robustly(problem.with_points(judged), options)
+        if rejected.points is not None:
+            assert rejected.points.lines is not None
+            rejected = replace(rejected, points=points.select(rejected.points.lines))
+    else:
+        weighed = fit_again(solution, judged, options)
+    kept = weighed.problem.points.lines
+    assert kept is not None
+    if weighed.refusal:
+        return weighed, rejected
+    own = weighed.problem.with_points(points.select(kept))
+    if not own.free_distortion:
+        own = own.with_seen_pixels()
+    start = own.adjust(replace(weighed.adjusted, state=normalised(weighed.in_pixels, own.views)))
+    found = find_surveyed([(own, start)])
+    if found is None:
+        return replace(weighed, problem=own, adjusted=start), rejected
+    (own, adjusted), *_ = found.fits
+    return reweighted(replace(weighed, problem=own, adjusted=adjusted, target=found.target)), rejected
 
 
-def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    return find_shape([(solution.problem, solution.adjusted)], choice, known, solution.model_errors is None)
+def _with_places(solution: Solution, points: Correspondences, factor: float) -> Array:
+    """(N, 3) covariance of the pixels, including the projected survey errors of their points [px^2].
 
+    The level of the pixel noise follows from the median residual by bisection.
+    """
+    own = np.array([1.0, 0.0, 1.0]) if points.covariance is None else points.covariance
+    own = np.broadcast_to(own, (len(points), 3))
+    state, view = solution.in_pixels, places_of_views(solution, points)
+    in_camera = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
+    J = solution.camera.project_jacobian(in_camera)[1] @ state.R[view]
+    assert points.world_std is not None
+    J = J * factor * points.world_std[:, None]
+    place = np.stack(
+        [(J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)]
+    )
+    seen, known = predicted_pixels(state, points.world, view)
+    known = known & (view >= 0) & np.isfinite(place).all(axis=0)
+    r, place = seen[known] - points.pixels[known], place.T[known]
 
-def _fitted_to(
-    problem: Problem, target: Target, solution: Solution, rejected: Rejected, options: Options
-) -> tuple[Solution, Rejected] | None:
-    """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
-    try:
-        if len(rejected) or rejected.views:
-            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
-        else:  # the solution has all points, where the target has them
-            again = fit_again(solution, solution.problem.points, options, only_from_here=True)
-    except DegenerateGeometryError:
-        return None
-    return None if again.refusal else (again, rejected)
+    def level(variance: float) -> float:
+        return float(median(squared_whitened(r, variance * own[known] + place))) / _MEDIAN
+
+    high = float(median(squared_whitened(r, own[known]))) / _MEDIAN
+    low = high * _LEAST_NOISE**2
+    for _ in range(_HALVINGS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if level(middle) > 1.0 else (low, middle)
+    covariance = high * own
+    covariance[known] += place
+    return covariance

@@ -1,1 +1,1 @@
-"""Selection and estimation of the distortion model, also from straight lines; undistortion."""
+"""Selection and estimation of the distortion model, also from the images of straight lines alone."""

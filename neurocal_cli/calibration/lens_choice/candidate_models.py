@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
-from neurocal_cli.adjustment.covariance import Covariance, covariance
+from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.cross_validation import held_out_points, held_out_views, reduced
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
 from neurocal_cli.adjustment.observability import is_weak, refuse_undetermined
@@ -42,7 +42,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 #
 # Numbers of free fisheye coefficients with the fixed ones: higher ones need points far from the axis.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
-# Number of coefficients that each model adds to the next simpler one.
+# Numbers of coefficients that each model adds to the next simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Nested models, from simple to rich.
 _CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
@@ -174,9 +174,12 @@ class _Chain:
             self._fit_again(simple, more, fitted)
         fisheyes = self._fisheyes(state)
         found = self._monotonic([*fitted.values(), *fisheyes])
-        fitted = dict(zip(fitted, found, strict=False))
-        best = _fewest_coefficients(found[len(fitted) :], self.problem.views)
-        return fitted if best is None else fitted | {"fisheye": best}
+        fitted, fisheyes = dict(zip(fitted, found, strict=False)), found[len(fitted) :]
+        if fisheyes:
+            fisheyes = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
+            n = worth(self.problem.views, fisheyes)
+            fitted["fisheye"] = min(fisheyes, key=lambda candidate: candidate.criterion(n))
+        return fitted
 
     def _promises_little(self, rational: Problem, fitted: dict[str, Candidate]) -> bool:
         """Whether the rational model can be skipped, because the criterion will not select it.
@@ -240,6 +243,7 @@ class _Chain:
         return [self._made_monotonic(c) if bad else c for c, bad in zip(fitted, near, strict=True)]
 
     def _made_monotonic(self, candidate: Candidate) -> Candidate:
+        """The best monotonic fit of the same model, or the same candidate if there is none."""
         found = fit_monotonic(candidate.problem, candidate.adjusted)
         if found is not None:
             return _assessed(*found, self.by_views, self.reach) or candidate
@@ -280,7 +284,11 @@ def _assessed(
         cov = counting_views(cov, *given, repeated)
     noise = _noise(problem.distortion.model, state, reach, cov.entries)
     bad = folds_back(problem, state)
-    determined = _determined(problem, state, cov)
+    try:
+        refuse_undetermined(problem, state, cov)
+        determined = True
+    except DegenerateGeometryError:
+        determined = False
     return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
 
 
@@ -310,13 +318,6 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     return cost > _SHORT**2 * float(own.sum()) + 1e-20
 
 
-def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
-    """The fisheye with the best criterion."""
-    some = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
-    n = worth(views, some)
-    return min(some, key=lambda candidate: candidate.criterion(n), default=None)
-
-
 def worth(views: Views, fitted: Collection[Candidate]) -> float:
     """Effective number of residuals, given the correlation of neighbours.
 
@@ -326,14 +327,6 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
         return 1.0
     closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
     return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)))
-
-
-def _determined(problem: Problem, state: CameraState, cov: Covariance) -> bool:
-    try:
-        refuse_undetermined(problem, state, cov)
-    except DegenerateGeometryError:
-        return False
-    return True
 
 
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:

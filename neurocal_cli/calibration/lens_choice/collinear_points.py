@@ -124,7 +124,7 @@ def _clusters(values: Array, gap: float) -> Index:
 
 
 def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
-    """Line and point of each point on the lines of a target."""
+    """Line and point of each point on the lines of a target, whose pairs are all compared if they are few."""
     n = len(target)
     if n <= _ALL_PAIRS:
         a, b = np.triu_indices(n, 1)
@@ -133,8 +133,12 @@ def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
     anchors = np.linspace(0, n - 1, int(np.clip(_MOST_PAIRS // n, 4, 64))).astype(np.intp)
     a, b = np.repeat(anchors, n), np.tile(np.arange(n), len(anchors))
     line, member, directions = _through_pairs(target, a[a != b], b[a != b], fewest)
-    common = _commonest(directions, np.bincount(line), int(np.clip(10**7 // n, 6, 24)))
-    return _parallels(target, common, fewest)
+    # All lines along the directions of the lines with the most points.
+    labels = _clusters(directions @ _OF_DIRECTION, _TOLERANCE)
+    _, first = np.unique(labels, return_index=True)
+    weight = np.bincount(labels, np.bincount(line))
+    most = int(np.clip(10**7 // n, 6, 24))
+    return _parallels(target, directions[first[np.argsort(-weight, kind="stable")[:most]]], fewest)
 
 
 def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index, Array]:
@@ -173,14 +177,6 @@ def _checked(
     number = np.cumsum(good) - 1
     keep = good[index]
     return number[index[keep]], member[keep], direction[good]
-
-
-def _commonest(directions: Array, members: Index, most: int) -> Array:
-    """Directions of the lines with the most points."""
-    labels = _clusters(directions @ _OF_DIRECTION, _TOLERANCE)
-    _, first = np.unique(labels, return_index=True)
-    weight = np.bincount(labels, members)
-    return directions[first[np.argsort(-weight, kind="stable")[:most]]]
 
 
 def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, Index]:

@@ -12,12 +12,10 @@ ordinary lens they are nearly degenerate with k1, k2 and k3. So they stay 0 unle
 criterion decidedly favours them.
 
 Given distortion. The networks model a pinhole. A given distortion is removed from the pixels before training
-(`Problem`), and the final bundle adjustment uses the observed pixels.
+(`Problem`), and the final adjustment uses the observed pixels.
 
-The simplest distortion model that explains the points as well as one that the user named.
-
-A model with many coefficients, of which the points determine only some, may fold the image back or not
-converge. A simpler model that explains the same points shows that this is the cause.
+Undetermined coefficients. A model with many coefficients, of which the points determine only some, may fold
+the image back or not converge. A simpler model that explains the same points shows that this is the cause.
 """
 
 from __future__ import annotations
@@ -39,47 +37,6 @@ from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, WITH_PRISM
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
-_STEPS_OF_SIMPLER = 60
-
-
-def undetermined_coefficients(problem: Problem, adjusted: Adjusted) -> str:
-    """Say that the points do not determine the coefficients of the named model; empty if they may.
-
-    `adjusted` is the best fit of `problem`, which estimates these coefficients.
-    """
-    simpler = _that_suffices(problem, adjusted)
-    if not simpler:
-        return ""
-    other = "a camera without distortion" if simpler == "none" else simpler
-    return (
-        f"the points do not determine the coefficients of the distortion model {adjusted.state.model}, as "
-        f"{other} explains them as well; choose --distortion {simpler} or auto, or give points nearer to the "
-        "image's corners"
-    )
-
-
-def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
-    """The simplest monotonic model that is better by the Bayesian information criterion; empty if none is."""
-    state, views = adjusted.state, problem.views
-    alike = correlation(views, point_residuals(views, state))
-    n, cost = effective_number(views.n_equations, alike), float(adjusted.cost.sum())
-    entries = state.entries.copy()
-    if state.model in WITH_XI:
-        entries[:, :3] /= 1.0 + state.k[0]  # the scale in the middle of the image
-    pinhole = replace(state, model="none", k=np.zeros(0), entries=entries)
-    for model in POLYNOMIAL_MODELS:
-        start = pinhole.with_model(model)
-        more = len(state.k) - len(start.k)
-        if more <= 0:
-            continue
-        simpler = problem.with_model(model)
-        found = simpler.adjust(start, _STEPS_OF_SIMPLER)
-        as_well = n * np.log(float(found.cost.sum()) / max(cost, 1e-300)) < more * np.log(n)
-        if as_well and folds_back(simpler, found.state) is None:
-            return model
-    return ""
-
-
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # had a larger correlation.
 _CORRELATED = 0.15  # correlation of neighbouring residuals
@@ -87,6 +44,7 @@ FEW_VIEWS = 20  # most views with which other starts are tested, to limit the ti
 _LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # many, because the coefficients are nearly degenerate
+_STEPS_OF_SIMPLER = 60
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
 DECISIVE = 10.0  # difference of the criterion: odds of 150
 
@@ -100,19 +58,16 @@ def with_more_starts(solution: Solution, more_starts: Starts) -> Solution:
     """
     problem = solution.problem
     # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
-    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
+    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
+        return solution
+    poor = not solution.adjusted.converged or is_weak(problem, solution.state, solution.covariance)
+    if not poor and correlation(problem.views, solution.residuals) < _CORRELATED:
         return solution
     few = of_few_views(solution, FEW_VIEWS)
     certain = few is solution or is_elsewhere(few, solution)
     if certain or total_cost(_lowest(few, more_starts)) < _LOWER * total_cost(few.adjusted):
         return replace(solution, adjusted=_lowest(solution, more_starts))
     return solution
-
-
-def _may_be_local(solution: Solution) -> bool:
-    if not solution.adjusted.converged or is_weak(solution.problem, solution.state, solution.covariance):
-        return True
-    return not correlation(solution.problem.views, solution.residuals) < _CORRELATED
 
 
 def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
@@ -134,11 +89,6 @@ def _lowest(solution: Solution, more_starts: Starts) -> Adjusted:
             near = [replace(found.adjusted, state=one) for one in similar]
         best = min([best, *map(problem.adjust, near)], key=total_cost)
     return best
-
-
-def total_cost(adjusted: Adjusted) -> float:
-    """Squared error of all views."""
-    return float(adjusted.cost.sum())
 
 
 def with_denominator_if_supported(solution: Solution) -> Solution:
@@ -192,3 +142,46 @@ def check_distortion(solution: Solution) -> Solution:
         f"the {where}; choose another --distortion, or give points nearer to the image's corners"
     )
     raise DegenerateGeometryError(undetermined_coefficients(problem, solution.adjusted) or folded)
+
+
+def undetermined_coefficients(problem: Problem, adjusted: Adjusted) -> str:
+    """Say that the points do not determine the coefficients of the named model; empty if they may.
+
+    `adjusted` is the best fit of `problem`, which estimates these coefficients.
+    """
+    simpler = _that_suffices(problem, adjusted)
+    if not simpler:
+        return ""
+    other = "a camera without distortion" if simpler == "none" else simpler
+    return (
+        f"the points do not determine the coefficients of the distortion model {adjusted.state.model}, as "
+        f"{other} explains them as well; choose --distortion {simpler} or auto, or give points nearer to the "
+        "image's corners"
+    )
+
+
+def _that_suffices(problem: Problem, adjusted: Adjusted) -> str:
+    """The simplest monotonic model that is better by the Bayesian information criterion; empty if none is."""
+    state, views = adjusted.state, problem.views
+    alike = correlation(views, point_residuals(views, state))
+    n, cost = effective_number(views.n_equations, alike), total_cost(adjusted)
+    entries = state.entries.copy()
+    if state.model in WITH_XI:
+        entries[:, :3] /= 1.0 + state.k[0]  # the scale in the middle of the image
+    pinhole = replace(state, model="none", k=np.zeros(0), entries=entries)
+    for model in POLYNOMIAL_MODELS:
+        start = pinhole.with_model(model)
+        more = len(state.k) - len(start.k)
+        if more <= 0:
+            continue
+        simpler = problem.with_model(model)
+        found = simpler.adjust(start, _STEPS_OF_SIMPLER)
+        as_well = n * np.log(total_cost(found) / max(cost, 1e-300)) < more * np.log(n)
+        if as_well and folds_back(simpler, found.state) is None:
+            return model
+    return ""
+
+
+def total_cost(adjusted: Adjusted) -> float:
+    """Squared error of all views."""
+    return float(adjusted.cost.sum())

@@ -1,12 +1,12 @@
-"""``--distortion auto``: select the simplest distortion model that the data support.
+"""``--distortion auto``: select the simplest distortion model that the data support, and lens with target.
 
-The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one. They are
-compared by their cross-validation error in five folds of the views (or of the points of a single view). The
-model with the lowest error is tied with all models whose error is within 0.9 % of it, and with simpler
-models whose error exceeds it by at most the standard error of the five folds. Among the tied models the
-Bayesian information criterion (Schwarz 1978) decides, n log E + p log n, where n is the effective number of
-residuals: it accounts for the correlation of neighbours and for views that repeat a pose (`repeated_poses`),
-which also share a fold.
+Selection. The models from `none` to `rational` and the fisheye are fitted, each starting from a simpler one.
+They are compared by their cross-validation error in five folds of the views (or of the points of a single
+view). The model with the lowest error is tied with all models whose error is within 0.9 % of it, and with
+simpler models whose error exceeds it by at most the standard error of the five folds. Among the tied models
+the Bayesian information criterion (Schwarz 1978) decides, n log E + p log n, where n is the effective number
+of residuals: it accounts for the correlation of neighbours and for views that repeat a pose
+(`repeated_poses`), which also share a fold.
 
 Models with over two coefficients more than the criterion alone would select are excluded, unless they predict
 far better than all others. Also excluded are models that did not converge, have too few points, or are not
@@ -15,10 +15,9 @@ error over several views by 5 %. Models of wide lenses (`WIDE`) are candidates o
 axis and the criterion decidedly favours them over all ordinary models, because near the axis all lenses are
 alike.
 
-Select distortion model and target together: distortion and a bent board leave similar residuals.
-
-Starting from the lens selected for the given target, the next richer model is tried as long as it raises the
-evidence enough. If none does, the next simpler one is tried as long as it hardly lowers it.
+Lens with target. Distortion and a bent board leave similar residuals, so both are selected together. Starting
+from the lens selected for the given target, the next richer model is tried as long as it raises the evidence
+enough. If none does, the next simpler one is tried as long as it hardly lowers it.
 """
 
 from __future__ import annotations
@@ -66,6 +65,10 @@ _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms err
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
 _CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
 _BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
+_RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
+_SIMPLER = -1.0  # and for a simpler one
+# Nested models: each has the coefficients of the previous one and more.
+_PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
 
 
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
@@ -79,7 +82,7 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     by_views = _views_can_spare_any(solution)
     fitted = fit_candidates(problem, solution.state, by_views)
     if more_starts is not None:
-        _look_elsewhere(fitted, solution, more_starts, by_views)
+        fitted = _with_other_starts(fitted, solution, more_starts, by_views)
     if not fitted:  # not even the pinhole converged
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
@@ -104,17 +107,22 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
     )
 
 
-def _look_elsewhere(
+def _with_other_starts(
     fitted: dict[str, Candidate], solution: Solution, more_starts: Starts, by_views: bool
-) -> None:
-    """Fit from other starts if the present fits may be local minima, and merge the results."""
+) -> dict[str, Candidate]:
+    """Fit from other starts if the present fits may be local minima; the best of all fits of each model."""
     problem, views = solution.problem, solution.problem.views
-    if (limit := _limit(views, fitted)) == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
-        return
+    limit = _limit(views, fitted)
+    if limit == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
+        return fitted
     for start in more_starts(problem):
-        _join(fitted, fit_candidates(problem, start, by_views), limit)
+        others = fit_candidates(problem, start, by_views)
+        if min((c.cost for c in others.values()), default=np.inf) < limit:
+            better = {m: c for m, c in others.items() if m not in fitted or c.cost < fitted[m].cost}
+            fitted = fitted | better
         if (limit := _limit(views, fitted)) == 0:
-            return
+            break
+    return fitted
 
 
 def _may_lead_lower(
@@ -152,16 +160,8 @@ def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
     return _MUCH_BETTER * closest.cost if alike else 0.0
 
 
-def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: float) -> None:
-    """Merge other fits that are better, if any of them is below the limit."""
-    if min((c.cost for c in others.values()), default=np.inf) >= limit:
-        return
-    for model, candidate in others.items():
-        if model not in fitted or candidate.cost < fitted[model].cost:
-            fitted[model] = candidate
-
-
 def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
+    """Whether the views determine the camera without any of them, so that views can be held out."""
     problem, adjusted = solution.problem, solution.adjusted
     if problem.views.n_views == 1 or not problem.free_camera.any():
         return False
@@ -182,7 +182,7 @@ def _best(
 ) -> tuple[str, AbstractSet[str]]:
     """The model with the lowest criterion among those tied for the lowest cross-validation error.
 
-    The second result are all models that no other predicts decidedly better than.
+    The second result is all models that no other one predicts decidedly better than.
 
     Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
     models, but among many models one is the best by chance.
@@ -282,12 +282,6 @@ def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
     return ""
 
 
-# Nested models: each has the coefficients of the previous one and more.
-_RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
-_SIMPLER = -1.0  # and for a simpler one
-_PLACES = {model: place for place, model in enumerate(POLYNOMIAL_MODELS)}
-
-
 def find_lens_and_target(
     fits: Sequence[tuple[Problem, Adjusted]],
     flat: bool = False,
@@ -360,6 +354,7 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
 def _log_prior_of_added(
     fits: Sequence[tuple[Problem, Adjusted]], richer: Sequence[tuple[Problem, Adjusted]]
 ) -> float:
+    """Log prior density of the coefficients that the richer lenses have beyond the others."""
     return sum(
         log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
         for (_, before), (problem, after) in zip(fits, richer, strict=True)
@@ -372,6 +367,7 @@ def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Pr
 
 
 def _linearised_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    """A richer model with the same distortion, not adjusted, with its normal matrix there."""
     state = adjusted.state.with_model(model)
     normal, _ = normal_blocks(problem.views.batches, state)
     return problem.with_model(model), replace(adjusted, state=state, normal=normal)

@@ -106,15 +106,18 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
             f"({len(lines) or 'none'}); give more points of each board, or use --distortion k1k2"
         )
     middle, scale = _frame(points)
-    start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
+    origin = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
     whitening = noise_model(points.covariance, points.across)[1]
     whitening = None if whitening is None else rounded(whitening, points.across)
     images = lines_in_pixels(points, lines, middle, scale, whitening)
-    curves = distorted_lines(images, np.array([1.0, 0.0, 1.0, *start]), Distortion(_MODEL))
+    curves = distorted_lines(images, np.array([1.0, 0.0, 1.0, *origin]), Distortion(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
     _check_lines(curves)
-    problem = _LineDistances(distorted_lines(images, curves.entries, _start(curves)), np.array(free), spare)
+    # From no distortion, the descent may not reach a strong one.
+    starts = [Distortion(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
+    start = min(starts, key=lambda one: straightness_error(images, curves.entries, one))
+    problem = _LineDistances(distorted_lines(images, curves.entries, start), np.array(free), spare)
     minimise(problem, _OPTIONS, len(curves.feet) * _FLOOR**2)
     found = problem.curves
     before, after = _rms(curves, equations) * scale, _rms(found, spare) * scale
@@ -136,12 +139,6 @@ def lines_in_pixels(
     return LineImages(lines, pixels, None if whitening is None else whitening[lines.row])
 
 
-def _start(curves: DistortedLines) -> Distortion:
-    """The best starting value: from no distortion, the descent may not reach a strong one."""
-    candidates = [Distortion(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
-    return min(candidates, key=lambda candidate: straightness_error(curves.images, curves.entries, candidate))
-
-
 def _rms(curves: DistortedLines, spare: int) -> float:
     """Root mean square error in the image itself, not whitened."""
     plain = replace(curves, images=replace(curves.images, whitening=None)).fitted()
@@ -158,7 +155,7 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
 
 
 class _LineDistances:
-    """The distances from straight lines, all of them `valid`, as a problem of `least_squares` with one group.
+    """The distances from straight lines, all of them `valid`, as one group of a `LeastSquaresProblem`.
 
     The prior of the centre counts as one more residual of the size of the noise, and the noise is estimated
     from the distances. With the noise eliminated, the log-likelihood of r and c is
@@ -183,21 +180,24 @@ class _LineDistances:
         """(1,) E."""
         return self._cost(self.curves)
 
-    def _values(self, curves: DistortedLines) -> Array:
-        return np.concatenate([curves.entries, curves.distortion.coefficients])
+    def _cost(self, curves: DistortedLines) -> Array:
+        return np.array([(curves.errors() ** 2).sum() * self._factor(curves)])
 
     def _factor(self, curves: DistortedLines) -> float:
         return float(np.exp(self.share @ self._values(curves) ** 2))
 
-    def _cost(self, curves: DistortedLines) -> Array:
-        return np.array([(curves.errors() ** 2).sum() * self._factor(curves)])
+    def _values(self, curves: DistortedLines) -> Array:
+        """A's entries and the coefficients."""
+        return np.concatenate([curves.entries, curves.distortion.coefficients])
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
         """Damped step of the free parameters, and the predicted gain."""
         weight, free = self.share * (self.r @ self.r), self.free
         H = (self.J.T @ self.J + np.diag(weight))[free[:, None], free]
         g = (self.J.T @ self.r - weight * self._values(self.curves))[free]
-        _check(H)
+        # Lines that do not determine the distortion: all through its centre, or in one place.
+        if not (np.diagonal(H) > 0).all() or np.linalg.eigvalsh(unit_diagonal(H)[0])[0] < _SINGULAR:
+            raise DegenerateGeometryError(_UNDETERMINED)
         step, promised = damped_step(H[None], g[None], damping)
         return step[0], promised * self._factor(self.curves)
 
@@ -224,10 +224,4 @@ def _check_lines(curves: DistortedLines) -> None:
     _, J, _ = curves.derivatives()
     moved = ((curves.images.pixels - curves.entries[3:]) ** 2).sum(axis=1) ** 3  # squared shift by k1
     if (J[:, 5] ** 2).sum() < _LEAST_CURVATURE**2 * moved.sum():
-        raise DegenerateGeometryError(_UNDETERMINED)
-
-
-def _check(H: Array) -> None:
-    """Refuse lines that do not determine the distortion: all through its centre, or in one place."""
-    if not (np.diagonal(H) > 0).all() or np.linalg.eigvalsh(unit_diagonal(H)[0])[0] < _SINGULAR:
         raise DegenerateGeometryError(_UNDETERMINED)

@@ -1,7 +1,7 @@
 """The last step of plumb-line: Newton's method on two sets of equations.
 
-The two sets are not the gradient of one cost, so `least_squares` cannot solve them. The distortion is
-determined by straight lines, the camera and the poses by the points. The network finds the camera from
+The two sets are not the gradient of one cost, so no least squares solves them. The distortion is determined
+by straight lines, the camera and the poses by the points. The network finds the camera from
 undistorted points. The distortion is then expressed in the camera's normalised coordinates, with the
 coefficients k of `MODEL`, and both are solved on the observed pixels:
 
@@ -36,7 +36,7 @@ from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, derivatives, normal_blocks
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.lens_choice.plumb_line import PlumbLine, lines_in_pixels
-from neurocal_cli.calibration.lens_choice.straightness import CAMERA, DistortedLines, distorted_lines
+from neurocal_cli.calibration.lens_choice.straightness import DistortedLines, distorted_lines
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort_with_jacobian
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -53,7 +53,11 @@ _TOLERANCE = 1e-10  # a step below this, in normalised units, ends the iteration
 _HALVINGS = 8
 _SINGULAR = 1e-13  # reciprocal condition number of a scaled matrix that is singular but for rounding
 _K = len(coefficient_names(MODEL))
-_BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
+_BY_K = 5 + np.arange(_K)  # columns of the lines' derivatives
+_UNDETERMINED = (
+    "the straight lines and points do not determine the camera; give more views of the board from "
+    "different angles and over more of the image, or use another --distortion"
+)
 
 
 def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
@@ -71,18 +75,17 @@ def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspo
         whitening[order] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
-    start = replace(start, model=MODEL, k=_in_camera_terms(start.entries[0], observed.pixels, views.pixels))
-    problem = replace(
-        problem, points=points, views=observed, distortion=Distortion(MODEL, start.k), free_distortion=True
-    )
-    together = _JointEquations(problem, distorted_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
-    adjusted = together.solved(start)
+    distortion = Distortion(MODEL, _in_camera_terms(start.entries[0], observed.pixels, views.pixels))
+    start = replace(start, model=MODEL, k=distortion.coefficients)
+    problem = replace(problem, points=points, views=observed, distortion=distortion, free_distortion=True)
+    together = _JointEquations(problem)
+    adjusted, curves = together.solved(start, distorted_lines(lines, start.entries[0], distortion))
     done = solution.adjusted.iterations + adjusted.iterations
     return replace(
         solution,
         problem=problem,
         adjusted=replace(adjusted, iterations=done),
-        shared=together.covariance(adjusted),
+        shared=together.covariance(adjusted, curves),
     )
 
 
@@ -109,37 +112,40 @@ class _PointEquations:
 class _JointEquations:
     """The lines' and the points' equations of one problem."""
 
-    def __init__(self, problem: Problem, curves: DistortedLines) -> None:
-        self.problem, self.curves = problem, curves
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
         self.free = np.flatnonzero(problem.free)
         self.columns = np.concatenate([self.free, _BY_K])  # of A and k among the lines' derivatives
 
-    def solved(self, start: CameraState) -> Adjusted:
-        """Newton's method from a state near the solution."""
-        state, settled, iterations = start, False, 0
-        if not self.curves.valid:
+    def solved(self, state: CameraState, curves: DistortedLines) -> tuple[Adjusted, DistortedLines]:
+        """Newton's method from a state near the solution; also the lines at the solution."""
+        settled, iterations = False, 0
+        if not curves.valid:
             raise DegenerateGeometryError(_UNDETERMINED)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             while iterations < _ITERATIONS and not settled:
                 points = self._points(state)
-                matrix, lines = self._matrix(points)
+                matrix, lines = self._matrix(points, curves)
                 step = _solve(matrix, np.concatenate([points.right, lines])[:, None])[:, 0]
-                state, taken = self._moved(state, points, step)
+                state, curves, taken = self._moved(state, curves, points, step)
                 settled = taken == 1.0 and bool(np.abs(step).max() < _TOLERANCE)
                 iterations += 1
                 if not taken:
                     break
             normal, _ = normal_blocks(self.problem.views.batches, state)
-        return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, np.array([settled]))
+        adjusted = Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, np.array([settled]))
+        return adjusted, curves
 
-    def _matrix(self, points: _PointEquations) -> tuple[Array, Array]:
+    def _matrix(self, points: _PointEquations, curves: DistortedLines) -> tuple[Array, Array]:
         """B, and the right side of the lines' equations."""
-        r, J, _ = self.curves.derivatives()
+        r, J, _ = curves.derivatives()
         by_k = J[:, _BY_K].T
         return np.concatenate([points.by_own, by_k @ J[:, self.columns]]), by_k @ r
 
-    def _moved(self, state: CameraState, points: _PointEquations, step: Array) -> tuple[CameraState, float]:
-        """Take the step, halved until all points are in front and the distortion is monotonic."""
+    def _moved(
+        self, state: CameraState, curves: DistortedLines, points: _PointEquations, step: Array
+    ) -> tuple[CameraState, DistortedLines, float]:
+        """Take the step, halved until it is allowed: points in front, a monotonic distortion."""
         by_camera = np.zeros((1, 5 + _K))
         by_camera[0, self.columns] = step
         by_pose = np.zeros((self.problem.views.n_views, 6))
@@ -149,12 +155,11 @@ class _JointEquations:
         for _ in range(_HALVINGS):
             trial = state.moved(length * by_camera, length * by_pose)
             if (trial.entries[0, [0, 2]] > 0).all() and np.isfinite(trial.k).all():
-                curves = self.curves.with_camera(trial.entries[0], trial.k).fitted()
-                if curves.valid and normal_blocks(self.problem.views.batches, trial)[1].all():
-                    self.curves = curves
-                    return trial, length
+                bent = curves.with_camera(trial.entries[0], trial.k).fitted()
+                if bent.valid and normal_blocks(self.problem.views.batches, trial)[1].all():
+                    return trial, bent, length
             length *= 0.5
-        return state, 0.0
+        return state, curves, 0.0
 
     def _points(self, state: CameraState) -> _PointEquations:
         batches, width = self.problem.views.batches, 12 + _K
@@ -181,13 +186,13 @@ class _JointEquations:
         total, n = rows.sum(axis=0), len(own)
         return _PointEquations(total[:, :n], total[:, n:-1], total[:, -1], solved[:, :, :n], solved[:, :, -1])
 
-    def covariance(self, adjusted: Adjusted) -> Array:
+    def covariance(self, adjusted: Adjusted, curves: DistortedLines) -> Array:
         """(f + K, f + K) covariance of A's free entries and the coefficients."""
         n = len(self.free)
         points = self._points(adjusted.state)
-        B, _ = self._matrix(points)
-        r, J, nu = self.curves.derivatives()
-        by_k, lines = J[:, _BY_K], self.curves.images.lines
+        B, _ = self._matrix(points, curves)
+        r, J, nu = curves.derivatives()
+        by_k, lines = J[:, _BY_K], curves.images.lines
         G = np.zeros((int(lines.row.max()) + 1, 2, _K))
         np.add.at(G, lines.row, nu[:, :, None] * by_k[:, None, :])
         M = np.tensordot(G, G, axes=((0, 1), (0, 1)))
@@ -212,12 +217,6 @@ def _fixed_distortion_columns(buffer: Array, entries: Array, Xc: Array) -> None:
     u, v = along_x / a, along_y / b - s * along_x / (a * b)
     for column, values in enumerate((x * u, y * u, y * v, u, v), start=buffer.shape[1] - 5):
         buffer[:, column] = values
-
-
-_UNDETERMINED = (
-    "the straight lines and points do not determine the camera; give more views of the board from "
-    "different angles and over more of the image, or use another --distortion"
-)
 
 
 def _solve(matrix: Array, right: Array) -> Array:

@@ -25,8 +25,6 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 
-CAMERA = 5  # columns of A's entries A11, A12, A22, A13, A23, before the coefficients
-
 _SETTLED = 1e-10  # a step of feet and lines below this, in normalised image units, ends the iteration
 _MOST_STEPS = 15
 

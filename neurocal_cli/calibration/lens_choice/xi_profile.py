@@ -11,6 +11,7 @@ the radius by k1, k2, p1 and p2 of omnidir has the spread of published cameras.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -24,6 +25,7 @@ from neurocal_cli.adjustment.reprojection import farthest_angle
 from neurocal_cli.adjustment.solution import Ambiguity, Solution
 from neurocal_cli.calibration.lens_choice.given_model import total_cost
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.similar_lens import similar_states
 from neurocal_cli.camera.state import CameraState
@@ -62,28 +64,37 @@ def with_all_minima(solution: Solution) -> Solution:
     if problem.distortion.model not in WITH_XI or not problem.free_distortion:
         return solution
     problem = replace(problem, fixed=problem.fixed - {"xi"})
-    profile = _Profile(problem, solution.adjusted)
+    freedom = problem.views.n_equations - problem.n_parameters
+    variance = max(total_cost(solution.adjusted), 1e-300) / max(freedom, 1)
+    profile, at_the_end = _Profile(problem, solution.adjusted, variance, []).on_grid().descended()
     best, ambiguity = profile.best, profile.ambiguity()
     if best is solution.adjusted:
         return replace(solution, ambiguity=ambiguity)
-    if any(best is one for one in profile.at_the_end):
+    if any(best is one for one in at_the_end):
         problem = profile.held
     else:
         problem, best = with_xi_held_if_flat(problem, best)
     return replace(solution, problem=problem, adjusted=best, ambiguity=ambiguity)
 
 
+@frozen_dataclass(eq=False)
 class _Profile:
-    """Cameras with given xi and all other parameters adjusted, and the minima among them."""
+    """Cameras with given xi and all other parameters adjusted, and the best camera of any xi."""
 
-    def __init__(self, problem: Problem, adjusted: Adjusted) -> None:
-        self.problem, self.best = problem, adjusted
-        self.held = replace(problem, fixed=problem.fixed | {"xi"})
-        freedom = problem.views.n_equations - problem.n_parameters
-        self.variance = max(total_cost(adjusted), 1e-300) / max(freedom, 1)
-        tried = (self.held.adjust(start, _STEPS) for start in self._starts(adjusted.state))
-        self.tried = [a for a in tried if a.converged and _is_lens(a)]
-        self._descend()
+    problem: Problem  # with free xi
+    best: Adjusted
+    variance: float  # of the residuals
+    tried: list[Adjusted]  # with given xi, in its order
+
+    @cached_property
+    def held(self) -> Problem:
+        """The problem with given xi."""
+        return replace(self.problem, fixed=self.problem.fixed | {"xi"})
+
+    def on_grid(self) -> _Profile:
+        """Try each xi of the grid."""
+        tried = (self.held.adjust(start, _STEPS) for start in self._starts(self.best.state))
+        return replace(self, tried=[a for a in tried if a.converged and _is_lens(a)])
 
     def _starts(self, state: CameraState) -> list[CameraState]:
         """The most similar lens for each xi of the grid; with many views, only if some allow that xi."""
@@ -102,15 +113,15 @@ class _Profile:
             if share * (total_cost(a) - least) < _NEAR
         ]
 
-    def _excess(self, adjusted: Adjusted) -> float:
-        return float(adjusted.cost.sum() - self.best.cost.sum()) / self.variance
+    def descended(self) -> tuple[_Profile, list[Adjusted]]:
+        """Descend from the lowest points of the grid to the minima.
 
-    def _descend(self) -> None:
-        """Descend from the lowest points of the grid to the minima."""
-        tried = list(self.tried)
-        costs = [np.inf, *map(total_cost, tried), np.inf]
+        If the lowest valley leads out of the model's range, the last cameras within it count as minima. They
+        are the second result, with given xi.
+        """
+        costs = [np.inf, *map(total_cost, self.tried), np.inf]
         minima = []
-        for n, start in enumerate(tried):
+        for n, start in enumerate(self.tried):
             if costs[n + 1] > min(costs[n], costs[n + 2]) or self._excess(start) > _NEAR:
                 continue
             found = self.problem.adjust(start)
@@ -119,36 +130,37 @@ class _Profile:
         if _is_lens(self.best):
             minima.append(self.best)
         lowest = min((total_cost(a) for a in minima), default=np.inf)
-        # If the lowest valley leads out of the model's range, keep the last cameras within it.
-        self.at_the_end = [a for a in tried if total_cost(a) < (1 - _SAME) * lowest]
-        minima = [*minima, *self.at_the_end] or [self.best]
-        self.best = min(minima, key=total_cost)
-        self._add(minima)
+        at_the_end = [a for a in self.tried if total_cost(a) < (1 - _SAME) * lowest]
+        minima = [*minima, *at_the_end] or [self.best]
+        best = min(minima, key=total_cost)
+        return replace(self, best=best, tried=_merged(self.tried, minima)), at_the_end
 
-    def _add(self, more: list[Adjusted]) -> None:
-        known = sorted([*self.tried, *more], key=_xi)
-        self.tried = known[:1] + [b for a, b in pairwise(known) if _xi(b) - _xi(a) > _SAME]
+    def _excess(self, adjusted: Adjusted) -> float:
+        """Excess of chi^2 over the best camera."""
+        return float(adjusted.cost.sum() - self.best.cost.sum()) / self.variance
 
     def ambiguity(self) -> Ambiguity | None:
         """The ambiguity; None if the covariance at the best minimum describes all possible cameras."""
         if self._is_parabola():
             return None
-        while len(self.tried) < _MOST:
-            logarithm = np.array([self._volume(a) - 0.5 * self._excess(a) for a in self.tried])
+        tried = self.tried
+        while len(tried) < _MOST:
+            logarithm = np.array([self._volume(a) - 0.5 * self._excess(a) for a in tried])
             weights = np.exp(logarithm - logarithm.max())
-            xi = np.array([_xi(a) for a in self.tried])
+            xi = np.array([_xi(a) for a in tried])
             mass = np.diff(xi) * np.maximum(weights[1:], weights[:-1])
             n = int(np.argmax(mass))
             if mass[n] <= _LARGEST_MASS * mass.sum():
                 break
-            side = self.tried[n + int(weights[n + 1] > weights[n])]
-            self._add([self.held.adjust(_moved(side.state, 0.5 * (xi[n] + xi[n + 1])), _STEPS)])
+            side = tried[n + int(weights[n + 1] > weights[n])]
+            between = self.held.adjust(_moved(side.state, 0.5 * (xi[n] + xi[n + 1])), _STEPS)
+            tried = _merged(tried, [between])
         centre = _camera(self.best.state)
         return Ambiguity(
-            np.array([_xi(a) for a in self.tried]),
-            np.array([_camera(a.state) - centre for a in self.tried]),
-            np.array([self._excess(a) for a in self.tried]),
-            np.array([self._volume(a) for a in self.tried]),
+            np.array([_xi(a) for a in tried]),
+            np.array([_camera(a.state) - centre for a in tried]),
+            np.array([self._excess(a) for a in tried]),
+            np.array([self._volume(a) for a in tried]),
         )
 
     def _volume(self, adjusted: Adjusted) -> float:
@@ -176,6 +188,12 @@ class _Profile:
             if possible and abs(expected - found) > _AS_A_PARABOLA * max(1.0, 0.3 * expected):
                 return False
         return True
+
+
+def _merged(tried: list[Adjusted], more: list[Adjusted]) -> list[Adjusted]:
+    """Cameras in the order of xi, one for each value."""
+    known = sorted([*tried, *more], key=_xi)
+    return known[:1] + [b for a, b in pairwise(known) if _xi(b) - _xi(a) > _SAME]
 
 
 def _known(state: CameraState, farthest: float) -> Array:

@@ -1,4 +1,4 @@
-"""Calibrate by one of the baselines, with the same checks, result and refusals as for the network."""
+"""Calibrate by one of the other methods, with the same checks, result and refusals as for the network."""
 
 from __future__ import annotations
 

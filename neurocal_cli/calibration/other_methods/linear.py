@@ -1,5 +1,7 @@
 """Linear calibration in closed form, without initial values (Faugeras and Toscani 1986; Zhang 2000).
 
+`Found` is the result of this method and of the others.
+
 Solid views. Each point gives two equations that are linear in P,
 
     (p_1.M + p_14) - u (p_3.M + p_34) = 0,   (p_2.M + p_24) - v (p_3.M + p_34) = 0,
@@ -19,8 +21,6 @@ solid view this is the decomposition of Faugeras. A given centre and a given rig
 
 The squares are not those of pixel errors, so this is not the minimum of (3), and noise has more effect than
 necessary.
-
-Result of a baseline.
 """
 
 from __future__ import annotations
@@ -43,10 +43,13 @@ from neurocal_cli.network.network import patterns_of
 from neurocal_cli.network.orthogonality import cameras_from_products
 from neurocal_cli.network.view_networks import Group, begin_flat
 
+_FEWEST = 4, 6  # points of a flat and of a solid view
+_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
+
 
 @frozen_dataclass(eq=False)
 class Found:
-    """Result of a baseline."""
+    """What a method finds."""
 
     problem: Problem  # as solved; a method may take more parameters as given than the user
     state: CameraState  # normalised
@@ -54,18 +57,6 @@ class Found:
     iterations: int = 0
     converged: bool = True  # False if an iteration ended early
     remarks: tuple[str, ...] = ()  # for the user
-
-
-def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
-    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
-    distortion = problem.distortion
-    if distortion.model == "none" or problem.free_distortion:
-        return problem, state
-    return problem.as_seen(state)
-
-
-_FEWEST = 4, 6  # points of a flat and of a solid view
-_SINGULAR = 1e-12  # ratio of a diagonal entry to the largest one, below which it is rounding
 
 
 def linear(problem: Problem) -> Found:
@@ -79,8 +70,15 @@ def linear(problem: Problem) -> Found:
     return Found(*as_seen(problem, linear_state(problem)), minimised=False)
 
 
+def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
+    """Restore a given distortion, which was removed from the pixels for methods that use a pinhole."""
+    if problem.distortion.model == "none" or problem.free_distortion:
+        return problem, state
+    return problem.as_seen(state)
+
+
 def linear_state(problem: Problem) -> CameraState:
-    """Camera and poses, normalised, without distortion."""
+    """Camera and poses, normalised, without distortion; refuses points that only a mirrored camera sees."""
     check_points(problem)
     if problem.type == 4:
         return _camera_of_given_poses(problem)
@@ -88,7 +86,14 @@ def linear_state(problem: Problem) -> CameraState:
         Group(members, flat, _products(problem.views, members, flat), np.zeros(len(members)))
         for members, flat in whole_groups(problem, _FEWEST)
     ]
-    _refuse_mirrored(problem, groups)
+    for group in groups:
+        mirrored = np.linalg.det(group.product[:, :, :3]) < 0
+        if not group.flat and mirrored.any():
+            raise DegenerateGeometryError(
+                f"view {problem.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored "
+                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v "
+                "downwards?)"
+            )
     entries = problem.normalised_entries if problem.type == 3 else _intrinsics(problem, groups)
     return cameras_from_products(problem, groups, entries[None])
 
@@ -128,17 +133,6 @@ def _products(views: Views, members: NDArray[np.intp], flat: bool) -> Array:
     return np.asarray(product * np.where(product[:, 2, -1] < 0, -1.0, 1.0)[:, None, None])
 
 
-def _refuse_mirrored(problem: Problem, groups: list[Group]) -> None:
-    for group in groups:
-        mirrored = np.linalg.det(group.product[:, :, :3]) < 0
-        if not group.flat and mirrored.any():
-            raise DegenerateGeometryError(
-                f"view {problem.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored "
-                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v "
-                "downwards?)"
-            )
-
-
 def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     """A's normalised entries (5,) from the products of all views."""
     centre = np.where(problem.free[3:], 0.0, problem.normalised_entries[3:])
@@ -157,23 +151,17 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     rows = np.concatenate(equations)[:, unknown]
     omega = np.zeros(6)
     omega[unknown] = smallest(rows[None], int(unknown.sum()))[0]
-    A = _upper_factor(omega)
-    entries = A[ENTRIES]
-    entries[3:] += centre
-    return np.asarray(np.where(problem.free, entries, problem.normalised_entries))
-
-
-def _upper_factor(omega: Array) -> Array:
-    """A of ``omega = A^-T A^-1``, with A[2, 2] = 1."""
     try:
-        L = np.linalg.cholesky(omega_of(omega))  # omega = L L^T, so A^-1 is L^T
+        L = np.linalg.cholesky(omega_of(omega))  # omega = A^-T A^-1 = L L^T, so A^-1 is L^T up to scale
     except np.linalg.LinAlgError as error:
         raise DegenerateGeometryError(
             "no camera solves the linear equations of these points; tilt the boards more, give more views, "
             "or use the method neuro"
         ) from error
     A = np.linalg.inv(L.T)
-    return np.asarray(A / A[2, 2])
+    entries = (A / A[2, 2])[ENTRIES]
+    entries[3:] += centre
+    return np.asarray(np.where(problem.free, entries, problem.normalised_entries))
 
 
 def _camera_of_given_poses(problem: Problem) -> CameraState:

@@ -1,7 +1,7 @@
 """Nonlinear calibration: Levenberg-Marquardt on the pixel error (3) from the linear solution.
 
 This is the paper's second method for comparison. The descent is MINPACK's, through SciPy, with numerical
-derivatives; for many views, a sparse trust region. It shares only the projection with `bundle_adjustment`,
+derivatives; for many views, a sparse trust region. It shares only the projection with `adjustment.adjust`,
 and ends at the same minimum.
 """
 

@@ -149,16 +149,20 @@ def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bo
     return _Alignment(members, flat, rows * np.where(side < 0, -1.0, 1.0)[:, None, None])
 
 
+@frozen_dataclass(eq=False)
 class _Stages:
-    """Both stages for all views, as functions of the parameters of stage 2."""
+    """Stage 1 for all views, and what follows from it for the parameters of stage 2."""
 
-    def __init__(self, problem: Problem, x: Array, y: Array) -> None:
-        self.views = problem.views
-        self.x, self.y = x, y
-        self.groups = [
-            _align(self.views, x, y, members, flat) for members, flat in whole_groups(problem, _FEWEST)
-        ]
-        self.sign = np.ones(self.views.n_views)
+    views: Views
+    x: Array  # (N,) the points relative to the centre
+    y: Array
+    groups: list[_Alignment]
+
+    @classmethod
+    def of(cls, problem: Problem, x: Array, y: Array) -> _Stages:
+        """Align all views."""
+        groups = whole_groups(problem, _FEWEST)
+        return cls(problem.views, x, y, [_align(problem.views, x, y, *group) for group in groups])
 
     @property
     def aspect(self) -> float | None:
@@ -169,24 +173,25 @@ class _Stages:
                 return float(np.average(aspect, weights=self.views.counts[group.views]))
         return None
 
-    def poses(self, s: float) -> tuple[Array, Array]:
-        """R (V, 3, 3), and t (V, 3) with t_z = 0."""
+    def poses(self, s: float, sign: Array) -> tuple[Array, Array]:
+        """R (V, 3, 3), and t (V, 3) with t_z = 0; `sign` (V,) chooses the poses of flat views."""
         V = self.views.n_views
         R, t = np.zeros((V, 3, 3)), np.zeros((V, 3))
         for group in self.groups:
             k = group.views
-            R[k], t[k, 0], t[k, 1] = group.poses(s, self.sign[k])
+            R[k], t[k, 0], t[k, 1] = group.poses(s, sign[k])
             if group.flat:
                 R[k] = R[k] @ np.swapaxes(self.views.basis[k], 1, 2)
         return R, t
 
-    def depths(self, s: float, f: float | None) -> tuple[Array, float]:
-        """Stage 2, linear: t_z (V,) and f, without distortion; f may be given.
+    def depths(self, s: float, f: float | None) -> tuple[Array, float, Array]:
+        """Stage 2, linear, without distortion: t_z (V,), f, which may be given, and the signs for `poses`.
 
         In the plane of a pixel's ray, f (s X_c, Y_c) = (x, y) (r_3.M + t_z).
         """
         views = self.views
-        R, t = self.poses(s)
+        sign = np.ones(views.n_views)
+        R, t = self.poses(s, sign)
         Xc = (R[views.index] @ views.local[..., None])[..., 0] + t[views.index]
         g, m, w = Xc[:, :2] * [s, 1.0], np.column_stack([self.x, self.y]), Xc[:, 2]
 
@@ -201,20 +206,20 @@ class _Stages:
         for group in self.groups:
             flat[group.views] = group.flat
         other = flat & (right < 0)  # the other sign of a flat view's pose makes f positive
-        self.sign[other] *= -1
+        sign[other] = -1.0
         right, wmm = np.where(other, -right, right), np.where(other, -wmm, wmm)
         if f is None:
             f = float(right.sum() / alone.sum())
-        return (f * gm - wmm) / mm, f
+        return (f * gm - wmm) / mm, f, sign
 
 
 def _poses_of_given_camera(problem: Problem) -> CameraState:
     """Type 3: both stages with f = s = 1 on normalised image points."""
     views, entries = problem.views, problem.normalised_entries
     x, y = normalised_points(tuple(entries), views.pixels[:, 0], views.pixels[:, 1])
-    stages = _Stages(problem, x, y)
-    depth, _ = stages.depths(1.0, 1.0)
-    R, t = stages.poses(1.0)
+    stages = _Stages.of(problem, x, y)
+    depth, _, sign = stages.depths(1.0, 1.0)
+    R, t = stages.poses(1.0, sign)
     t[:, 2] = depth
     return CameraState(entries[None], R, t)
 
@@ -222,10 +227,10 @@ def _poses_of_given_camera(problem: Problem) -> CameraState:
 def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     """Types 1 and 2: both stages."""
     views, centre = problem.views, problem.normalised_entries[3:]
-    stages = _Stages(problem, *(views.pixels - centre).T)
+    stages = _Stages.of(problem, *(views.pixels - centre).T)
     known = stages.aspect
     s = 1.0 if known is None else known
-    depth, f = stages.depths(s, None)
+    depth, f, sign = stages.depths(s, None)
     if not f > 0:
         raise DegenerateGeometryError(
             "the radial alignment of these points has no positive focal length; tilt the target more, check "
@@ -239,7 +244,7 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     def state(p: Array) -> CameraState:
         f = np.exp(p[0])
         aspect = np.exp(p[1]) if free_s else s
-        R, t = stages.poses(float(aspect))
+        R, t = stages.poses(float(aspect), sign)
         t[:, 2] = p[-V:] * f
         entries = np.array([[aspect * f, 0.0, f, *centre]])
         return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
