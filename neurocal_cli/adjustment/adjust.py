@@ -25,7 +25,7 @@ from neurocal_cli.camera.geometry import Array, orthonormalised
 from neurocal_cli.camera.state import CameraState
 
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
-# tests/test_adjust.py holds the minimum against SciPy's.
+# test_adjust.py holds the minimum against SciPy's.
 OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
 FLOOR = 1e-13  # rms in normalised pixels that rounding alone can cause
 

@@ -40,7 +40,7 @@ from neurocal_cli.observations.measured_directions import (
 )
 from neurocal_cli.observations.points import Correspondences
 
-# Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances
+# Repeated by test_common_noise.py and test_measured_directions.py: with these, true covariances
 # lower the errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and
 # more, rendered ones of about 1.
 _MOST_POINTS = 20000  # enough to estimate the share to a percent

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
-# Share of a negligible gain that the next gain may be foretold to reach. tests/test_adjust.py takes one more
+# Share of a negligible gain that the next gain may be foretold to reach. test_adjust.py takes one more
 # step from where descents end.
 _FORETOLD = 0.1
 

@@ -13,7 +13,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
-# Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
+# Repeated by test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
@@ -22,7 +22,7 @@ _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below whi
 # flat targets must be below that, times this factor.
 MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
-_WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
+_WEAK = 0.005  # std of a focal length, over its value; test_campaign.py (slow) repeats it
 
 
 def check_points(problem: Problem) -> None:

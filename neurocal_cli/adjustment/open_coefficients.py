@@ -36,7 +36,7 @@ from neurocal_cli.observations.points import Correspondences
 # For each group of coefficients that are present or absent together: the power of the radius, and the prior
 # std of their term as a share of the radius in the farthest corner of the image. At the farthest points of
 # four real cameras the shares are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007, and in the corners
-# up to three times as large. Repeated by tests/test_choice_uncertainty.py (slow: 200 draws).
+# up to three times as large. Repeated by test_choice_uncertainty.py (slow: 200 draws).
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad

@@ -20,15 +20,15 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
-# none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
+# Repeated by test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
+# none blamed) and test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
 _FEWEST = 4  # fewest views, so that the others outvote one
 _MOVES = 2.5  # leaving a view out must move some shared parameter by at least this many standard deviations
 _OUTLIER = 25.0  # times the contradiction that noise causes, and that of the other views
 _STEPS = 60
 # Steps of a view's own camera, from the common one. A flat view with distortion has a long valley: 60 steps
 # end up to 0.6 % above the rms error of hundreds of steps; one step and the minimum of its quadratic model
-# come within 0.5 % of it if the common camera is right. tests/test_free_networks.py repeats it.
+# come within 0.5 % of it if the common camera is right. test_free_networks.py repeats it.
 _FREE_STEPS = 1
 _UNSEEN = 1e-9  # ridge on a unit diagonal, against steps in undetermined directions
 _SAME_PLANE = 1e-3

@@ -19,7 +19,7 @@ from neurocal_cli.camera.geometry import Array, distinct_rows
 from neurocal_cli.camera.projection import project_points
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
+# Repeated by test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
 # thousand random views are called the same.
 _STILL = 1.0  # px by which the target's points may move, or
 _NOISE = 3.0  # this many standard deviations of their noise, if that is more

@@ -34,7 +34,7 @@ from neurocal_cli.camera.geometry import Array
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
 # Ratio of the jackknife's variance to the expected one from which on it is used for boards with a bend in
-# each view: above it in one (4.4) of the 143 such sets of tests/test_simulated_targets.py, and 4.7 to 32 in
+# each view: above it in one (4.4) of the 143 such sets of test_simulated_targets.py, and 4.7 to 32 in
 # photographs (figures, "The board estimated with the camera").
 _GROWN = 3.0
 _FEWEST = 3  # fewest poses: with one left out, two must still differ

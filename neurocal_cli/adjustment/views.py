@@ -20,10 +20,10 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.observations.measured_directions import LEAST, equations, loosened
 from neurocal_cli.observations.points import Correspondences
 
-# The fastest of 512 to 4096 points on 13 to 1000 views of 54; tests/benchmarks/test_speed.py repeats it.
+# The fastest of 512 to 4096 points on 13 to 1000 views of 54; test_speed.py repeats it.
 _LARGEST_BATCH = 512
 _POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, which fit into the second-level cache
-# Repeated by tests/test_convergence.py, with targets of every thickness.
+# Repeated by test_convergence.py, with targets of every thickness.
 # A target thinner than this share of its length is a plane up to rounding ...
 _EXACTLY_FLAT = 1e-6
 # ... and thinner than this it is treated as a plane until bundle adjustment, which uses all coordinates.

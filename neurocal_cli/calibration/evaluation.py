@@ -23,7 +23,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences
 
 # In the same image, most points lie within these distances of the calibration's prediction, even after small
-# edits by the user; in another image of the board they do not. Repeated by tests/test_evaluation.py.
+# edits by the user; in another image of the board they do not. Repeated by test_evaluation.py.
 _NEAR_PX = 2.0
 _NEAR = 5.0  # times the rms error of the calibration
 _FEWEST = 4  # fewest points that determine a pose

@@ -30,7 +30,7 @@ from neurocal_cli.network.options import Options
 from neurocal_cli.observations.points import Correspondences
 
 # Model of a second start, for when the radial start fails, for example because the distortion centre is far
-# from the image centre. Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no
+# from the image centre. Repeated by test_multi_start.py (slow: 200 lenses of each of five models, no
 # local minimum).
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60

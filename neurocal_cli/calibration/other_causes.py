@@ -56,7 +56,7 @@ from neurocal_cli.observations.points import Correspondences
 _OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
 # The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
 _SURELY = 0.5
-_TELL_BENDS = 3  # views that tell bent planes from distortion (tests/test_cli_stereo.py)
+_TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
 _ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
 # Of one view.

@@ -43,9 +43,9 @@ from neurocal_cli.observations.board import planes_of
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import distinct_points
 
-# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
+# Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
-# tests/test_wrong_inputs.py.
+# test_wrong_inputs.py.
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error

@@ -18,7 +18,7 @@ from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.measured_directions import single, unit, variance_across
 from neurocal_cli.observations.points import Correspondences
 
-# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong; clean data
+# Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong; clean data
 # are the same to the last bit with and without the rejection).
 _FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
 _CHANCE = 0.01  # of calling any point of a good data set wrong

@@ -28,7 +28,7 @@ from neurocal_cli.calibration.verdict.view_groups import view_groups
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.network.options import Options
 
-# Repeated by tests/test_rich_lens.py (slow). The rms error on held-out views drops by a factor of 1.28 or
+# Repeated by test_rich_lens.py (slow). The rms error on held-out views drops by a factor of 1.28 or
 # more for such lenses (residual correlation -0.05 or less), of at most 1.0 for bent boards and two cameras,
 # and of up to 1.19 for photographs of a board that is not flat (residual correlation 0.5).
 _FEWEST = 20  # fewest different poses

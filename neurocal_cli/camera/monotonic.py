@@ -23,8 +23,8 @@ from neurocal_cli.camera.distortion import (
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.polynomial import first_eight, untilted
 
-# Start and end of Newton's method. Random models of tests/test_monotonic.py are inverted to 1e-8 up to 95 %
-# of the radius at which they cease to be monotonic, random wide lenses of tests/test_directions.py to 1e-9 up
+# Start and end of Newton's method. Random models of test_monotonic.py are inverted to 1e-8 up to 95 %
+# of the radius at which they cease to be monotonic, random wide lenses of test_directions.py to 1e-9 up
 # to 99 % of their largest angle.
 _FARTHEST = 1e3  # undistorted radius that no image reaches
 _TABLE = 4096  # radii, or angles of a wide lens

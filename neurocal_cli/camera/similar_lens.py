@@ -22,7 +22,7 @@ from neurocal_cli.camera.polynomial import sensor_rotation
 from neurocal_cli.camera.projection import ENTRIES, project_points
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_wide_lenses.py (slow): random lenses of all models converge from these starts.
+# Repeated by test_wide_lenses.py (slow): random lenses of all models converge from these starts.
 _ANGLES = 60
 _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
 # Grid of xi, and the boundaries of the parts of its range that may each contain a minimum.

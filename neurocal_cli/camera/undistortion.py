@@ -42,7 +42,7 @@ PANORAMAS = UNDISTORTED[1:]
 _ALONG = 1001  # pixels along a row and a column
 _WIDEST_PLANE = 170.0  # degrees
 _NARROW = 1e-3  # rad
-# With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
+# With these, no pixel at alpha 0 comes from more than 0.02 px outside; test_undistortion.py repeats it.
 _BORDER = 401  # samples along each side of the image
 _GRID = 41  # samples along each axis inside it
 _HALF_PIXEL = 0.5

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera
 _SIDES = ("left", "right")
 # Median difference of rows, as a multiple of that of the rig's own points, and in px: 1 for other points of
-# the rig, 5 if one file is given twice; tests/test_cli_rectify.py.
+# the rig, 5 if one file is given twice; test_cli_rectify.py.
 _MISFIT, _NO_MISFIT = 3.0, 0.1
 
 

@@ -49,7 +49,7 @@ _ROUNDING = 1 / 12  # DN^2
 _EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance assumed for noise-free images
 _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides, and number of samples
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
-# 0.7 to 1.6 in rendered images (tests/test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
+# 0.7 to 1.6 in rendered images (test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
 _AGREES = 2.0
 _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to the rim is not used
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# With these limits tests/test_other_targets.py recognises nothing in noise, blurred boards and sample images.
+# With these limits test_other_targets.py recognises nothing in noise, blurred boards and sample images.
 _LONGEST = 1000  # px; larger images are reduced to this longer side, which still shows a target's marks
 _MARKERS = 3  # different ones of one family; noise sometimes gives one
 _WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers

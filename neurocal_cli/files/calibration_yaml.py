@@ -144,9 +144,9 @@ def _network_lines(network: NetworkRecord, long: bool) -> Iterator[str]:
     yield f"curve: {flow(np.array(network.curve, dtype=float))}"
 
 
-def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> Iterator[str]:
+def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> list[str]:
     stack = np.array(list(matrices.values()))
     if not long:
-        return named_lines(name, matrices, flows(stack))
+        return list(named_lines(name, matrices, flows(stack)))
     columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
     return block(name, column_lines(columns))

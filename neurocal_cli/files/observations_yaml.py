@@ -35,26 +35,22 @@ from neurocal_cli.observations.points import Correspondences
 _MOST_CHARACTERS = 1_500_000  # of decimals; PyYAML parses them in half a second
 
 
-def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
+def observation_lines(points: Correspondences, long: bool) -> list[str]:
     """Lines of the block ``observations``."""
     names, blocks = value_columns(points)
     columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
-    yield "observations:"
-    yield f"  columns: [{', '.join(columns)}]"
+    lines = ["observations:", f"  columns: [{', '.join(columns)}]"]
     if points.undistorted:
-        yield f"  undistorted: {points.undistorted}"
+        lines.append(f"  undistorted: {points.undistorted}")
     if points.distances:
-        yield "  distances:  # from, to, length, std"
+        lines.append("  distances:  # from, to, length, std")
         for one in points.distances:
             ends = f"{quoted(one.start)}, {quoted(one.end)}"
-            yield f"    - [{ends}, {number(one.length)}, {number(one.std)}]"
+            lines.append(f"    - [{ends}, {number(one.length)}, {number(one.std)}]")
     if len(points) == 0:
-        yield "  rows: []"
-        return
+        return [*lines, "  rows: []"]
     if long:
-        yield from indented(_long_lines(points, np.hstack(blocks)))
-        return
-    yield "  rows:"
+        return [*lines, *indented(_long_lines(points, np.hstack(blocks)))]
     # OpenCV's FileStorage requires rows to be indented more than their key.
     heads = [f"    - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
@@ -63,7 +59,7 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
         ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
         heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
     numbers = flow(np.hstack([points.world, *blocks]))
-    yield from map(add, heads, numbers[2:-1].split(", ["))
+    return [*lines, "  rows:", *map(add, heads, numbers[2:-1].split(", ["))]
 
 
 def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:

@@ -98,15 +98,15 @@ def list_lines(key: str, entries: Iterable[str]) -> list[str]:
     return [f"{key}:", *lines] if lines else [f"{key}: []"]
 
 
-def indented(lines: Iterable[str], by: int = 2) -> Iterator[str]:
+def indented(lines: Iterable[str], by: int = 2) -> list[str]:
     """Lines with some blanks before each."""
-    return (f"{' ' * by}{line}" for line in lines)
+    blanks = " " * by
+    return [blanks + line for line in list(lines)]
 
 
-def block(key: str, lines: Iterable[str]) -> Iterator[str]:
+def block(key: str, lines: Iterable[str]) -> list[str]:
     """Lines of a key whose value are these lines."""
-    yield f"{key}:"
-    yield from indented(lines)
+    return [f"{key}:", *indented(lines)]
 
 
 def boolean(value: bool) -> str:

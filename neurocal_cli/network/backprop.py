@@ -11,7 +11,7 @@ cycle around the optimum, with a loss 2-40 % too high. The excess is proportiona
 so the rates are halved whenever the loss no longer decreases. The paper's Table 1 scene (440 points) takes
 400-800 epochs from random weights to 1e-7 px; boxes and corners with 0.3 px of noise take 1,000-6,000.
 Nearly flat targets (20,000 and more) and views so close that the gammas differ by a factor of 14 (8,000) are
-slower. tests/test_backprop.py trains on scenes of these kinds.
+slower. test_backprop.py trains on scenes of these kinds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.network.network import Patterns, Task, Trained, e_2d, e_orth, optimal_gamma, output
 
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
-# tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later
+# test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later
 # 1/40 of the epochs so far: 230 in 50,000.
 _FIRST_CHECK = 10
 _CHECKS_PER_LIFE = 40

@@ -23,7 +23,7 @@ from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.network.levenberg_marquardt import LMOptions, train_lm
 from neurocal_cli.network.network import Patterns, Task, patterns_of, random_weights
 
-# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
+# Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view, each within 3 standard deviations of clean data): the hardest scene needed this many
 # starts and rounds, and the limits lie between the clean and the wrong views of these sets.
 #

@@ -24,8 +24,8 @@ from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.view_networks import Group
 
-# Repeated by tests/test_convergence.py (1000 solid and 300 flat scenes, three seeds) and
-# tests/test_refusals.py: no start that won there was behind after so many steps, no mirrored pose won from
+# Repeated by test_convergence.py (1000 solid and 300 flat scenes, three seeds) and
+# test_refusals.py: no start that won there was behind after so many steps, no mirrored pose won from
 # beyond this range, and no correct data were called mirrored.
 _TRIAL_STEPS = 15  # another start must be better after so many steps
 # A mirrored pose is a candidate while its rms error is below _FLIP_RANGE times the other's, and after

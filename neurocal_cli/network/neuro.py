@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from neurocal_cli.network.random_cameras import Found
 
 
-# Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
+# Repeated by test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
 _FEW_POINT_STARTS = 100
 # Initial damping of the first bundle adjustment from a pinhole, and from a camera near the minimum.

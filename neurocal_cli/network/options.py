@@ -15,7 +15,7 @@ from neurocal_cli.network.starts import Agreement
 if TYPE_CHECKING:
     from neurocal_cli.network.backprop import BackpropOptions
 
-# Most points of each view that train a network; more only take longer (tests/test_convergence.py).
+# Most points of each view that train a network; more only take longer (test_convergence.py).
 MOST_POINTS = 1024
 
 # Called with the name of a stage and the completed share of it.

@@ -35,7 +35,7 @@ _APART = 1e-2  # largest difference of any entry from which on two minima are di
 _LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
 _STARTS = 8  # random starts, trained side by side
 _ENOUGH = 3  # starts at the same, lowest loss with which training ends
-# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
+# Repeated by test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
 # which depths keep all points in front of the first camera.
 _MOST_CANDIDATES = 4
 _NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane

@@ -32,7 +32,7 @@ from neurocal_cli.network.view_networks import even_polynomial, radial_coefficie
 from neurocal_cli.observations.points import Correspondences
 
 # lambda_1 = -0.8 is a barrel distortion whose farthest point has 5 times that radius in a pinhole; 0.3 is a
-# pincushion. Repeated by tests/test_radial_networks.py and the campaign of tests/test_campaign.py (slow).
+# pincushion. Repeated by test_radial_networks.py and the campaign of test_campaign.py (slow).
 _STRENGTHS = (-0.8, -0.65, -0.5, -0.38, -0.27, -0.17, -0.08, 0.08, 0.17, 0.3)
 # The pattern search around the best of them: the best of six neighbours, or else half the step.
 _STEP, _ROUNDS = 0.05, 5

@@ -18,7 +18,7 @@ from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.network.network import Patterns, patterns_of
 
-# Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
+# Repeated by test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64
 _NEAREST = 1.2  # least depth of the target's centre, in target radii
 _TIE = 1e-4  # relative difference within which two costs are equal

@@ -33,7 +33,7 @@ from neurocal_cli.network.starts import learn
 
 # Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
 _NO_CONDITION = 1e-13
-_SMALL = 1500  # number of patterns below which subsampling saves no time (tests/benchmarks/test_speed.py)
+_SMALL = 1500  # number of patterns below which subsampling saves no time (test_speed.py)
 _RIDGE = 1e-9  # share of the diagonal; without it the free scale of a product makes its matrix singular
 _STRONGEST = 0.5  # largest change of the farthest point's radius for which one step is near enough
 _RADII = np.linspace(0.02, 1.0, 60)  # of the points, at which the coefficients of a model are fitted

@@ -197,3 +197,9 @@ def test_a_module_says_what_it_is_for() -> None:
     assert [name for name in NAMES if not ast.get_docstring(tree_of(name))] == []
     vague = {"utils", "helpers", "manager"}
     assert [name for name in NAMES if vague & set(Path(name).with_suffix("").parts)] == []
+
+
+def test_the_tests_that_comments_name_are_there() -> None:
+    tests = {path.name for path in (ROOT.parent / "tests").rglob("test_*.py")}
+    named = {name: set(re.findall(r"\btest_\w+\.py", (ROOT / name).read_text("utf-8"))) for name in NAMES}
+    assert {name: gone for name, those in named.items() if (gone := those - tests)} == {}

@@ -67,7 +67,7 @@ _LEANING = 0.03  # rad; largest lean, of which upright boards leave much open: 0
 _FEWEST, _FEWEST_OF_FOLDED = 3, 1  # fewest different views of most points
 LEAST_GAIN = 6.0
 """Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
-most; tests/test_simulated_targets.py (slow) checks that clean sets keep the given target."""
+most; test_simulated_targets.py (slow) checks that clean sets keep the given target."""
 
 
 @frozen_dataclass(eq=False)

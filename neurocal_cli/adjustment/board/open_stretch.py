@@ -29,7 +29,7 @@ from neurocal_cli.observations.board import is_flat
 # data less certain. With these, the std of alpha from 3, 4, 5 and 8 views grows by 19, 5, 3 and 0.7 % in the
 # median, and that of theta by 31, 16, 12 and 4 %. Without a small lean, these are 4, 1, 0.5 and 0.1 %; but if
 # a flat board stands upright in all views and leans by 0.15 %, theta is off by 4.2 deviations rms and by
-# 14 at most, instead of 2.1 and 5.6. Repeated by tests/test_open_stretch.py and test_target_shape.py (slow).
+# 14 at most, instead of 2.1 and 5.6. Repeated by test_open_stretch.py and test_target_shape.py (slow).
 _ODDS = ({1.0: 0.2}, {LEAN / STRETCH: 1.0, 1.0: 0.2})
 _NEGLIGIBLE = 1e-3  # probability up to which the standard deviations stay unchanged to the last bit
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together, beyond which it is no stretch of a print

@@ -108,13 +108,13 @@ _START = {
     "height": 3e-4,
 }  # of the target's size
 # Least gain in log evidence with which a stretch or a lean is estimated, as by the odds in `open_stretch`.
-# With 0, errors from five views of bent boards are 5 to 10 % larger (tests/test_simulated_targets.py, slow).
+# With 0, errors from five views of bent boards are 5 to 10 % larger (test_simulated_targets.py, slow).
 _SEEN = math.log(5.0)
 _CERTAIN = 500.0  # largest log odds: more overflows
 _LEAST_SHARE = 1e-9  # of its prior variance that a coefficient keeps
 # Least size of the fold over the target's size: planes are set up by hand, not better than to 0.1 mm of 200.
 # Without it, a stretch and a lean may explain one view of two planes, and the centre is off by eight standard
-# deviations (tests/test_folded_targets.py, slow).
+# deviations (test_folded_targets.py, slow).
 _BY_HAND = 5e-4
 _MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
 # Least predicted gain in log evidence of a step. With these, cameras differ by 0.002 standard deviations rms

@@ -27,7 +27,7 @@ Images do not determine where a target is, how it is turned, and how large it is
 target is moved and rotated as a whole to be nearest to the given one. Its scale is such that its planes, each
 by itself, are on average as large as given: their squares are printed, but a folded target is set up by hand.
 If planes were 0.5 mm from their place, the size of the whole would be wrong by 0.2 %, ten times the standard
-deviation of a rig's baseline (tests/test_target.py).
+deviation of a rig's baseline (test_target.py).
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from neurocal_cli.camera.geometry import Array, nearest_similarity
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
-_LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
+_LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see test_target_shape.py
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
 _HELD = 1e-7  # std of a surveyed point that is stated as exact, over the target's size
 # Std of a stretch, half of the relative difference of two sides, and of a lean, half of the angle by which
 # two sides are off a right angle. In photographs of four boards, these are 0.03, 0.24, 0.00 and 0.05 %, and
-# 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
+# 0.04, 0.04, 0.14 and 0.09 % (test_target.py, slow).
 STRETCH = 1.5e-3
 LEAN = 0.3 * STRETCH
 """Least std of a lean in a covariance: most prints lean a little. Without it, theta is off by up to 4
 standard deviations if a bent board stands upright in all views and leans by 0.15 %
-(tests/test_target_shape.py)."""
+(test_target_shape.py)."""
 NOTHING = 1e-7
 """Size of an absent part over the target's size."""
 _MOST = 150  # most points from which the eigenfunctions are computed

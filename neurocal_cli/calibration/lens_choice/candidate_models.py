@@ -36,8 +36,8 @@ from neurocal_cli.camera.similar_lens import similar_states
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
-# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
-# tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
+# Repeated by test_model_selection.py (slow: 200 lenses of each of six models) and
+# test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
 # the tightest that give these results; penalties and significance tests are chi-squared levels, as noted.
 #
 # Numbers of free fisheye coefficients with the fixed ones: higher ones need points far from the axis.
@@ -48,13 +48,13 @@ _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 _CHAIN = (*POLYNOMIAL_MODELS[1:], "rational")
 _SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
 # The same for the quadratic models of the free networks. Where these give less, full descents of the networks
-# never gave more than 1.2; tests/test_free_networks.py repeats it.
+# never gave more than 1.2; test_free_networks.py repeats it.
 _FAR_FROM_SHORT = 1.15
 _MOST_VIEWS = 60  # views that are compared with free networks, to limit the time
 _BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
 _LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in one case of 200
 # Share of the gain required by the criterion that the rational model must predict; with less, it was never
-# selected (tests/test_model_selection.py, slow: 100 scenes).
+# selected (test_model_selection.py, slow: 100 scenes).
 _PROMISING = 0.5
 # The selection admits a model with this number of coefficients more than another one only if it lowers the
 # rms error of held-out data by this factor.

@@ -19,7 +19,7 @@ FEWEST_ON_LINE = 4
 _FEWEST_OF_EDGES = 3  # the same for points that are measured across edges, on lines along these edges
 
 # Rounding of coordinates, as a share of the target's size: 2 micrometres on a 200 mm board. The tests in
-# tests/test_plumb_line.py repeat that lines are found and that scattered points have none.
+# test_plumb_line.py repeat that lines are found and that scattered points have none.
 _TOLERANCE = 1e-5
 _LINES_A_POINT = 4  # rows, columns and diagonals of a board
 _OF_EDGES = 8  # the same where only lines along edges are used

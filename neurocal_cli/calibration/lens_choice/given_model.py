@@ -37,7 +37,7 @@ from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS, WITH_PRISM
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import DegenerateGeometryError
 
-# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
+# Repeated by test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # had a larger correlation.
 _CORRELATED = 0.15  # correlation of neighbouring residuals
 FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
@@ -45,7 +45,7 @@ _LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # many, because the coefficients are nearly degenerate
 _STEPS_OF_SIMPLER = 60
-# Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
+# Repeated by test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
 DECISIVE = 10.0  # difference of the criterion: odds of 150
 
 Starts = Callable[[Problem], Iterable[CameraState]]  # yields other starting states for a problem

@@ -53,9 +53,9 @@ from neurocal_cli.camera.distortion import MODELS, POLYNOMIAL_MODELS, coefficien
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.target import Target
 
-# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
+# Repeated by test_model_selection.py (slow: 200 lenses of each of six models; the true one in 85 to
 # 99 %, never more than two coefficients too many, 1 % of the best error on new views) and
-# tests/test_rendered_sets.py.
+# test_rendered_sets.py.
 _TIE = 0.009  # relative difference of rms errors that counts as equal
 # "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
 _CERTAIN = 2.0

@@ -40,7 +40,7 @@ from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistort
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
-# Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are
+# Repeated by test_monotonic_fit.py and, for the tie, test_model_selection.py: lenses that are
 # not monotonic in unseen corners predict new views 5 to 16 % better with these.
 _BORDER = 17  # samples along each side of the image
 _FARTHEST = 100  # farthest points that are checked

@@ -54,7 +54,7 @@ _MARGIN = 1.05  # reach over the extent of the points or of the image's border
 _FARTHER = 1.5  # largest reach over the extent of the points
 _TINY, _NOTHING, _NEWTON = 1e-300, 1e-17, 8
 # Lengths of the processes, in reaches, and bounds of their sizes, in rms residuals of the fisheye. Repeated
-# by tests/test_rich_lens.py (slow): with these, errors in parts without points match their standard
+# by test_rich_lens.py (slow): with these, errors in parts without points match their standard
 # deviations.
 _OF_PROFILE, _OF_FIELD = (0.1, 0.25), (0.25, 0.5, 1.0)
 _LARGEST, _SMALLEST, _SPREAD = 10.0, 1e-3, 1.5  # the last one is the prior std of the logarithm

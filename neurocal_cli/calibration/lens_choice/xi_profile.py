@@ -30,7 +30,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.similar_lens import similar_states
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors
+# Repeated by test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors
 # as large as their standard deviations.
 _GRID = {"omnidir": np.linspace(0.0, 3.0, 31), "double_sphere": np.linspace(-0.6, 1.0, 33)}
 _SAME = 1e-6

@@ -17,7 +17,7 @@ The distortion is x' = x (1 + k1 r^2), as everywhere in this package; Tsai's pol
 distortion. Stage 1 is independent of both.
 
 The coefficients of the equations of stage 1 also contain noise, so its results are biased
-(tests/test_tsai.py; without moving the origin, the bias for the paper's scene would be ten times as large).
+(test_tsai.py; without moving the origin, the bias for the paper's scene would be ten times as large).
 Stage 2 does not correct this, and a wrong centre affects all parameters.
 """
 

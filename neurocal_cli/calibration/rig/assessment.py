@@ -43,7 +43,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, rotation_step
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 
-# Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,
+# Repeated by test_wrong_rigs.py, in which no wrong rig may be good, and by test_rig_verdict.py,
 # in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 3.5 times
 # as much as noise explains.
 _SCATTER = Limit(4.0, 10.0)

@@ -26,7 +26,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
 # Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
-# than so many standard deviations of a pixel. The tests of named faults in tests/test_stereo_evaluation.py
+# than so many standard deviations of a pixel. The tests of named faults in test_stereo_evaluation.py
 # repeat that faults are found and sound pairs kept.
 _SHARE = 0.1
 _SIGMAS = 30.0

@@ -15,7 +15,7 @@ from neurocal_cli.calibration.verdict.view_change import ViewChange
 from neurocal_cli.calibration.verdict.view_groups import ViewGroups
 from neurocal_cli.camera.geometry import Array
 
-# Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
+# Repeated by test_view_change.py and test_board_shape.py, with changes from 0.2 % and boards
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
 _CHANGED = Limit(0.001, 0.05)  # of the focal length
 _APART = Limit(0.01, 0.05)  # of the focal length

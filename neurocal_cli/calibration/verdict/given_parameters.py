@@ -36,7 +36,7 @@ _THETA = 1  # a given theta stays fixed
 _STEPS = 20
 _TANGENTIAL = ("p1", "p2")
 # Largest variance of the residuals of the simpler camera, over that of the calibration; repeated by
-# tests/test_given_parameters.py.
+# test_given_parameters.py.
 AS_WELL = 1.05
 _WELL_POSED = 1e-7  # smallest eigenvalue of a normal matrix of unit diagonal
 TOLD_APART = 5.0  # standard deviations; 100 cameras with correctly given parameters stay below

@@ -23,7 +23,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.observations.points import Correspondences
 
 # Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
-# tests/test_given_points.py.
+# test_given_points.py.
 _LARGER = Limit(1.5, 4.0)
 _CHANCE = 3.0  # standard deviations by which the rms error of few points may be larger
 _ROUNDING = 1e-4  # of the pixels' spread: smaller errors are negligible

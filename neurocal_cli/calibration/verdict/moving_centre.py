@@ -24,7 +24,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_moving_centre.py (slow): of 30 sets of 15 views with focal lengths of 900 to 1500 px
+# Repeated by test_moving_centre.py (slow): of 30 sets of 15 views with focal lengths of 900 to 1500 px
 # shifts of 20 px are found in all, and of 10 px in nine of ten; none where a board bends from view to view.
 # Real photographs reach at most 0.45 of the excess, and boards that bend 0.65.
 _GAIN = 20.0  # least gain in log evidence

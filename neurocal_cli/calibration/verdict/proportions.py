@@ -30,7 +30,7 @@ from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
-# tests/test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
+# test_proportions.py repeats these limits with clean, distorted and otherwise wrong boards.
 _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
 _FEWEST_VIEWS, _FEWEST_POINTS = 4, 6  # one view more than the unknowns need
 _ENOUGH_VIEWS = 40

@@ -26,7 +26,7 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
-# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
+# Repeated by test_wrong_inputs.py, in which no wrong input may be good, and by test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
 ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = Limit(1.6, 2.3)

@@ -30,7 +30,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
-# Repeated by tests/test_turned_images.py. Turned images of photographs explain 0.83 to 0.98 of what centres
+# Repeated by test_turned_images.py. Turned images of photographs explain 0.83 to 0.98 of what centres
 # of each view explain, and a centre that moves at random at most 0.7.
 _SHARE = 0.8
 _EXCESS = 0.85  # with an estimated board: least share of the error above the noise floor

@@ -27,7 +27,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-# Repeated by tests/test_view_change.py: on clean scenes there is less than one false alarm in a hundred, and
+# Repeated by test_view_change.py: on clean scenes there is less than one false alarm in a hundred, and
 # on real boards, whose views differ by more than noise, none.
 _LINE = 3.5  # sigmas: one false alarm in 2000 for each test
 _BY_POSE = 4.0  # sigmas: poses differ in six ways, and lens errors are correlated with them

@@ -23,7 +23,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
 # Cost per condition in units of the noise variance: least cost of a contradiction, and largest cost that may
-# remain. Of 200 clean sets of 5 to 40 views none exceeds the first: tests/test_view_groups.py repeats it.
+# remain. Of 200 clean sets of 5 to 40 views none exceeds the first: test_view_groups.py repeats it.
 _CONTRADICTS = 5.0
 _NOISE = 4.0
 _FEWEST = 2  # fewest views of a group

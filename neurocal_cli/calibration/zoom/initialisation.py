@@ -43,11 +43,11 @@ from neurocal_cli.observations.points import Correspondences
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 _QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 # A richer model must lower the cross-validation error to this share and the residual variance by so many
-# standard deviations. The tests of the choice in tests/test_zoom_lens.py have both outcomes.
+# standard deviations. The tests of the choice in test_zoom_lens.py have both outcomes.
 _LARGEST_SHARE = 0.98
 _SIGMAS = 3.0
 # Times the median rms error of the settings. As a lens may change sharply between two settings, the limit is
-# wide; the tests of settings that are left out in tests/test_zoom_lens.py check both sides.
+# wide; the tests of settings that are left out in test_zoom_lens.py check both sides.
 _WRONG_PIXELS = 3.0
 
 

@@ -20,7 +20,7 @@ from neurocal_cli.calibration.zoom.settings import describe, middles
 from neurocal_cli.calibration.zoom.zoom_lens import Prediction, ZoomLens
 
 # Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
-# even between settings (slow tests in tests/test_zoom_lens.py).
+# even between settings (slow tests in test_zoom_lens.py).
 _CONTRADICTION = Limit(1.3, 2.3)  # rms error over the noise floor
 # Noise floor over that with a pose for each view: 0.99 to 1.02 if camera and target stood still, 1.9 if they
 # moved by 0.002 rad or 3 mm from setting to setting (test_a_camera_that_moved_a_little_is_told).

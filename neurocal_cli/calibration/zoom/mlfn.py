@@ -43,7 +43,7 @@ from neurocal_cli.camera.geometry import Array
 # test_plane_and_rational_unit_are_any_homographic_function come as near as 2 %.
 _LARGEST_TILT = 0.99
 # Precisions of priors in units of the targets' spread; see `updated_precision`. The training tests in
-# tests/test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
+# test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
 _FLAT = 1e-4  # of free weights: a standard deviation of 100
 _MOST = 1e4
 _LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0

@@ -39,7 +39,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import UsageError
 
 SCALES = ("log", "linear", "inverse")
-# Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
+# Two slow tests of test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
 # these choices, `Budget` and `Schedule` reach between settings.
 # (own, hidden): tanh units of the first layer for each control, units of the second.
 TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))

@@ -29,10 +29,10 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
-# stay within 1.04 of the noise floor even between settings (slow tests in tests/test_zoom_lens.py).
+# stay within 1.04 of the noise floor even between settings (slow tests in test_zoom_lens.py).
 _POOR_FIT = 1.5
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
-# out in tests/test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
+# out in test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
 # changes sharply is rejected.
 _SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
 _SIGMAS = 8.0  # standard deviations from the prediction of all other settings, rms over the parameters

@@ -38,12 +38,12 @@ from neurocal_cli.detection.grid import Grid
 Size = tuple[int, int]
 
 # Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless nothing
-# has been found yet. Chosen for speed: tests/benchmarks/test_detection_speed.py.
+# has been found yet. Chosen for speed: test_detection_speed.py.
 _SEARCHED = 1.4e6
 # Larger levels are never searched, to save memory and time.
 _MOST_SEARCHED = 30_000_000
 # Insensitive. Number of seeds of a level that may fail; limits the time if there is no board
-# (tests/benchmarks/test_detection_speed.py, "clutter only").
+# (test_detection_speed.py, "clutter only").
 _TRIES, _TRIES_2X3 = 8, 4
 _UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
 _BEHIND = 3.0  # ratio of the squares' sizes above which a second board is not searched

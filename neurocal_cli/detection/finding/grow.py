@@ -54,7 +54,7 @@ _OFF_MAP, _OFF_MAP_PX, _OFF_MAP_NOISE = 0.021, 0.09, 20.0
 _MANY, _FEW_SMOOTH = 18, 0.6  # factor on this limit for fewer vertices, which may be aligned by chance
 
 # Insensitive, with exceptions: half of _STEPS loses 3 of 1204 vertices, half of _MOST_SPREAD loses 47, and
-# twice _WEAKEST, which exceeds the contrast of the neighbours, stops growth. tests/test_finding.py repeats
+# twice _WEAKEST, which exceeds the contrast of the neighbours, stops growth. test_finding.py repeats
 # this.
 _SEARCHED = 0.24  # squares; half width of the search around a prediction ...
 _STEPS = 7  # ... and number of samples in each direction

@@ -23,7 +23,7 @@ Index = NDArray[np.intp]
 
 LEAST_SIGMA = 0.75  # px; least smoothing of derivatives, for the narrowest squares
 
-# _REACH and _RIDGE are insensitive; tests/test_finding.py.
+# _REACH and _RIDGE are insensitive; test_finding.py.
 _REACH = 3  # squares
 _WIDTH = 1.4  # squares; standard deviation of the Gaussian weights
 _RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])

@@ -28,7 +28,7 @@ from neurocal_cli.detection.finding.saddles import Level, Saddles, find_saddles,
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 _FEWEST = 9  # saddles, for 3 x 3 vertices
-# Insensitive; tests/test_finding.py.
+# Insensitive; test_finding.py.
 _WIDEST = 0.26  # rad; greatest angle between a port and the direction to the neighbour
 _SHARE = 0.45  # the same angle as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; a neighbour may be this far beside the port's line, within the latter angle
@@ -36,7 +36,7 @@ _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... or greatest second difference times this weight
 # Insensitive: a lattice rejected here is grown instead, which only costs time
-# (tests/benchmarks/test_detection_speed.py).
+# (test_detection_speed.py).
 _NEAR = 1.0  # px; greatest shift of a saddle when derivatives are smoothed more
 _FEWEST_AT_ONCE = 12  # vertices; smaller lattices are grown from the seed
 _ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share

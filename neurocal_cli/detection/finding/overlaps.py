@@ -19,20 +19,20 @@ from neurocal_cli.detection.finding.lattice import Index, Lattice, predict_verti
 from neurocal_cli.detection.grid import TURNS
 from neurocal_cli.detection.medians import median, quantile
 
-# Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
+# Insensitive; FOLDED and "two boards" in test_finding.py repeat this.
 _SAME = 0.25  # squares; greatest distance between vertices that are the same
 _MEETS = 0.13  # squares; greatest distance of a vertex from another lattice or its next row ...
 _MEETS_PARTLY = 0.22  # ... and the same for vertices of incomplete rows
 _MOSTLY = 0.6  # share of such vertices above which a row is removed
 _COPY = 0.5  # share of vertices in another lattice above which a lattice is its copy
 _BESIDE = 2.0  # squares; lattices farther apart share no vertices
-# tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
+# test_finding.py divides a board into two halves with these limits, and expects one grid.
 _NEAR = 4.0  # squares; greatest distance of vertices from the other lattice to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; greatest median and maximum deviation from whole numbers
 _LEAST = 4  # least number of vertices compared
 # Pairs of the least second difference of a fold [squares] and its least ratio to those of distant rows,
 # because paper is not flat either. Insensitive, like all that follow; FOLDED and WHOLE in
-# tests/test_finding.py repeat this.
+# test_finding.py repeat this.
 _FOLDS = ((0.13, 4.0), (0.06, 12.0))
 _VERTEX_ERROR = 0.2  # px, added for the errors of the vertices
 _UNKNOWN = 0.03  # squares; second difference assumed if there are no distant rows

@@ -42,7 +42,7 @@ _LEAST_RATIO = 0.02  # ... and its least ratio to the stronger one; the ratio is
 _NARROWEST = np.radians(14)  # least angle between the two lines
 # Saddles examined per megapixel, least number examined, and greatest number kept; these limit the time.
 _PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400
-_LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
+_LONGEST_STEP = 1.5  # px; insensitive, test_finding.py
 
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)

@@ -38,7 +38,7 @@ _SQUARE = 24.0  # px; side of a square in the view ...
 _MOST_PIXELS = 1.4e6  # ... unless the view would be larger than this
 _LARGEST = 1.5  # px; greatest shift of a vertex when it is refined in the image
 _SIGMA = 0.15  # squares; smoothing of derivatives, in steps of 0.25 px
-# For boards seen almost from the side, as in tests/test_finding.py. The limits have not been varied on images
+# For boards seen almost from the side, as in test_finding.py. The limits have not been varied on images
 # that reach this step.
 _FACTOR = 2.0  # of the stretch
 _ANISOTROPY = 1.8  # least ratio of the rms gradients across and along the squares

@@ -38,7 +38,7 @@ PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun 7.1.26)
 # with seven minimax coefficients, found by Lawson's method. The error is at most 7.3e-10
-# (tests/test_fit_models.py). For the pixels of 93 edges, error function and density take 0.13 ms;
+# (test_fit_models.py). For the pixels of 93 edges, error function and density take 0.13 ms;
 # scipy.special.erf takes 1.0 ms, and 0.1 s to import.
 _P = 0.34
 _C = (

@@ -38,7 +38,7 @@ _BLUR_OFF = 0.2  # relative error of the blur above which the fits are repeated
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # prior standard deviations relative to contrast and blur
 
 # Insensitive as long as they admit a ratio of 1 to the prior, and fits of 8 pixels for the smallest squares.
-# tests/test_measuring.py counts the fits of hidden edges that are accepted.
+# test_measuring.py counts the fits of hidden edges that are accepted.
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
 # In a shadow or far from a lamp: least contrast relative to the board's median, and number of neighbours that
 # have such a contrast, too.

@@ -33,7 +33,7 @@ _TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
 
 # A richer model must lower chi2 by this much for each additional parameter; chance alone gives 1. Residuals
 # far above the noise come from an uneven board, which a polynomial must not follow, so the price is higher
-# then. Insensitive, like all constants here; tests/test_fit_parts.py selects known models.
+# then. Insensitive, like all constants here; test_fit_parts.py selects known models.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
 _FIRST_SHARE = 0.3  # share of that price which the first step must gain for the fit to continue
 _FUTILE = 2  # richer lens models, or polynomials, without gain, after which no more are tried

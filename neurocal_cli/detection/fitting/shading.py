@@ -27,7 +27,7 @@ _NEAREST = 3  # the distance of the n-th nearest level is the width of the weigh
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 # Coefficients of richer polynomials, of degree 3 to 5; the ratio of their scatter to that of the best simpler
 # one from which they are used; and the spread of the levels around that, relative to their variances, from
-# which they are tried. Chosen on rendered lamps and vignetting (tests/test_uneven_light.py).
+# which they are tried. Chosen on rendered lamps and vignetting (test_uneven_light.py).
 _RICHER, _GAIN, _NOTABLE = (10, 15, 21), 0.5, 1.0
 _EVEN = 0.005  # standard deviation of the levels, in half contrasts, below which degree 2 is sufficient
 # A shadow is looked for if so many levels differ so much from the polynomials, relative to the contrast. It

@@ -54,7 +54,7 @@ _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this 
 _RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
 _NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
 # Number of terms of the series for crossings with a cosine below each limit, and for all others;
-# tests/test_fit_models.py compares them with a rendered cross.
+# test_fit_models.py compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 
 

@@ -42,7 +42,7 @@ from neurocal_cli.observations.board import Board, Plane, is_flat
 _ROUNDING = 1e-6  # greatest error of a motion that maps the board onto itself, relative to its extent
 _WEAK = 3.0  # perspective counts as visible if an affine camera fits worse by this factor
 
-# tests/test_identity.py accepts and refuses rendered boards with these limits.
+# test_identity.py accepts and refuses rendered boards with these limits.
 _CLEARLY = 3.0  # ratio to the best rms error above which an arrangement is excluded
 _NOISE = 0.05  # px; least rms error in this ratio
 _MISFIT = 0.25  # squares; greatest rms error of the best arrangement, for distortion and uneven boards

@@ -33,7 +33,7 @@ DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _SIDES: tuple[tuple[slice | int, ...], ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
 _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
 
-# With these limits tests/test_identity.py classifies ends of rendered boards, occluders and image borders.
+# With these limits test_identity.py classifies ends of rendered boards, occluders and image borders.
 _STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
 _RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
 _ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
@@ -42,7 +42,7 @@ _AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the ne
 _SHARE = 0.75  # least share of the squares along a side that must agree
 _FEWEST = 2  # least number of usable squares at a side
 
-# With these limits tests/test_identity.py removes false lines, and keeps those of larger boards.
+# With these limits test_identity.py removes false lines, and keeps those of larger boards.
 _FEW = 0.34  # a line may be removed if at most this share of its vertices was found
 _FEW_AT_FOLDS = 0.6  # the same for several planes, which are tested against a camera afterwards
 
