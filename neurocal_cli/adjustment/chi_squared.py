@@ -12,9 +12,11 @@ _ROUNDING = 1e-15  # of the largest eigenvalue
 def chi_squared(difference: Array, covariance: Array) -> float:
     """Squared Mahalanobis length d^T C^-1 d of a difference d (n,) with covariance C (n, n).
 
-    Directions whose variance is zero or negative by rounding are left out.
+    Directions whose variance is zero or negative by rounding are left out; nan if an entry has no variance.
     """
     scale = np.sqrt(np.diagonal(covariance))
+    if not (scale > 0).all():
+        return float("nan")
     variance, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
     known = variance > _ROUNDING * variance[-1]
     along = (difference / scale) @ directions[:, known]

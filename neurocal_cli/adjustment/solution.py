@@ -156,6 +156,16 @@ class Solution:
         )
 
     @property
+    def spare_equations(self) -> float:
+        """Number of equations that the points give beyond the number of unknowns."""
+        return self.problem.views.n_equations - self.problem.n_parameters
+
+    @property
+    def squared_error(self) -> float:
+        """Sum of the squared, weighted errors of all points [px^2]."""
+        return float(self.adjusted.normal[:, -1, -1].sum()) * self.problem.views.pixel_scale**2
+
+    @property
     def in_pixels(self) -> CameraState:
         """Camera and poses in pixels and world units; poses are in the order of the problem's views."""
         return in_pixels(self.problem, self.state)

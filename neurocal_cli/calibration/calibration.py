@@ -18,6 +18,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
+from neurocal_cli.observations.measured_directions import equations
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
@@ -252,6 +253,13 @@ def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
     from_lines = calibration.straight_lines is not None
     names = coefficient_names(calibration.distortion_model) if from_lines else NODES
     return free_entries(calibration, names)
+
+
+def spare_equations(calibration: Calibration) -> float:
+    """Number of equations that the points give beyond the number of unknowns."""
+    points, views = calibration.points, calibration.views.values()
+    unknowns = int(estimated_parameters(calibration).sum()) + 6 * sum(not view.fixed for view in views)
+    return float(equations(points.across, len(points)).sum()) - unknowns
 
 
 def undistorted_before(points: Correspondences, given: Camera | Calibration) -> str:

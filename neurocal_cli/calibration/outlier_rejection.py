@@ -9,6 +9,11 @@ bit with and without this module. Otherwise
    (`outlier_views`);
 3. the camera judges every point, including those left out before. Points whose error exceeds the largest
    expected of so many normal errors are left out, and the rest is calibrated again, until nothing changes.
+
+Few points fit better without some of them whether these are wrong or not, up to an exact fit. So where few
+equations are left, the evidence decides. For s spare equations with the squared error c, its logarithm is
+log Gamma(s / 2) - s / 2 log(pi c), with the noise level integrated out (Jeffreys' prior). Each of k outliers
+is anywhere in the image, of area F, and any k of n points may be those: - k log F - log(n over k).
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from math import comb, lgamma, log, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +52,13 @@ from neurocal_cli.observations.target import distinct_points
 # Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
 # test_wrong_inputs.py.
+_EXACT = 1e-9  # of the pixels' spread: rms errors below this are rounding
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
+_FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
 _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
 
 
@@ -84,7 +92,41 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
     kept, solution = _agreeing(problem, options, first, failure)
     kept, solution = _without_outlier_views(problem, options, kept, solution)
     kept, solution = _all_judged(problem.points, options, kept, solution)
+    if not (kept.mask.all() or _is_borne_out(kept, solution, first)):
+        if first is not None and not first.refusal:
+            return first, Rejected()
+        _refuse_exact(solution, failure)
     return replace(solution, of_all=first), _rejected(problem.points, kept, solution)
+
+
+def _is_borne_out(kept: _Kept, solution: Solution, first: Solution | None) -> bool:
+    """Whether the fit of the points kept is more probable than that of all points, or is well determined."""
+    if solution.spare_equations >= _FEW:
+        return True
+    if first is None or first.refusal or solution.spare_equations <= 0:
+        return solution.spare_equations > 0
+    points = first.problem.points
+    n, k = len(points), int((~kept.mask).sum())
+    area = float(np.prod(points.image_size or np.ptp(points.pixels, axis=0)))
+    return _evidence(solution) - k * log(area) - log(comb(n, k)) > _evidence(first)
+
+
+def _evidence(solution: Solution) -> float:
+    """Log evidence of the fit of some points; see the module."""
+    half = 0.5 * solution.spare_equations
+    floor = (_EXACT * pixel_spread(solution.problem.points)) ** 2
+    return lgamma(half) - half * log(pi * (solution.squared_error + floor))
+
+
+def _refuse_exact(solution: Solution, failure: DegenerateGeometryError | None) -> None:
+    """Refuse the exact fit of points of which others were left out."""
+    if failure is not None:
+        raise failure
+    if solution.spare_equations <= 0:
+        raise DegenerateGeometryError(
+            "some points contradict each other, and without them nothing is left to test the others; "
+            "correct them, or add points"
+        )
 
 
 def judged_again(

@@ -26,7 +26,12 @@ from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixel
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import Views, arrange
-from neurocal_cli.calibration.calibration import Calibration, Verdict, estimated_parameters, free_entries
+from neurocal_cli.calibration.calibration import (
+    Calibration,
+    Verdict,
+    estimated_parameters,
+    free_entries,
+)
 from neurocal_cli.calibration.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import pixel_spread, verdict_of

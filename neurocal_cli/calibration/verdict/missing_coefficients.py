@@ -23,6 +23,7 @@ from neurocal_cli.camera.state import CameraState
 _STEPS = 60
 _ENOUGH = 60  # views: more are not needed
 _DECISIVE = 4.0  # of the Bayesian information criterion; none of 160 clean sets gains as much
+_FEWEST = 4  # spare equations; the errors in fewer are explained by any coefficient
 _ROUNDING = 1e-12  # of a normal matrix with unit diagonal
 _CENTRE = slice(3, 5)  # of A's entries
 
@@ -54,10 +55,14 @@ def missing_coefficients(m: Minimum, std: Array) -> MissingCoefficients | None:
     if not before > 0 or not _promises_enough(views, richer[-1], free, m.free_poses, before):
         return None
     best, lowest = None, -_DECISIVE
+    poses = 6 * views.n_views if m.free_poses else 0
     for start in richer:
+        spare = views.n_equations - int(_all_free(free, start).sum()) - poses
+        if spare < _FEWEST:
+            break
         found = adjust(views.batches, start, _all_free(free, start), m.free_poses, _STEPS)
         left = float(found.cost.sum()) / before
-        n = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
+        n = effective_number(spare, correlation(views, point_residuals(views, found.state)))
         criterion = n * np.log(max(left, _ROUNDING)) + (len(start.k) - n_coefficients) * np.log(n)
         if criterion < lowest:
             best, lowest = (found.state, left), criterion

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, StopReason, Verdict
+from neurocal_cli.calibration.calibration import Calibration, StopReason, Verdict, spare_equations
 from neurocal_cli.calibration.verdict.common_errors import common_errors
 from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
@@ -23,6 +23,7 @@ from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
@@ -39,6 +40,8 @@ _FLEXING = 0.0002
 # model exceeds both; of 18 of photographs of two cameras, two zooms, moved crops and turned images, 14 do.
 # test_two_real_cameras_are_not_good repeats one of each.
 _TOO_MUCH_TO_FLEX = (1.3, 9.0)
+# Spare equations from which 95 % lie within 1.4 and within 1.2 times two standard deviations (Student's t).
+_SPARE = (4, 8)
 _HELD_OUT = Limit(1.3, 2.0)  # over the rms error
 _DISAGREEMENT = Limit(6.0, 40.0)
 _CORRELATION = Limit(0.5, 0.85)
@@ -95,6 +98,7 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         slow = named and calibration.stop_reason == StopReason.MAX_ITERATIONS.value
         more = "choose a simpler --distortion, or auto" if slow else "increase --starts"
         yield 2, f"training did not converge: {calibration.stop_reason}", more
+    yield from _redundancy(calibration)
     # A given camera that is wrong explains the errors, so it is reported before them.
     yield from _given(calibration, evidence)
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
@@ -106,6 +110,20 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
+
+
+def _redundancy(calibration: Calibration) -> Iterator[Finding]:
+    """Finding about residuals that are too few to tell the noise."""
+    spare = spare_equations(calibration)
+    if spare >= _SPARE[1]:
+        return
+    more = int(np.ceil(0.5 * (_SPARE[1] - spare)))
+    yield (
+        1 + int(spare < _SPARE[0]),
+        f"the points give only {plural(round(spare), 'equation')} more than there are unknowns, so standard "
+        "deviations may be far too small by chance",
+        f"give at least {plural(more, 'point')} more",
+    )
 
 
 def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
