@@ -108,8 +108,13 @@ def assert_minimum(scene: Scene, points: Correspondences, type: int, skew: bool)
         assert np.abs(cal.rotations[name] - R).max() < 1e-6
 
 
-@pytest.mark.parametrize("weights", ["none", "sigma", "suu,suv,svv"])
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize(
+    ("weights", "skew"),
+    slow_but(
+        [("suu,suv,svv", True), ("none", False)],
+        itertools.product(("none", "sigma", "suu,suv,svv"), (True, False)),
+    ),
+)
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_a_solid_target_ends_where_scipy_does_from_the_truth(type: int, skew: bool, weights: str) -> None:
     rng = np.random.default_rng(10 * type + skew)
@@ -119,9 +124,7 @@ def test_a_solid_target_ends_where_scipy_does_from_the_truth(type: int, skew: bo
 
 @pytest.mark.parametrize(
     ("weights", "skew"),
-    slow_but(
-        [("suu,suv,svv", True), ("none", False)], itertools.product(("none", "suu,suv,svv"), (True, False))
-    ),
+    slow_but([("suu,suv,svv", True)], itertools.product(("none", "suu,suv,svv"), (True, False))),
 )
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_flat_boards_end_where_scipy_does_from_the_truth(type: int, skew: bool, weights: str) -> None:
@@ -308,7 +311,7 @@ def spread_out(rng: np.random.Generator, n: int, flat: bool) -> Array:
             return np.asarray(world + np.array([120.0, 75.0, 0.0]))
 
 
-@pytest.mark.parametrize("seeds", [range(7), pytest.param(range(7, 20), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 20), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("flat", [True, False], ids=["flat", "solid"])
 def test_a_pose_from_four_points(flat: bool, seeds: range) -> None:
     for seed in seeds:
@@ -332,7 +335,7 @@ def test_all_points_but_one_in_a_plane(type: int, skew: bool) -> None:
         np.testing.assert_allclose(cal.rotations["v0"], scene.poses["v0"].R, atol=1e-7)
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 5), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 5), marks=pytest.mark.slow)])
 def test_the_fewest_points_fit_to_rounding(seeds: range) -> None:
     for kind, n in FEWEST.items():
         for seed in seeds:

@@ -89,7 +89,7 @@ def test_given_poses_with_points_behind_need_a_wide_lens() -> None:
     [("eucm", "eucm", 190), pytest.param("fisheye", "auto", 200, marks=pytest.mark.slow)],
 )
 def test_wrong_points_are_found_and_no_view_is_lost(model: str, distortion: str, field: float) -> None:
-    scene = wide_set(15, model, field, n_views=10, sigma=0.1)
+    scene = wide_set(15, model, field, n_views=7, sigma=0.1)
     rng = np.random.default_rng(0)
     wrong = rng.random(len(scene.points)) < 0.05
     pixels = scene.points.pixels + wrong[:, None] * rng.normal(size=(len(wrong), 2)) * 40

@@ -117,7 +117,7 @@ def test_changes_of_all_sizes(change: str, share: float) -> None:
     assert told(make(share), share, words, range(30)) >= least
 
 
-@pytest.mark.parametrize("seeds", slow_but((range(2, 5),), (range(2, 5), range(20))))
+@pytest.mark.parametrize("seeds", slow_but((range(2, 3),), (range(2, 3), range(20))))
 @pytest.mark.parametrize("curl", slow_but((0.5,), (0.5, 2.0)))
 def test_images_of_two_sizes_are_told_of_a_bent_board_too(curl: float, seeds: range) -> None:
     words = ("these views are scaled by",)
