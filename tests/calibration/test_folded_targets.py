@@ -160,7 +160,7 @@ def test_one_photograph_of_a_bent_corner_through_a_lens_gives_the_camera() -> No
     assert 0.4 < rms(values) < 1.25
 
 
-@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 80), marks=slow)])
+@pytest.mark.parametrize("seeds", [range(4, 5), pytest.param(range(80), marks=slow)])
 def test_one_photograph_of_any_corner(seeds: range) -> None:
     """Two or three boards at 70 to 120 degrees, with all defaults but the right angle of the image's axes.
 

@@ -62,7 +62,7 @@ def check(type: int, sigma: float, trials: int) -> None:
     assert np.abs(stds - 1).max() < 0.05
 
 
-@pytest.mark.parametrize("type", slow_but((1, 4), (1, 2, 3, 4)))
+@pytest.mark.parametrize("type", slow_but((1,), (1, 2, 3, 4)))
 def test_errors_are_at_the_cramer_rao_bound(type: int) -> None:
     check(type, 1.0, 36)
 

@@ -98,7 +98,7 @@ def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
     assert pytest.approx(undistorted_camera(cam, 0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
 
 
-@pytest.mark.parametrize("model", BENDING)
+@pytest.mark.parametrize("model", slow_but(("thin_prism", "tilted", "fisheye", "omnidir"), BENDING))
 def test_covariances_are_those_of_many_points(model: str) -> None:
     cam = camera(model, True)
     seen = np.array([[600.0, 30.0]])
@@ -112,7 +112,7 @@ def test_covariances_are_those_of_many_points(model: str) -> None:
     assert found[0] == pytest.approx(expected, abs=0.04 * expected[0])
 
 
-@pytest.mark.parametrize("model", BENDING)
+@pytest.mark.parametrize("model", slow_but(("thin_prism", "tilted", "fisheye", "omnidir"), BENDING))
 def test_a_direction_of_measurement_stays_across_the_edge(model: str) -> None:
     cam = camera(model, True)
     seen, edge = np.array([600.0, 30.0]), np.array([0.6, 0.8])

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from support.command_line import run
 from support.places import SAMPLES
+from support.slow_cases import slow_but
 
 from neurocal_cli.files.writing import Outputs
 
@@ -110,7 +111,11 @@ def test_closed_standard_output_is_said_to_be_closed(made: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"]
+    "words",
+    slow_but(
+        ("evaluate camera camera.yaml --json", "--help"),
+        ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"],
+    ),
 )
 def test_nor_is_what_is_only_printed_lost_without_a_word(made: Path, words: str) -> None:
     shell = f"{sys.executable} -m neurocal_cli {words} >&-"

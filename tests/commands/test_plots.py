@@ -82,7 +82,7 @@ def test_a_camera_without_a_calibration_is_drawn_with_the_points_it_was_judged_b
     assert b"known only of a calibration" in draw_camera(subject, "svg", "uncertainty").replace(
         b"&#x20;", b" "
     )
-    assert draw_camera(subject).startswith(BEGINNINGS["png"])
+    assert draw_camera(subject, "png", "residuals").startswith(BEGINNINGS["png"])
 
 
 @pytest.fixture(scope="module")

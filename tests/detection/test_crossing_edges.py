@@ -54,9 +54,7 @@ def is_in_an_outer_row(name: str, cols: int, rows: int) -> bool:
     return int(r) in (0, rows - 1) if kind == "h" else int(c) in (0, cols - 1)
 
 
-@pytest.mark.parametrize(
-    "name", slow_but(("base", "strongly distorted"), ("base", "strongly distorted", "k1 -0.3", "gamma 2.2"))
-)
+@pytest.mark.parametrize("name", slow_but(("base",), ("base", "strongly distorted", "k1 -0.3", "gamma 2.2")))
 def test_outermost_midpoints_are_measured_along_their_edges(name: str) -> None:
     squares: list[Array] = []
     for seed in range(4):

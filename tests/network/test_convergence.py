@@ -86,11 +86,11 @@ def single_starts(draw: Callable[[np.random.Generator], Drawn], n: int, seed: in
 
 
 def test_random_solid_targets_end_at_the_maximum_likelihood_fit() -> None:
-    assert scenes(a_solid, 40, seed=1, seeds=1)["bad"] == 0
+    assert scenes(a_solid, 16, seed=1, seeds=1)["bad"] == 0
 
 
 def test_random_flat_sets_end_at_the_maximum_likelihood_fit() -> None:
-    assert scenes(a_flat_set, 20, seed=2, seeds=1)["bad"] == 0
+    assert scenes(a_flat_set, 10, seed=2, seeds=1)["bad"] == 0
 
 
 @pytest.mark.slow

@@ -81,7 +81,7 @@ def shift(picture: Array, model: Array, gradient: tuple[Array, Array]) -> Array:
 
 @pytest.mark.parametrize(
     ("psf", "roll"),
-    slow_but(((0.4, 0.0), (2.0, 0.3)), itertools.product((0.4, 0.8, 2.0), (0.0, 0.3, np.pi / 4, 1.2))),
+    slow_but(((2.0, 0.3),), itertools.product((0.4, 0.8, 2.0), (0.0, 0.3, np.pi / 4, 1.2))),
 )
 def test_a_board_that_faces_the_camera_is_a_product_of_error_functions(psf: float, roll: float) -> None:
     middle = (79.37, 60.21)
@@ -131,7 +131,7 @@ def straight_edge(distance: Array, normal: Array, psf: float) -> Array:
     return np.asarray(np.einsum("...ij,i,j->...", response, 0.5 * WEIGHTS, 0.5 * WEIGHTS))
 
 
-@pytest.mark.parametrize("tilt", [30.0, 60.0, 72.0])
+@pytest.mark.parametrize("tilt", slow_but((60.0,), [30.0, 60.0, 72.0]))
 def test_edges_of_a_tilted_board_are_straight_edges_between_its_vertices(tilt: float) -> None:
     scene = facing(34.0, 0.0, (80.0, 60.0), 0.8)
     scene = replace(scene, camera=replace(scene.camera, image_size=(320, 240)), psf=0.8)

@@ -51,7 +51,7 @@ def test_turned_images_are_named(n_turned: int, shape: str, amount: float) -> No
 
 def test_a_turned_image_that_is_left_out_is_named_through_a_strong_lens() -> None:
     points, _ = photographed("flat", 5, 14, k=(-0.3, 0.1), sigma=0.15)
-    calibration = calibrate(turned(points, [3]))
+    calibration = calibrate(turned(points, [3]), distortion="k1k2")
     assert "turned by 180 degrees" in calibration.rejected.views[points.view_names[3]]
 
 

@@ -20,7 +20,7 @@ def groups(points) -> ViewGroups | None:
     return gather_evidence(calibrate(points)).groups
 
 
-@pytest.mark.parametrize("other", slow_but((570.0, 800.0), (540.0, 570.0, 630.0, 800.0)))
+@pytest.mark.parametrize("other", slow_but((570.0,), (540.0, 570.0, 630.0, 800.0)))
 def test_two_cameras_are_told_apart_view_by_view(other: float) -> None:
     found = groups(of_cameras([600.0, other]))
     assert found is not None
