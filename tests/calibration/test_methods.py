@@ -257,7 +257,7 @@ def close(cal: Calibration, scene: Scene, types_std: float = 6.0) -> None:
         assert np.abs(cal.rotations[name] - pose.R).max() < 0.05
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_one_heavy_view_among_small_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     many = np.column_stack([rng.uniform(0, 240, 20_000), rng.uniform(0, 150, 20_000), np.zeros(20_000)])
@@ -266,7 +266,7 @@ def test_one_heavy_view_among_small_ones(seed: int) -> None:
 
 
 @pytest.mark.parametrize("skew", [True, False])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_views_of_all_sizes(seed: int, skew: bool) -> None:
     rng = np.random.default_rng(seed)
     sizes = [4, 5, 54, 9, 30, 6, 17, 54, 4]
@@ -275,14 +275,14 @@ def test_views_of_all_sizes(seed: int, skew: bool) -> None:
 
 
 @pytest.mark.parametrize("type", [1, 2])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_flat_and_folded_views_together(seed: int, type: int) -> None:
     scene = several([BOARD, FOLDED, BOARD, FOLDED[::3]], 0.2, seed)
     close(pinhole(scene.points(), seed=seed, **scene.given(type)), scene)
 
 
-@pytest.mark.parametrize("bow", [1e-5, 1e-3, 0.5, 2.0, 6.0])
-@pytest.mark.parametrize("type", [1, 2, 3])
+@pytest.mark.parametrize("bow", slow_but((1e-5, 0.5, 6.0), [1e-5, 1e-3, 0.5, 2.0, 6.0]))
+@pytest.mark.parametrize("type", slow_but((1,), [1, 2, 3]))
 def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
     bowed = BOARD.copy()
     bowed[:, 2] = bow * (((BOARD[:, 0] - 120) / 120) ** 2 + 0.5 * ((BOARD[:, 1] - 75) / 75) ** 2)
@@ -294,7 +294,7 @@ def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
 
 
 @pytest.mark.parametrize("few", [4, 5])
-@pytest.mark.parametrize("seed", slow_but((0, 1), range(4)))
+@pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_views_with_too_few_points_of_their_own_are_helped_by_others(few: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     corner = FOLDED[rng.permutation(len(FOLDED))[:few]]
@@ -325,7 +325,7 @@ def test_a_pose_from_four_points(flat: bool, seeds: range) -> None:
 
 
 @pytest.mark.parametrize("type", [2, 3])
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("skew", slow_but((True,), [True, False]))
 def test_all_points_but_one_in_a_plane(type: int, skew: bool) -> None:
     world = np.concatenate([BOARD, [[100.0, 90.0, -150.0]]])
     for seed in range(3):

@@ -66,14 +66,14 @@ def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> 
         a_wrong_view_changes_nothing(seed, MISMATCHES[seed % len(MISMATCHES)], distortion)
 
 
-@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("flat", slow_but((True,), [True, False]))
 def test_good_data_are_calibrated_to_the_last_bit_as_if_nothing_were_looked_for(flat: bool) -> None:
     for seed in range(2):
         _, points, _ = good(300 + seed, flat)
         assert format_calibration(reject(points)) == format_calibration(pinhole(points, skew=False))
 
 
-@pytest.mark.parametrize("type", slow_but((1, 3, 4), (1, 2, 3, 4)))
+@pytest.mark.parametrize("type", slow_but((1, 4), (1, 2, 3, 4)))
 def test_each_problem_type_leaves_wrong_points_out(type: int) -> None:
     scene = table_1()
     points = scene.points(0.2, np.random.default_rng(3))

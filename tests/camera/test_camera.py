@@ -24,7 +24,7 @@ from neurocal_cli.errors import InputError, UsageError
 
 FLAT = Intrinsics(500.0, 500.0, 320.0, 240.0)
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=30, deadline=None)
 focal = st.floats(10, 1e5)
 centre = st.floats(-1e4, 1e4)
 cameras = st.builds(Intrinsics, focal, focal, centre, centre, st.floats(0.3, 2.8))
@@ -154,7 +154,7 @@ def test_a_projection_matrix_of_any_sign_and_scale_is_taken_apart(
 
 SIZE = (640, 480)
 every_model = pytest.mark.parametrize("model", list(MODELS))
-with_and_without_skew = pytest.mark.parametrize("theta", [np.pi / 2, 1.5])
+with_and_without_skew = pytest.mark.parametrize("theta", slow_but((1.5,), (np.pi / 2, 1.5)))
 
 
 def camera_with(model: str, theta: float = np.pi / 2) -> Camera:

@@ -65,7 +65,7 @@ def test_points_are_those_of_opencv(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", BENDING)
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("skew", slow_but((True,), [True, False]))
 def test_points_go_there_and_back(model: str, skew: bool) -> None:
     cam = camera(model, skew)
     new, seen = undistorted_camera(cam), inside()

@@ -201,7 +201,7 @@ def test_no_grid_is_no_board() -> None:
 @pytest.mark.parametrize(
     "name",
     slow_but(
-        ("two planes distorted", "three planes across"),
+        ("three planes across",),
         ("two planes", "two planes distorted", "two planes across", "three planes", "three planes across"),
     ),
 )

@@ -436,7 +436,7 @@ def refused_or_read(path, content):
     assert message.isprintable()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(junk=st.binary(max_size=60) | st.text(max_size=60).map(lambda s: s.encode("utf-8", "replace")))
 def test_random_bytes_are_refused_in_one_line(tmp_path_factory, junk):
     refused_or_read(tmp_path_factory.getbasetemp() / "cal.yaml", junk)
@@ -463,7 +463,7 @@ def of_four_points():
     return format_calibration(replace(cal, points=cal.points.select(slice(0, 4))))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10**6), junk=TREES)
 def test_a_value_of_another_type_anywhere_is_refused_in_one_line(tmp_path_factory, seed, junk):
     chance = random.Random(seed)

@@ -135,8 +135,9 @@ def test_noise_of_each_camera_is_weighed_by_itself() -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         points = scene.points(0, 0.05, rng), scene.points(1, 0.5, rng)
-        alone = calibrate(points[0], skew=False, distortion="none")
-        rig = calibrate_stereo(*points, skew=False, distortion="none")
+        options = {"skew": False, "distortion": "none", "target": "given", "outliers": "keep"}
+        alone = calibrate(points[0], **options)
+        rig = calibrate_stereo(*points, **options)
         truth = scene.cameras[0].alpha_u
         errors["own"].append(alone.intrinsics.alpha_u - truth)
         errors["joint"].append(rig.left.intrinsics.alpha_u - truth)
