@@ -363,7 +363,7 @@ def test_a_distortion_that_is_rich_enough_is_not_called_too_simple(
 
 
 def test_a_bent_board_is_found_with_a_distortion_that_is_rich_enough() -> None:
-    points, truth = photographed("parabola", 12, k=(-0.2,), model="k1")
+    points, truth = photographed("parabola", 12, 9, k=(-0.2,), model="k1")
     found = calibrate(points, distortion="k1")
     assert found.target is not None
     assert found.verdict is not None

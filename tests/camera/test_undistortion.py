@@ -175,7 +175,7 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
     assert pytest.approx(np.asarray(theirs), abs=2.0) == undistorted_camera(cam, alpha).A
 
 
-@pytest.mark.parametrize("model", BENDING)
+@pytest.mark.parametrize("model", slow_but(("plumb_bob", "tilted", "fisheye", "omnidir", "rich"), BENDING))
 @pytest.mark.parametrize("skew", slow_but((True,), (True, False)))
 def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew: bool) -> None:
     cam = camera(model, skew)

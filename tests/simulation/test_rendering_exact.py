@@ -171,7 +171,7 @@ def undistorted(camera: Camera, pixels: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 40) -> Array:
+def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 30) -> Array:
     """A window of the picture in [0, 1] from dense samples, shaken so that no line hides between them."""
     rng = np.random.default_rng(0)
     pad = int(np.ceil(6 * scene.psf)) + 1

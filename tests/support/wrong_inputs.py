@@ -560,6 +560,8 @@ SLOW = frozenset(
         "X in mm, Y in cm",
         "X in inches, Y in mm, the board turned",
         "a fisheye, called a pinhole",
+        "left and right images mixed",
+        "strong distortion, called a pinhole",
         "a third of the views in metres",
         "one image upside down",
         "one view in cm",

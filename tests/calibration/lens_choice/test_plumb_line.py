@@ -211,7 +211,7 @@ def test_the_centre_is_not_biased(trials: int) -> None:
 @pytest.mark.parametrize(
     ("type", "k"),
     slow_but(
-        [(1, [-0.3, 0.1]), (2, [0.2, -0.05]), (4, [0.0, 0.0])],
+        [(1, [-0.3, 0.1]), (4, [0.0, 0.0])],
         itertools.product((1, 2, 4), ([-0.3, 0.1], [0.2, -0.05], [0.0, 0.0])),
     ),
 )
@@ -230,9 +230,7 @@ def test_a_folded_target_without_noise_gives_lens_and_camera(type: int, k: list[
 WIDE = [[-0.35, 0.12], [-0.35, 0.08], [-0.5, 0.2], [-0.246, 0.036], [0.3, 0.0]]
 
 
-@pytest.mark.parametrize(
-    ("k", "widest"), slow_but([(WIDE[2], 0.6), (WIDE[3], 1.3)], itertools.product(WIDE, (0.6, 1.3)))
-)
+@pytest.mark.parametrize(("k", "widest"), slow_but([(WIDE[2], 0.6)], itertools.product(WIDE, (0.6, 1.3))))
 def test_wide_lenses_come_close_to_the_joint_fit(k: list[float], widest: float) -> None:
     flat = random_flat_set(np.random.default_rng(7), 14, False, cols=13, rows=10, f=400, width=1000)
     straight = np.column_stack([flat.pixels, np.ones(len(flat.pixels))]) @ np.linalg.inv(flat.intrinsics.A).T

@@ -19,7 +19,7 @@ from neurocal_cli.calibration.verdict.assessment import gather_evidence
 
 def curled(by: float, seed: int, n: int = 14) -> Calibration:
     rng = np.random.default_rng([seed, 77])
-    return calibrate(photographed(poses(n, rng), rng, curl=by), target="given")
+    return calibrate(photographed(poses(n, rng), rng, curl=by), distortion="k1k2", target="given")
 
 
 def stretched(by: float, seed: int, n: int = 14) -> Calibration:

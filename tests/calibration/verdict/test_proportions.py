@@ -136,12 +136,6 @@ def test_other_boards_have_no_other_proportions(points: Correspondences) -> None
     assert proportions(points) is None
 
 
-def test_parallel_boards_are_still_called_parallel() -> None:
-    points = seen(board(), [Pose(np.eye(3), q.t) for q in poses(10, 1)], CAMERA.A, 5)
-    with pytest.raises(DegenerateGeometryError, match="parallel"):
-        calibrate(points, distortion="none")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FLAT)
 def test_no_other_wrong_input_is_taken_for_it(name: str) -> None:

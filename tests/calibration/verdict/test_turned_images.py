@@ -32,7 +32,7 @@ def named(calibration: Calibration) -> set[str]:
 @pytest.mark.parametrize(
     ("n_turned", "shape", "amount"),
     slow_but(
-        [(2, "flat", 0.0), (7, "both", 0.1)],
+        [(2, "both", 0.1), (7, "both", 0.1)],
         [(n, *shape) for n in (2, 4, 7) for shape in (("flat", 0.0), ("parabola", 0.5), ("both", 0.1))],
     ),
 )
@@ -58,7 +58,7 @@ def test_a_turned_image_that_is_left_out_is_named_through_a_strong_lens() -> Non
 @pytest.mark.parametrize(
     ("kind", "n_views", "seed"),
     slow_but(
-        [("flat", 6, 0), ("stabilised", 9, 0), ("flexing", 20, 0), ("parabola", 20, 0)],
+        [("flat", 6, 0), ("stabilised", 6, 0), ("flexing", 20, 0), ("parabola", 6, 0)],
         itertools.product(("flat", "stabilised", "flexing", "parabola"), (6, 9, 20), range(24)),
     ),
 )
