@@ -6,6 +6,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,7 @@ def seen(camera: Camera, some: list[Pose], sigma: float, rng: np.random.Generato
     return Correspondences(np.tile(world, (len(some), 1)), noisy, names, SIZE)
 
 
+@cache
 def calibrated(camera: Camera, sigma: float = 0.2) -> Calibration:
     points = seen(camera, [*poses(8, 3), *turned_poses(8, 4)], sigma, np.random.default_rng(1))
     return calibrate(points, distortion=camera.distortion.model, target="given")

@@ -194,7 +194,7 @@ def all_files_are_long():
         yield
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cal=calibrations())
 def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_long, cal):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -206,7 +206,7 @@ def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_lo
     assert format_calibration(cal, by_rows=True).count("format: 1") == 1
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(cal=calibrations(), style=st.sampled_from([None, True, False]), slow=st.booleans())
 def test_a_file_written_anew_by_another_program_reads_the_same(tmp_path_factory, cal, style, slow):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bound
-from support.rendered import CONDITIONS, OTHERS, RECIPES, condition, picture
+from support.rendered import CONDITIONS, RECIPES, condition, picture
 from support.slow_cases import slow_but
 
 from neurocal_cli.camera.camera import Camera
@@ -368,7 +368,7 @@ def test_the_bound_grows_with_noise_and_is_infinite_where_nothing_is_seen() -> N
 # Scenes
 
 
-@pytest.mark.parametrize("name", slow_but((*CONDITIONS[::3], *OTHERS), CONDITIONS))
+@pytest.mark.parametrize("name", slow_but(CONDITIONS[::4], CONDITIONS))
 def test_a_condition_shows_what_it_should(name: str) -> None:
     scene = condition(name, 0)
     truth = ground_truth(scene)
