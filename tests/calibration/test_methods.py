@@ -281,7 +281,7 @@ def test_flat_and_folded_views_together(seed: int, type: int) -> None:
     close(pinhole(scene.points(), seed=seed, **scene.given(type)), scene)
 
 
-@pytest.mark.parametrize("bow", slow_but((1e-5, 0.5, 6.0), [1e-5, 1e-3, 0.5, 2.0, 6.0]))
+@pytest.mark.parametrize("bow", slow_but((0.5, 6.0), [1e-5, 1e-3, 0.5, 2.0, 6.0]))
 @pytest.mark.parametrize("type", slow_but((1,), [1, 2, 3]))
 def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
     bowed = BOARD.copy()

@@ -70,7 +70,7 @@ def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
     subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)
 
 
-@pytest.mark.parametrize("panel", slow_but(("uncertainty", "poses"), CAMERA_PANELS))
+@pytest.mark.parametrize("panel", slow_but(("uncertainty",), CAMERA_PANELS))
 def test_each_panel_of_a_camera_is_a_picture(panel: str) -> None:
     assert draw_camera(Subject.of(made_calibration(3)), "svg", panel).startswith(BEGINNINGS["svg"])
 

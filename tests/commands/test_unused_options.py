@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from support.command_line import run
 from support.places import SAMPLES
+from support.slow_cases import slow_but
 
 FLAT, LEFT, RIGHT = (SAMPLES / f"{name}.csv" for name in ("flat", "stereo_left", "stereo_right"))
 CAMERA = """
@@ -53,7 +54,14 @@ UNUSED = {
 }
 
 
-@pytest.mark.parametrize(("name", "words"), UNUSED.items(), ids=UNUSED.keys())
+@pytest.mark.parametrize(
+    ("name", "words"),
+    slow_but(
+        [item for item in UNUSED.items() if item[0] not in ("stereo --type", "lens fit --no-skew")],
+        UNUSED.items(),
+    ),
+    ids=UNUSED.keys(),
+)
 def test_a_note_tells_of_an_option_that_changes_nothing(
     name: str, words: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
