@@ -1,5 +1,6 @@
 """For all tests: threads, examples that are the same in every run, and real data."""
 
+import gc
 import os
 import signal
 
@@ -21,5 +22,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 from support.real_data import real_files, zhang  # noqa: E402, F401
 
 # What fails once has to fail again.
-settings.register_profile("repeatable", derandomize=True)
+settings.register_profile("repeatable", derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
+
+
+def pytest_collection_finish() -> None:
+    """Thousands of tests, which stay to the end, are not looked through for garbage again and again."""
+    gc.collect()
+    gc.freeze()

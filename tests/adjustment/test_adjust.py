@@ -117,7 +117,7 @@ def blocks_by_differences(problem: Problem, state: CameraState) -> Array:
 
 @pytest.mark.parametrize(
     ("skew", "whitened"),
-    slow_but({(0.0, False), (0.05, True)}, itertools.product((0.0, 0.05), (False, True))),
+    slow_but({(0.05, True)}, itertools.product((0.0, 0.05), (False, True))),
 )
 @pytest.mark.parametrize("counts", [(30,), EVEN, RAGGED], ids=["one view", "even", "ragged"])
 def test_normal_blocks_by_central_differences(counts: tuple[int, ...], skew: float, whitened: bool) -> None:
@@ -287,7 +287,7 @@ def test_a_refinement_that_is_cut_short_says_so() -> None:
 
 
 @pytest.mark.parametrize("model", BENT)
-@pytest.mark.parametrize("seed", slow_but(range(80000, 80020), range(80000, 80003)))
+@pytest.mark.parametrize("seed", slow_but((80000,), range(80000, 80003)))
 def test_a_descent_ends_only_where_another_step_gains_nothing(model: str, seed: int) -> None:
     """What is left is below a thousandth of chi-squared, 3 % of one standard deviation of one parameter."""
     points = bent_set(model, seed)[0].points(SIGMA, np.random.default_rng([seed, 1]))

@@ -28,7 +28,7 @@ def laid(
     return batches_of(local, local[:, :2], whitening, view, len(counts)), local, whitening, view
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(counts_of, st.booleans())
 def test_every_point_lies_in_one_tile_of_its_view_and_padding_weighs_nothing(
     counts: list[int], whitened: bool

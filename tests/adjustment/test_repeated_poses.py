@@ -7,6 +7,7 @@ import pytest
 from support.grouped_views import ALPHA, COLS, ROWS, frames, photographed, poses
 from support.real_data import RealFiles
 from support.scenes import random_flat_set
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.adjustment.cross_validation import FOLDS
@@ -46,7 +47,7 @@ def test_photographs_from_a_tripod_average() -> None:
     assert found.worth > 0.85
 
 
-@pytest.mark.parametrize("f", [700.0, 3000.0])
+@pytest.mark.parametrize("f", slow_but((3000.0,), [700.0, 3000.0]))
 def test_views_of_different_poses_are_never_the_same(f: float) -> None:
     scene = random_flat_set(np.random.default_rng(3), 1000, False, cols=6, rows=5, f=f, width=1280)
     points = scene.points(0.5, np.random.default_rng(4))
@@ -71,7 +72,7 @@ def replace_pixels(still: Correspondences, n: int, step: float) -> Correspondenc
     return Correspondences(world, pixels, np.repeat([f"f{k:02d}" for k in range(n)], COLS * ROWS))
 
 
-@pytest.mark.parametrize("own", [0.02, pytest.param(0.01, marks=pytest.mark.slow), 0.1])
+@pytest.mark.parametrize("own", slow_but((0.02,), (0.02, 0.01, 0.1)))
 def test_the_std_of_frames_is_that_of_their_poses(own: float) -> None:
     """Twelve frames of each pose, whose errors are nearly the same, know hardly more than one."""
     errors = []

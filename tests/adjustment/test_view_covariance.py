@@ -7,6 +7,7 @@ import pytest
 from support.distorted import bent_set
 from support.grouped_views import ALPHA, LENS, photographed, poses
 from support.scenes import random_flat_set
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.adjustment import view_covariance
@@ -50,7 +51,7 @@ def scores(n_views: int, seeds: range) -> list[bool]:
     return taken
 
 
-@pytest.mark.parametrize("n_views", [3, 12])
+@pytest.mark.parametrize("n_views", slow_but((3,), [3, 12]))
 def test_clean_views_contradict_each_other_in_one_set_of_twenty(n_views: int) -> None:
     # Of 60 sets, 11 and more have a probability of 0.0003.
     assert sum(scores(n_views, range(60))) < 11

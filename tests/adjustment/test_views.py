@@ -64,7 +64,7 @@ def test_rows_in_order_are_not_moved() -> None:
     assert arrange(ordered).order is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.integers(0, 40), min_size=1, max_size=60),
     st.floats(-3, 3),

@@ -31,7 +31,7 @@ def judge(seed: int) -> tuple[str, str]:
     return truth.condition, "good" if found.verdict.word == "good" and off > 5 else ""
 
 
-@pytest.mark.parametrize("seed", slow_but(range(5007, 5010), range(5007, 5014)))
+@pytest.mark.parametrize("seed", slow_but((5007,), range(5007, 5014)))
 def test_every_condition_is_met(seed: int) -> None:
     assert judge(seed)[1] == ""
 

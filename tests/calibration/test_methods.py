@@ -108,8 +108,13 @@ def assert_minimum(scene: Scene, points: Correspondences, type: int, skew: bool)
         assert np.abs(cal.rotations[name] - R).max() < 1e-6
 
 
-@pytest.mark.parametrize("weights", ["none", "sigma", "suu,suv,svv"])
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize(
+    ("weights", "skew"),
+    slow_but(
+        [("suu,suv,svv", True)],
+        itertools.product(("none", "sigma", "suu,suv,svv"), (True, False)),
+    ),
+)
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_a_solid_target_ends_where_scipy_does_from_the_truth(type: int, skew: bool, weights: str) -> None:
     rng = np.random.default_rng(10 * type + skew)
@@ -119,11 +124,9 @@ def test_a_solid_target_ends_where_scipy_does_from_the_truth(type: int, skew: bo
 
 @pytest.mark.parametrize(
     ("weights", "skew"),
-    slow_but(
-        [("suu,suv,svv", True), ("none", False)], itertools.product(("none", "suu,suv,svv"), (True, False))
-    ),
+    slow_but([("suu,suv,svv", True)], itertools.product(("none", "suu,suv,svv"), (True, False))),
 )
-@pytest.mark.parametrize("type", [1, 2, 3, 4])
+@pytest.mark.parametrize("type", slow_but((1, 4), [1, 2, 3, 4]))
 def test_flat_boards_end_where_scipy_does_from_the_truth(type: int, skew: bool, weights: str) -> None:
     rng = np.random.default_rng(10 * type + skew)
     scene = random_flat_set(np.random.default_rng(3), 4, skew, cols=6, rows=5)
@@ -254,7 +257,7 @@ def close(cal: Calibration, scene: Scene, types_std: float = 6.0) -> None:
         assert np.abs(cal.rotations[name] - pose.R).max() < 0.05
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_one_heavy_view_among_small_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     many = np.column_stack([rng.uniform(0, 240, 20_000), rng.uniform(0, 150, 20_000), np.zeros(20_000)])
@@ -263,7 +266,7 @@ def test_one_heavy_view_among_small_ones(seed: int) -> None:
 
 
 @pytest.mark.parametrize("skew", [True, False])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_views_of_all_sizes(seed: int, skew: bool) -> None:
     rng = np.random.default_rng(seed)
     sizes = [4, 5, 54, 9, 30, 6, 17, 54, 4]
@@ -272,14 +275,14 @@ def test_views_of_all_sizes(seed: int, skew: bool) -> None:
 
 
 @pytest.mark.parametrize("type", [1, 2])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_flat_and_folded_views_together(seed: int, type: int) -> None:
     scene = several([BOARD, FOLDED, BOARD, FOLDED[::3]], 0.2, seed)
     close(pinhole(scene.points(), seed=seed, **scene.given(type)), scene)
 
 
-@pytest.mark.parametrize("bow", [1e-5, 1e-3, 0.5, 2.0, 6.0])
-@pytest.mark.parametrize("type", [1, 2, 3])
+@pytest.mark.parametrize("bow", slow_but((0.5, 6.0), [1e-5, 1e-3, 0.5, 2.0, 6.0]))
+@pytest.mark.parametrize("type", slow_but((1,), [1, 2, 3]))
 def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
     bowed = BOARD.copy()
     bowed[:, 2] = bow * (((BOARD[:, 0] - 120) / 120) ** 2 + 0.5 * ((BOARD[:, 1] - 75) / 75) ** 2)
@@ -291,7 +294,7 @@ def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
 
 
 @pytest.mark.parametrize("few", [4, 5])
-@pytest.mark.parametrize("seed", slow_but((0, 1), range(4)))
+@pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_views_with_too_few_points_of_their_own_are_helped_by_others(few: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     corner = FOLDED[rng.permutation(len(FOLDED))[:few]]
@@ -308,7 +311,7 @@ def spread_out(rng: np.random.Generator, n: int, flat: bool) -> Array:
             return np.asarray(world + np.array([120.0, 75.0, 0.0]))
 
 
-@pytest.mark.parametrize("seeds", [range(7), pytest.param(range(7, 20), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 20), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("flat", [True, False], ids=["flat", "solid"])
 def test_a_pose_from_four_points(flat: bool, seeds: range) -> None:
     for seed in seeds:
@@ -322,7 +325,7 @@ def test_a_pose_from_four_points(flat: bool, seeds: range) -> None:
 
 
 @pytest.mark.parametrize("type", [2, 3])
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("skew", slow_but((True,), [True, False]))
 def test_all_points_but_one_in_a_plane(type: int, skew: bool) -> None:
     world = np.concatenate([BOARD, [[100.0, 90.0, -150.0]]])
     for seed in range(3):
@@ -332,7 +335,7 @@ def test_all_points_but_one_in_a_plane(type: int, skew: bool) -> None:
         np.testing.assert_allclose(cal.rotations["v0"], scene.poses["v0"].R, atol=1e-7)
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 5), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 5), marks=pytest.mark.slow)])
 def test_the_fewest_points_fit_to_rounding(seeds: range) -> None:
     for kind, n in FEWEST.items():
         for seed in seeds:

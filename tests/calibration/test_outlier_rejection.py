@@ -31,7 +31,7 @@ def outliers_change_nothing(seed: int, distortion: str = "none") -> None:
     assert len(rows) - 3 <= found.n_rejected <= len(rows)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_a_fifth_of_wrong_pixels_changes_nothing(seed: int) -> None:
     outliers_change_nothing(seed)
 
@@ -52,7 +52,9 @@ def a_wrong_view_changes_nothing(seed: int, kind: str, distortion: str = "none")
     assert farthest(found, clean, but=points.view_names[view]) < 3
 
 
-@pytest.mark.parametrize("kind", MISMATCHES)
+@pytest.mark.parametrize(
+    "kind", slow_but(("shuffled", "another camera", "mirrored", "half shifted by a square"), MISMATCHES)
+)
 def test_a_wrong_view_of_ten_changes_nothing(kind: str) -> None:
     a_wrong_view_changes_nothing(MISMATCHES.index(kind), kind)
 
@@ -64,19 +66,19 @@ def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> 
         a_wrong_view_changes_nothing(seed, MISMATCHES[seed % len(MISMATCHES)], distortion)
 
 
-@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("flat", slow_but((True,), [True, False]))
 def test_good_data_are_calibrated_to_the_last_bit_as_if_nothing_were_looked_for(flat: bool) -> None:
-    for seed in range(3):
+    for seed in range(2):
         _, points, _ = good(300 + seed, flat)
         assert format_calibration(reject(points)) == format_calibration(pinhole(points, skew=False))
 
 
-@pytest.mark.parametrize("type", slow_but((1, 3, 4), (1, 2, 3, 4)))
+@pytest.mark.parametrize("type", slow_but((1, 4), (1, 2, 3, 4)))
 def test_each_problem_type_leaves_wrong_points_out(type: int) -> None:
     scene = table_1()
     points = scene.points(0.2, np.random.default_rng(3))
     bad, rows = with_outliers(scene, points, 0.2, np.random.default_rng(4))
-    found = calibrate(bad, **scene.given(type))
+    found = calibrate(bad, distortion="none", **scene.given(type))
     assert found.rejected.points is not None
     assert set(map(tuple, found.rejected.points.pixels)) <= set(map(tuple, bad.pixels[rows]))
     assert found.n_rejected > 0.95 * len(rows)
@@ -90,7 +92,7 @@ def test_what_is_left_out_is_named_by_line_and_id_and_kept() -> None:
     pixels[[17, 200]] += [[40.0, 0.0], [0.0, -25.0]]
     labels = np.array([f"p{k}" for k in range(len(points))])
     points = replace(points, pixels=pixels, point=labels, lines=np.arange(5, 5 + len(points)), source="p.csv")
-    found = calibrate(points)
+    found = calibrate(points, distortion="none")
     (warning,) = [text for text in found.warnings if "left out" in text]
     assert "2 of 440 points" in warning
     assert "p.csv:22 (p17)" in warning

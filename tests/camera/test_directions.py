@@ -18,7 +18,7 @@ from neurocal_cli.camera.monotonic import largest_angle, unproject_directions
 from neurocal_cli.camera.pinhole import Intrinsics
 
 every_wide_model = pytest.mark.parametrize("model", list(WIDE))
-quick = settings(max_examples=25, deadline=None)
+quick = settings(max_examples=12, deadline=None)
 
 _RANGES = {
     "fisheye": ((-0.1, 0.1), (-0.03, 0.03), (-0.005, 0.005), (-0.001, 0.001)),

@@ -25,7 +25,7 @@ from neurocal_cli.camera.geometry import (
 angle = st.floats(-np.pi, np.pi)
 vector = arrays(float, 3, elements=st.floats(-1, 1))
 matrix = arrays(float, (3, 3), elements=st.floats(-1, 1).map(lambda x: round(x, 6)))
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=30, deadline=None)
 
 
 def about(axis: Array, angle: float) -> Array:
@@ -61,7 +61,7 @@ def test_euler_angles_come_back(R_x: float, R_y: float, R_z: float) -> None:
     assert abs(found[1]) <= np.pi / 2
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(angle, angle, st.floats(0, 17), st.sampled_from([-1, 1]))
 @example(R_x=0.3, R_z=-0.8, digits=11.0, side=1)
 @example(R_x=0.3, R_z=-0.8, digits=17.0, side=-1)

@@ -38,7 +38,7 @@ def without_tangential(model: str, k: Array) -> Array:
 
 
 @given(st.sampled_from(list(SPREAD)), st.integers(0, 2**32 - 1))
-@settings(max_examples=75, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_whatever_a_lens_sees_comes_back(model: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     lens = Distortion(model, without_tangential(model, rng.normal(size=len(SPREAD[model])) * SPREAD[model]))
@@ -83,7 +83,7 @@ def test_what_a_quick_test_calls_monotonic_is() -> None:
     """It looks forward only; the inverse has the last word."""
     rng = np.random.default_rng(3)
     yes = 0
-    for trial in range(2000):
+    for trial in range(600):
         model = ("k1", "k1k2", "k1k2p1p2", "plumb_bob")[trial % 4]
         size = np.array([0.4, 0.3, 0.01, 0.01, 0.3])[: len(coefficient_names(model))]
         lens = Distortion(model, rng.normal(size=len(size)) * size * 10 ** rng.uniform(-0.5, 1))
@@ -91,7 +91,7 @@ def test_what_a_quick_test_calls_monotonic_is() -> None:
         if reaches(lens, farthest):
             yes += 1
             assert np.isfinite(undistort(lens, farthest * np.cos(angle), farthest * np.sin(angle))[0]).all()
-    assert yes > 1000
+    assert yes > 300
 
 
 def test_a_pole_of_the_rational_lens_is_a_fold() -> None:

@@ -11,6 +11,7 @@ import pytest
 from support.command_line import run
 from support.distorted import LENSES, through
 from support.scenes import random_flat_set
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Camera, Intrinsics, calibrate
 from neurocal_cli.camera.distortion import WITH_PRISM, Distortion, coefficient_names
@@ -99,7 +100,7 @@ def errors_over_std(truth: Intrinsics, k: list[float], found: Calibration) -> np
     return np.array([error[name] / found.std[name] for name in found.covariance_names if name in error])
 
 
-@either_model
+@pytest.mark.parametrize("model", slow_but(("thin_prism",), WITH_PRISM))
 def test_it_is_calibrated_without_a_denominator_where_there_is_none(model: str) -> None:
     truth, k, found = seen(model, PLAIN, 1)
     assert found.converged

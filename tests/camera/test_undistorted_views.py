@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.command_line import run
+from support.slow_cases import slow_but
 from support.wide_cameras import SIZE, WIDE_LENSES, wide_camera, wide_points
 
 from neurocal_cli import Correspondences, undistort_image, undistort_points
@@ -34,7 +35,7 @@ from neurocal_cli.observations.undistorted_points import shown
 MODELS = list(WIDE_LENSES)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     shape=st.sampled_from(PANORAMAS),
     f=st.floats(20, 3000),
@@ -160,7 +161,7 @@ def test_points_behind_a_plane_are_named_and_a_cylinder_keeps_them() -> None:
         undistort_points(points, cam, 0.5, to="cylinder")
 
 
-@pytest.mark.parametrize("shape", UNDISTORTED)
+@pytest.mark.parametrize("shape", slow_but(("cylinder",), UNDISTORTED))
 def test_an_image_and_its_points_agree(shape: str) -> None:
     """A dot is found where its pixel is moved to, also behind the camera; what sees nothing is black."""
     size = SIZE[0] // 2, SIZE[1] // 2

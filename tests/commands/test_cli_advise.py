@@ -110,7 +110,7 @@ def test_the_uncertainty_is_that_of_many_calibrations() -> None:
 
 def test_each_view_helps_and_shows_the_whole_target() -> None:
     calibration = learnt(3)
-    advice = advise(calibration, 4)
+    advice = advise(calibration, 2)
     assert all(np.diff([advice.before, *advice.after]) < 0)
     world = np.unique(calibration.points.world, axis=0)
     for view in advice.views:

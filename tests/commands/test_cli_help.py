@@ -44,35 +44,33 @@ def test_each_option_has_one_sentence_of_help(words: list[str], command: click.C
 
 
 @pytest.mark.parametrize(
-    ("words", "command", "parameter"),
+    ("words", "command"),
     [
-        pytest.param(words, command, parameter, id=" ".join(["neurocal", *words, str(parameter.name)]))
+        pytest.param(words, command, id=" ".join(["neurocal", *words]))
         for words, command in commands()
         if not isinstance(command, click.Group)
-        for parameter in command.params
-        if not (isinstance(parameter, click.Option) and parameter.is_flag)
     ],
 )
-def test_a_value_that_is_empty_is_wrong_use(
-    words: list[str], command: click.Command, parameter: click.Parameter, tmp_path: Path
-) -> None:
-    typed: list[object] = []
-    for one in command.params:
-        usual = one.type.choices[0] if isinstance(one.type, click.Choice) else tmp_path / "none.pdf"
-        value = "" if one is parameter else usual
-        if isinstance(one, click.Argument):
-            typed += [value] * max(one.nargs, 1)
-        elif one is parameter or one.required:
-            typed += [one.opts[0], *([value] * one.nargs)]
-    board = (
-        ["--cols", 9, "--rows", 6, "--square", 25] if words == ["detect"] and parameter.name == "unit" else []
-    )
-    result = run(*words, *board, *typed)
-    assert result.exit_code == 2
-    assert result.stderr.count("Error: ") == 1
-    named = parameter.name if isinstance(parameter, click.Argument) else parameter.opts[0].strip("-")
-    assert named in result.stderr.lower() or str(parameter.metavar) in result.stderr
-    assert list(tmp_path.iterdir()) == []
+def test_a_value_that_is_empty_is_wrong_use(words: list[str], command: click.Command, tmp_path: Path) -> None:
+    for parameter in command.params:
+        if isinstance(parameter, click.Option) and parameter.is_flag:
+            continue
+        typed: list[object] = []
+        for one in command.params:
+            usual = one.type.choices[0] if isinstance(one.type, click.Choice) else tmp_path / "none.pdf"
+            value = "" if one is parameter else usual
+            if isinstance(one, click.Argument):
+                typed += [value] * max(one.nargs, 1)
+            elif one is parameter or one.required:
+                typed += [one.opts[0], *([value] * one.nargs)]
+        if words == ["detect"] and parameter.name == "unit":
+            typed = ["--cols", 9, "--rows", 6, "--square", 25, *typed]
+        result = run(*words, *typed)
+        assert result.exit_code == 2, parameter.name
+        assert result.stderr.count("Error: ") == 1, parameter.name
+        named = parameter.name if isinstance(parameter, click.Argument) else parameter.opts[0].strip("-")
+        assert named in result.stderr.lower() or str(parameter.metavar) in result.stderr
+        assert list(tmp_path.iterdir()) == [], parameter.name
 
 
 def examples(command: click.Command) -> str:

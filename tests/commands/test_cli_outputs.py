@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from support.command_line import run
 from support.places import SAMPLES
+from support.slow_cases import slow_but
 
 from neurocal_cli.files.writing import Outputs
 
@@ -83,11 +84,14 @@ def test_an_input_is_never_written_over(
 
 @pytest.mark.parametrize(
     ("words", "read"),
-    [
-        (("calibrate", "-", "-o", "flat.csv"), "flat.csv"),
-        (("undistort", "camera.yaml", "-", "-o", "flat.csv"), "flat.csv"),
-        (("undistort", "-", "flat.csv", "-o", "camera.yaml"), "camera.yaml"),
-    ],
+    slow_but(
+        [(("calibrate", "-", "-o", "flat.csv"), "flat.csv")],
+        [
+            (("calibrate", "-", "-o", "flat.csv"), "flat.csv"),
+            (("undistort", "camera.yaml", "-", "-o", "flat.csv"), "flat.csv"),
+            (("undistort", "-", "flat.csv", "-o", "camera.yaml"), "camera.yaml"),
+        ],
+    ),
 )
 def test_nor_is_one_that_the_shell_makes_standard_input(
     made: Path, tmp_path: Path, words: tuple[str, ...], read: str
@@ -110,7 +114,11 @@ def test_closed_standard_output_is_said_to_be_closed(made: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"]
+    "words",
+    slow_but(
+        ("evaluate camera camera.yaml --json", "--help"),
+        ["evaluate camera camera.yaml", "evaluate camera camera.yaml --json", "--help", "convert --help"],
+    ),
 )
 def test_nor_is_what_is_only_printed_lost_without_a_word(made: Path, words: str) -> None:
     shell = f"{sys.executable} -m neurocal_cli {words} >&-"

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.command_line import run
 from support.places import SAMPLES
+from support.slow_cases import slow_but
 
 from neurocal_cli import Board, read_image
 from neurocal_cli.commands import streams
@@ -88,7 +89,7 @@ def test_images_of_different_sizes_are_named_before_the_work(tmp_path: Path) -> 
     assert result.stderr.startswith("note: the images have 2 sizes (2 of 40 x 30 px, 2 of 80 x 60 px)")
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("shell", slow_but(("bash",), ["bash", "zsh", "fish"]))
 def test_the_shell_can_complete(shell: str) -> None:
     def completed(**environment: str) -> str:
         return subprocess.run(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from support.places import SAMPLES
+from support.slow_cases import slow_but
 
 
 def descendants(pid: int) -> set[int]:
@@ -36,7 +37,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no /proc to see processes in")
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", slow_but((signal.SIGKILL,), [signal.SIGTERM, signal.SIGKILL]))
 def test_workers_end_with_a_detection_that_is_killed(tmp_path: Path, how: signal.Signals) -> None:
     picture = (SAMPLES / "board01.png").read_bytes()
     for k in range(200):

@@ -55,12 +55,10 @@ def is_in_an_outer_row(name: str, cols: int, rows: int) -> bool:
     return int(r) in (0, rows - 1) if kind == "h" else int(c) in (0, cols - 1)
 
 
-@pytest.mark.parametrize(
-    "name", slow_but(("base", "strongly distorted"), ("base", "strongly distorted", "k1 -0.3", "gamma 2.2"))
-)
+@pytest.mark.parametrize("name", slow_but(("base",), ("base", "strongly distorted", "k1 -0.3", "gamma 2.2")))
 def test_outermost_midpoints_are_measured_along_their_edges(name: str) -> None:
     squares: list[Array] = []
-    for seed in range(4):
+    for seed in range(3):
         scene, one = seen(seed, name)
         rows, (plane,) = outermost(one), scene.board.planes
         whole = 2 * (plane.cols - 1) + 2 * (plane.rows - 1)
@@ -70,7 +68,7 @@ def test_outermost_midpoints_are_measured_along_their_edges(name: str) -> None:
         u, v = (one.pixels[rows] - truth).T
         suu, suv, svv = one.covariance[rows].T
         squares.append((svv * u * u - 2 * suv * u * v + suu * v * v) / (suu * svv - suv**2))
-    # 104 points; at the border of a strong lens the variances are a third too large.
+    # 78 points; at the border of a strong lens the variances are a third too large.
     least = 0.5 if name == "strongly distorted" else 0.7
     assert least < np.concatenate(squares).mean() / 2 < 1.4
     assert np.concatenate(squares).max() < 25

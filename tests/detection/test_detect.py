@@ -43,7 +43,7 @@ def opposite(name: str) -> str:
     return f"{kind}:{last[0] - int(c)}:{last[1] - int(r)}"
 
 
-@pytest.mark.parametrize("name", slow_but(("base", "two planes"), ("base", "two planes", "three planes")))
+@pytest.mark.parametrize("name", slow_but(("two planes",), ("base", "two planes", "three planes")))
 def test_points_are_where_the_ids_say(name: str) -> None:
     for seed in range(2):
         found, seen = detected(name, seed)

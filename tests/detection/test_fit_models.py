@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.maps import some_map
+from support.slow_cases import slow_but
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import ProfileShape
@@ -107,7 +108,7 @@ def some_edges() -> tuple[EdgePixels, Array, ProfileShape]:
     return data, values, shape
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.01, 0.4, np.pi / 4])
+@pytest.mark.parametrize("angle", slow_but((0.4,), [0.0, 0.01, 0.4, np.pi / 4]))
 @pytest.mark.parametrize("psf", [0.05, 0.2, 0.34])
 def test_box_profile_is_that_of_a_pixel(angle: float, psf: float) -> None:
     normal = np.array([[np.cos(angle), np.sin(angle)]])
@@ -173,8 +174,8 @@ def test_vertex_model_has_the_derivatives_it_says(sharp: bool) -> None:
         np.testing.assert_allclose(linear.rows[:, 1 + k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
-@pytest.mark.parametrize("motion", [0.0, 0.7])
-@pytest.mark.parametrize("angle", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("motion", slow_but((0.7,), [0.0, 0.7]))
+@pytest.mark.parametrize("angle", slow_but((0.3, 1.0), [0.3, 0.6, 1.0]))
 def test_blurred_oblique_cross_is_as_modelled(angle: float, motion: float) -> None:
     """sign(a . x) sign(b . x) blurred by a Gaussian, against a sum over many random points."""
     rng = np.random.default_rng(3)

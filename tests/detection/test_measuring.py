@@ -65,9 +65,9 @@ GOOD = (
 
 @pytest.mark.parametrize("name", slow_but(("base",), ("base", "tilt 65", "k1 -0.3")))
 def test_midpoints_reach_the_bound(name: str) -> None:
-    found_errors = errors(name, range(2))
+    found_errors = errors(name, range(1))
     assert found_errors.ratio < 1.2
-    assert 0.7 < found_errors.normalised < 1.4  # two pictures: wider than for eight
+    assert 0.7 < found_errors.normalised < 1.4  # one picture: wider than for eight
     assert found_errors.kept == 1
     assert found_errors.rms < 0.0036
 
@@ -80,7 +80,7 @@ def test_edges_sharper_than_a_pixel_reach_the_bound(points: Literal["midpoints",
 
 
 def test_vertices_reach_the_bound() -> None:
-    found_errors = errors("base", range(2), "vertices")
+    found_errors = errors("base", range(1), "vertices")
     assert found_errors.ratio < 1.2
     assert 0.7 < found_errors.normalised < 1.4
     assert found_errors.kept == 1
@@ -266,7 +266,7 @@ def largest_grid(path: Path) -> tuple[np.ndarray, Grid]:
 def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealFiles, points: str) -> None:
     cv2 = pytest.importorskip("cv2")
     places_3d, pixels = [], []
-    for path in real_files("opencv_stereo/left*.jpg"):
+    for path in real_files("opencv_stereo/left0[1-6].jpg"):
         image, grid = largest_grid(path)
         measured = measure(image, grid, points)  # type: ignore[arg-type]
         half = np.array([[0.5, 0], [0, 0.5], [0, 0]])[measured.kind]

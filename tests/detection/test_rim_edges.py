@@ -11,6 +11,7 @@ import pytest
 from support.command_line import run
 from support.real_data import RealFiles
 from support.rendered import condition, rendered
+from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
 from neurocal_cli.detection.detect import Detection, detect_points, gather
@@ -63,7 +64,7 @@ def test_edges_to_the_rim_are_where_the_ids_say() -> None:
     assert 0.8 < rms < 1.2  # 120 errors
 
 
-@pytest.mark.parametrize("reach", [0.4, 0.7])
+@pytest.mark.parametrize("reach", slow_but((0.7,), [0.4, 0.7]))
 def test_cut_outer_squares_are_left_out(reach: float) -> None:
     _, found = seen(1, reach=reach)
     assert not any(is_at_rim(name) for name in found.ids)

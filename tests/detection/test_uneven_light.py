@@ -40,52 +40,54 @@ def together(
 
 @pytest.mark.parametrize("ratio", slow_but((4.0,), (4.0, 6.0)))
 def test_vertices_are_measured_through_strong_vignetting(ratio: float) -> None:
-    found = together(vignetted(ratio), "vertices", range(3))
+    found = together(vignetted(ratio), "vertices", range(2))
     assert found.kept > 0.97  # 0.92 and 0.75
     assert found.z < 1.5  # 2.3 and 2.6
 
 
 def test_vertices_are_measured_beside_a_lamp() -> None:
-    found = together(beside_a_lamp(8.0), "vertices", range(3))
+    found = together(beside_a_lamp(8.0), "vertices", range(2))
     assert found.kept > 0.85  # 0.76
     assert found.z < 1.2  # 1.8
     assert found.rms < 0.025  # 0.037
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 @pytest.mark.parametrize("depth", slow_but((0.3,), (0.3, 0.5)))
 def test_both_sides_of_a_deep_shadow_are_measured(depth: float, points: Points) -> None:
-    found = together(half_in_shadow(depth, 4.0), points, range(3))
+    found = together(half_in_shadow(depth, 4.0), points, range(2))
     assert found.kept > 0.8  # 0.43: the whole dark side was lost, or measured wrongly
     assert found.rms < 0.035  # 0.13
     assert found.z < 2.0
     assert np.abs(found.error).max() < 0.2
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 def test_soft_borders_of_shadows_do_not_displace_points(points: Points) -> None:
-    found = together(half_in_shadow(0.4, 20.0), points, range(3))
+    found = together(half_in_shadow(0.4, 20.0), points, range(2))
     assert found.kept > 0.82  # 0.76 and 0.74
     assert found.rms < 0.03  # 0.025 and 0.061
     assert found.z < 1.5  # 1.5 and 3.2
 
 
-@pytest.mark.parametrize("effect", [beside_a_lamp(4.0), half_in_shadow(0.4, 6.0)])
+@pytest.mark.parametrize(
+    "effect", [pytest.param(beside_a_lamp(4.0), marks=pytest.mark.slow), half_in_shadow(0.4, 6.0)]
+)
 def test_hidden_edges_are_left_out_in_uneven_light(effect: Effect) -> None:
-    found = together(effect, "midpoints", range(6), hidden=True)
+    found = together(effect, "midpoints", range(4), hidden=True)
     assert found.kept > 0.84  # 0.74 in the shadow
-    assert found.hidden <= 3  # 5 in the shadow; the occluder only just touches the strip around them
+    assert found.hidden <= 2  # the occluder only just touches the strip around them
     assert np.abs(found.error).max() < 0.1  # 0.25
 
 
 def test_vertices_are_measured_on_mottled_paper() -> None:
-    found = together(mottled(15.0, 0.05), "vertices", range(3))
+    found = together(mottled(15.0, 0.05), "vertices", range(2))
     assert found.kept > 0.97  # 0.53
     assert found.rms < 0.008  # 0.020
     assert found.z < 1.2  # 2.9
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 def test_a_board_partly_out_of_focus_is_measured(points: Points) -> None:
     found = together(defocused(4.0), points, range(2))
     assert found.kept > 0.98  # 0.84 and 0.70
@@ -93,7 +95,7 @@ def test_a_board_partly_out_of_focus_is_measured(points: Points) -> None:
     assert found.z < 1.3  # 0.9 and 2.1
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 @pytest.mark.parametrize("length", slow_but((4.0,), (2.0, 4.0, 6.0)))
 def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
     length: float, points: Points
@@ -107,13 +109,13 @@ def test_motion_blur_of_a_camera_that_is_not_linear_does_not_displace_edges(
 def test_vertices_in_sharpened_images_of_cameras_that_are_not_linear_know_their_errors() -> None:
     found = [
         measured_under(moved(0.0), seed, "vertices", board(seed, response=2.2), sharpened)
-        for seed in range(3)
+        for seed in range(2)
     ]
     assert max(one.rms for one in found) < 0.0055  # 0.0057 without the response that displaces the edges
     assert np.mean([one.z for one in found]) > 0.6  # 0.51
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 def test_reflections_do_not_displace_edges(points: Points) -> None:
     found = together(hazy(0.4, 90.0), points, range(2), response=2.2)
     assert found.kept > 0.9
@@ -121,7 +123,7 @@ def test_reflections_do_not_displace_edges(points: Points) -> None:
     assert 0.5 < found.z < 1.4  # 0.27 for vertices
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("vertices",), ("midpoints", "vertices")))
 def test_tone_mapping_that_changes_over_the_board_does_not_displace_edges(points: Points) -> None:
     found = together(toned(2.2), points, range(2))
     assert found.kept > 0.9
@@ -129,7 +131,7 @@ def test_tone_mapping_that_changes_over_the_board_does_not_displace_edges(points
     assert 0.5 < found.z < 1.4  # 0.1 for vertices
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("midpoints",), ("midpoints", "vertices")))
 def test_a_camera_that_is_not_linear_may_be_partly_out_of_focus(points: Points) -> None:
     found = together(defocused(4.0), points, range(2), response=2.2)
     assert found.kept > 0.97

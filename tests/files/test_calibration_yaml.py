@@ -194,7 +194,7 @@ def all_files_are_long():
         yield
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cal=calibrations())
 def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_long, cal):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -206,7 +206,7 @@ def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_lo
     assert format_calibration(cal, by_rows=True).count("format: 1") == 1
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(cal=calibrations(), style=st.sampled_from([None, True, False]), slow=st.booleans())
 def test_a_file_written_anew_by_another_program_reads_the_same(tmp_path_factory, cal, style, slow):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -436,7 +436,7 @@ def refused_or_read(path, content):
     assert message.isprintable()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(junk=st.binary(max_size=60) | st.text(max_size=60).map(lambda s: s.encode("utf-8", "replace")))
 def test_random_bytes_are_refused_in_one_line(tmp_path_factory, junk):
     refused_or_read(tmp_path_factory.getbasetemp() / "cal.yaml", junk)
@@ -463,7 +463,7 @@ def of_four_points():
     return format_calibration(replace(cal, points=cal.points.select(slice(0, 4))))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10**6), junk=TREES)
 def test_a_value_of_another_type_anywhere_is_refused_in_one_line(tmp_path_factory, seed, junk):
     chance = random.Random(seed)

@@ -221,7 +221,7 @@ def test_poses_need_a_neurocal_file(read):
 WHOLE = [OPENCV_YAML, OPENCV_XML, ROS, json.dumps({"K": FLAT})]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     text=st.sampled_from(WHOLE),
     start=st.integers(0, 700),

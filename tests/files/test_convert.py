@@ -245,7 +245,7 @@ def test_what_is_not_known_is_refused_and_not_guessed(text: str, tmp_path: Path)
     assert str(caught.value).isprintable()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     target=st.sampled_from(list(FORMATS)),
     start=st.floats(0, 1),

@@ -310,7 +310,7 @@ def test_data_that_a_format_of_points_lacks_are_named(target: str, lost: str, tm
     assert f"note: a file of points of {target} has no place for {lost}\n" in result.stderr
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     target=st.sampled_from(["opencv", "matlab", "json", "npz", "mrcal"]),
     start=st.floats(0, 1),

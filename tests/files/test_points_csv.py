@@ -344,7 +344,7 @@ def correspondences(draw):
     )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(points=correspondences())
 def test_points_come_back_from_csv_to_the_last_bit(tmp_path_factory, points):
     path = tmp_path_factory.getbasetemp() / "points.csv"
@@ -381,7 +381,7 @@ def tables(draw):
     return "".join(lines).encode()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(data=tables())
 def test_the_fast_reader_agrees_with_the_careful_one_or_steps_aside(data):
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -416,7 +416,7 @@ def test_labels_longer_than_those_at_both_ends_are_not_cut_off():
     assert fast.labels["view"][8000] == "a-rather-long-name"
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     data=tables() | st.binary(max_size=80) | st.text(max_size=60).map(lambda s: s.encode("utf-8", "replace"))
 )

@@ -266,7 +266,7 @@ def test_table_1_from_ten_random_starts_within_the_papers_errors(method: Method)
     assert intrinsic_errors(scene, trained.product).max() < PAPER_ERROR / 100
 
 
-@pytest.mark.parametrize("seed", slow_but((0, 2), range(3)))
+@pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_noisy_scenes_reach_the_optimum(seed: int, method: Method) -> None:
     scene = random_scene(seed, points=80)
     trained = train_backprop(scene.task(range(5)), BackpropOptions(method=method))
@@ -376,7 +376,7 @@ def test_the_scale_of_the_patterns_weights_does_not_matter(method: Method) -> No
 
 
 @pytest.mark.parametrize("problem", FREE)
-@pytest.mark.parametrize("beta", [0.0, 1.0])
+@pytest.mark.parametrize("beta", slow_but((1.0,), [0.0, 1.0]))
 def test_fixed_weights_keep_every_bit(problem: int, beta: float, method: Method) -> None:
     task, a = table_1().constrained(problem)
     # Whatever they are: -0.0 must not become 0.0.

@@ -17,7 +17,9 @@ FLAT = SAMPLES / "flat.csv"
 
 @pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.006)])
 def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> None:
-    found = _AtMinimum(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
+    found = _AtMinimum(
+        calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep", target="given")
+    )
     state, views = found.state, found.views
     own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
     free = np.arange(5 + len(state.k)) < 5

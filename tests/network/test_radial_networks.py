@@ -21,7 +21,7 @@ STRONG = (552, 629, 1217, 2316)
 HARD = {"case262": (440.7, 3), "case310": (724.9, 3), "case628": (1138.9, 3), "case842": (2255.3, 3)}
 
 
-@pytest.mark.parametrize("seed", STRONG[:2])
+@pytest.mark.parametrize("seed", STRONG[:1])
 def test_the_start_is_near_the_truth_where_a_pinhole_is_not(seed: int) -> None:
     points, truth = scene(seed)
     found = radial_start(problem_for(points, 1), options_for("lm", 20, 0))
@@ -51,7 +51,10 @@ def test_boards_under_a_strong_lens_are_not_called_parallel(name: str, real_file
 @pytest.mark.parametrize("distortion", slow_but(("k1k2",), ("k1k2", "k1k2p1p2", "plumb_bob", "rational")))
 def test_a_model_never_ends_above_a_simpler_one(distortion: str, real_files: RealFiles) -> None:
     points = read_points(real_files("wrong_data/case842.csv"))
-    simple, more = (calibrate(points, distortion=model) for model in ("k1", distortion))
+    simple, more = (
+        calibrate(points, distortion=model, skew=False, target="given", outliers="keep")
+        for model in ("k1", distortion)
+    )
     assert more.rmse_px <= simple.rmse_px * (1 + 1e-6)
 
 
@@ -71,7 +74,7 @@ def test_parallel_boards_are_refused_for_what_they_are() -> None:
         calibrate(points)
 
 
-@pytest.mark.parametrize("seed", [6004, 6028])
+@pytest.mark.parametrize("seed", slow_but((6028,), (6004, 6028)))
 def test_a_left_handed_target_is_called_mirrored_under_a_strong_lens_too(seed: int) -> None:
     points, _ = scene(seed)
     mirrored = Correspondences(points.world * [1, 1, -1], points.pixels, points.view, points.image_size)

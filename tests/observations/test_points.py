@@ -24,7 +24,7 @@ def with_value(array: Array, value: float) -> Array:
     return changed
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.sampled_from(["b", "a", "c", "left 10", "left 9"]), min_size=1, max_size=20))
 def test_views_come_in_order_of_first_appearance(labels: list[str]) -> None:
     n = len(labels)

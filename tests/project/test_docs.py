@@ -127,18 +127,18 @@ def test_each_public_name_is_in_the_python_reference() -> None:
     ) == set(neurocal_cli.__all__)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_links_lead_somewhere(page: Path) -> None:
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#\s]+)", text):
-        assert target.startswith("http") or (page.parent / target).exists(), target
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)#\s]+)", text):
+            assert target.startswith("http") or (page.parent / target).exists(), (name(page), target)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_files_of_the_project_that_a_page_names_are_there(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    for path in re.findall(r"\b((?:neurocal_cli|tests|docs/tools)/[\w/]+\.py)", text):
-        assert (ROOT / path).exists(), path
+def test_files_of_the_project_that_a_page_names_are_there() -> None:
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for path in re.findall(r"\b((?:neurocal_cli|tests|docs/tools)/[\w/]+\.py)", text):
+            assert (ROOT / path).exists(), (name(page), path)
 
 
 def test_the_architecture_page_is_of_this_package() -> None:

@@ -81,7 +81,7 @@ def shift(picture: Array, model: Array, gradient: tuple[Array, Array]) -> Array:
 
 @pytest.mark.parametrize(
     ("psf", "roll"),
-    slow_but(((0.4, 0.0), (2.0, 0.3)), itertools.product((0.4, 0.8, 2.0), (0.0, 0.3, np.pi / 4, 1.2))),
+    slow_but(((2.0, 0.3),), itertools.product((0.4, 0.8, 2.0), (0.0, 0.3, np.pi / 4, 1.2))),
 )
 def test_a_board_that_faces_the_camera_is_a_product_of_error_functions(psf: float, roll: float) -> None:
     middle = (79.37, 60.21)
@@ -131,7 +131,7 @@ def straight_edge(distance: Array, normal: Array, psf: float) -> Array:
     return np.asarray(np.einsum("...ij,i,j->...", response, 0.5 * WEIGHTS, 0.5 * WEIGHTS))
 
 
-@pytest.mark.parametrize("tilt", [30.0, 60.0, 72.0])
+@pytest.mark.parametrize("tilt", slow_but((60.0,), [30.0, 60.0, 72.0]))
 def test_edges_of_a_tilted_board_are_straight_edges_between_its_vertices(tilt: float) -> None:
     scene = facing(34.0, 0.0, (80.0, 60.0), 0.8)
     scene = replace(scene, camera=replace(scene.camera, image_size=(320, 240)), psf=0.8)
@@ -171,7 +171,7 @@ def undistorted(camera: Camera, pixels: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 40) -> Array:
+def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 30) -> Array:
     """A window of the picture in [0, 1] from dense samples, shaken so that no line hides between them."""
     rng = np.random.default_rng(0)
     pad = int(np.ceil(6 * scene.psf)) + 1
@@ -265,7 +265,7 @@ def test_two_planes_side_by_side_are_seamless() -> None:
         assert np.abs(difference).max() / 65535 < 1e-4
 
 
-@pytest.mark.parametrize("psf", [0.0, 0.8, 3.0])
+@pytest.mark.parametrize("psf", slow_but((0.0, 3.0), [0.0, 0.8, 3.0]))
 def test_light_is_neither_made_nor_lost(psf: float) -> None:
     scene = facing(11.7, 0.4, (80.0, 60.0), psf, background=Background(0.0))
     target, square = scene.targets[0], 11.7**2

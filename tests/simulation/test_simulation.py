@@ -110,7 +110,7 @@ def test_the_number_of_processes_changes_nothing() -> None:
 def test_several_views_through_a_lens() -> None:
     poses = random_poses(LENS, BOARD, 5, np.random.default_rng(0))
     scene = scene_of(LENS, BOARD, poses)
-    study = study_noise(scene, [0.1], 12, ("neuro", "nonlinear", "linear", "opencv"), seed=0)
+    study = study_noise(scene, [0.1], 6, ("neuro", "nonlinear", "linear", "opencv"), seed=0)
     assert study.names == (
         "alpha_u",
         "alpha_v",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -155,8 +156,12 @@ class Found:
 
 def board(seed: int, hidden: bool = False, response: float = 1.0) -> Scene:
     """A board that fills the image; two discs hide parts of it if wanted."""
-    sensor = Sensor(response, read_noise=2.0)
-    scene = replace(single(RECIPE, np.random.default_rng(seed)), sensor=sensor)
+    return replace(_placed(seed, hidden), sensor=Sensor(response, read_noise=2.0))
+
+
+@cache
+def _placed(seed: int, hidden: bool) -> Scene:
+    scene = single(RECIPE, np.random.default_rng(seed))
     if not hidden:
         return scene
     rng = np.random.default_rng([seed, 5])
@@ -166,6 +171,11 @@ def board(seed: int, hidden: bool = False, response: float = 1.0) -> Scene:
         for u, v in midpoints[rng.choice(len(midpoints), 2, replace=False)]
     ]
     return replace(scene, occluders=tuple(discs))
+
+
+@lru_cache(16)
+def _light_of(scene: Scene) -> Array:
+    return image_light(scene, 4)
 
 
 def sharpened(image: Image) -> Image:
@@ -181,7 +191,9 @@ def measured_under(
     """Measure a board under an effect; its vertices are found to half a pixel."""
     plane = ground_truth(scene).planes[0]
     rng = np.random.default_rng([seed, 11])
-    image = digitised(scene.sensor, effect(image_light(scene, 4), plane.vertices, rng), rng)
+    image = digitised(
+        scene.sensor, effect(_light_of(replace(scene, sensor=Sensor())), plane.vertices, rng), rng
+    )
     if processed is not None:
         image = processed(image)
     grid, mirrored = found(plane, seed, hidden=True)

@@ -69,12 +69,10 @@ def test_columns_of_the_lens_are_those_of_differences(model: str) -> None:
         assert normal[:, column, -1] == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize(
-    "model", slow_but(("plumb_bob", "fisheye"), [name for name in LENSES if name != "rational"])
-)
+@pytest.mark.parametrize("model", slow_but(("plumb_bob",), [name for name in LENSES if name != "rational"]))
 def test_noise_free_views_give_the_lens_back(model: str) -> None:
     scene, points = flat_points(model)
-    calibration = calibrate(points, distortion=model)
+    calibration = calibrate(points, distortion=model, target="given")
     assert calibration.converged
     assert calibration.rmse_px < 1e-7
     truth = scene.intrinsics.values()

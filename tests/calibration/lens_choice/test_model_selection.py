@@ -62,7 +62,7 @@ def test_the_choice_is_right_for_200_lenses(model: str) -> None:
     assert everywhere >= {"plumb_bob": 0.925, "fisheye": 0.96}.get(model, 0.975)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", slow_but(range(3), range(12)))
 def test_no_lens_is_found_where_there_is_none_in_one_view(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene = random_solid(rng, 1, False)
@@ -146,7 +146,7 @@ def test_where_only_a_fisheye_is_sound_an_ordinary_lens_that_predicts_as_well_is
     assert found.distortion_model == truth.model == "k1k2"
 
 
-@pytest.mark.parametrize("seed", slow_but((7003, 7024), range(7000, 7100)))
+@pytest.mark.parametrize("seed", slow_but((7024,), range(7000, 7100)))
 def test_a_rational_model_that_promises_little_would_not_be_chosen(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

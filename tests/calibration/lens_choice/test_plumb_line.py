@@ -160,8 +160,15 @@ def test_distorted_lines_have_no_error() -> None:
 # The distortion from lines alone
 
 
-@pytest.mark.parametrize("centre", [(499.5, 399.5), (535.0, 370.0), (450.0, 450.0)])
-@pytest.mark.parametrize("k", [[-0.4, 0.2], [-0.2, 0.0], [0.3, -0.1]])
+@pytest.mark.parametrize(
+    ("k", "centre"),
+    slow_but(
+        [([-0.4, 0.2], (535.0, 370.0)), ([0.3, -0.1], (450.0, 450.0))],
+        itertools.product(
+            ([-0.4, 0.2], [-0.2, 0.0], [0.3, -0.1]), ((499.5, 399.5), (535.0, 370.0), (450.0, 450.0))
+        ),
+    ),
+)
 def test_lines_tell_centre_and_lens_without_a_camera(k: list[float], centre: tuple[float, float]) -> None:
     scene = lens_scene(k, centre)
     scene = replace(scene, intrinsics=replace(scene.intrinsics, alpha_v=900.0))
@@ -204,7 +211,7 @@ def test_the_centre_is_not_biased(trials: int) -> None:
 @pytest.mark.parametrize(
     ("type", "k"),
     slow_but(
-        [(1, [-0.3, 0.1]), (2, [0.2, -0.05]), (4, [0.0, 0.0])],
+        [(1, [-0.3, 0.1]), (4, [0.0, 0.0])],
         itertools.product((1, 2, 4), ([-0.3, 0.1], [0.2, -0.05], [0.0, 0.0])),
     ),
 )
@@ -223,9 +230,7 @@ def test_a_folded_target_without_noise_gives_lens_and_camera(type: int, k: list[
 WIDE = [[-0.35, 0.12], [-0.35, 0.08], [-0.5, 0.2], [-0.246, 0.036], [0.3, 0.0]]
 
 
-@pytest.mark.parametrize(
-    ("k", "widest"), slow_but([(WIDE[2], 0.6), (WIDE[3], 1.3)], itertools.product(WIDE, (0.6, 1.3)))
-)
+@pytest.mark.parametrize(("k", "widest"), slow_but([(WIDE[2], 0.6)], itertools.product(WIDE, (0.6, 1.3))))
 def test_wide_lenses_come_close_to_the_joint_fit(k: list[float], widest: float) -> None:
     flat = random_flat_set(np.random.default_rng(7), 14, False, cols=13, rows=10, f=400, width=1000)
     straight = np.column_stack([flat.pixels, np.ones(len(flat.pixels))]) @ np.linalg.inv(flat.intrinsics.A).T
@@ -325,7 +330,7 @@ def test_std_is_true_and_nothing_biased_for_many_lenses(k: list[float], centre: 
     check_statistics(k, centre, 400, 0.1 - 1.75 / np.sqrt(2 * 400))
 
 
-@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("flat", slow_but((True,), (True, False)))
 def test_wrong_points_are_set_aside_before_lines_tell_the_lens(flat: bool) -> None:
     rng = np.random.default_rng(3)
     scene = lens_scene([-0.25, 0.1], views=6) if flat else table_1()
@@ -383,7 +388,8 @@ def test_zhangs_views_are_nearly_as_good_as_with_a_joint_fit(zhang: Corresponden
 @pytest.mark.parametrize(
     ("pattern", "cols", "rows", "square"),
     [
-        ("opencv_stereo/left[0-9]*.jpg", 9, 6, 25.0),
+        ("opencv_stereo/left0[1-5].jpg", 9, 6, 25.0),
+        pytest.param("opencv_stereo/left[0-9]*.jpg", 9, 6, 25.0, marks=pytest.mark.slow),
         pytest.param("opencv_stereo/right[0-9]*.jpg", 9, 6, 25.0, marks=pytest.mark.slow),
         pytest.param("sony_chess/frame*.jpg", 4, 6, 30.0, marks=pytest.mark.slow),
     ],
@@ -444,7 +450,7 @@ def test_type_3_has_its_lens() -> None:
         calibrate(scene.points(), distortion="plumb-line", **scene.given(3))
 
 
-@pytest.mark.parametrize("seed", slow_but((0, 1), range(4)))
+@pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_nonsense_is_refused_or_warned_of(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = table_1().points() if seed % 2 else lens_scene([-0.2, 0.1], views=3).points()

@@ -13,6 +13,7 @@ from support.command_line import run
 from support.places import SAMPLES
 from support.real_data import RealFiles
 from support.rigs import random_rig, sides
+from support.slow_cases import slow_but
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 
 from neurocal_cli import calibrate, calibrate_stereo, fit_rig, read_points, triangulate
@@ -133,7 +134,7 @@ def test_what_is_wrong_with_a_rig_is_named_and_its_baseline_is_right(
         assert abs(rig.left.intrinsics.alpha_u - 1000) < 4 * rig.left.std["alpha_u"]
 
 
-@pytest.mark.parametrize("name", ["bump01", "bump05"])
+@pytest.mark.parametrize("name", slow_but(("bump01",), ["bump01", "bump05"]))
 def test_a_bump_half_way_is_named_and_nothing_else_suffers(real_files: RealFiles, name: str) -> None:
     rig = shared(real_files, name)
     assert rig.verdict is not None

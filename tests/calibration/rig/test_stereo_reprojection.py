@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.rigs import RigScene, all_residuals, random_rig
+from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
 from neurocal_cli.calibration.rig.adjust import RigProblem, RigState, adjust_rig, rig_problem
@@ -24,7 +25,7 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
     return scene, problem, problem.start(find_consensus(problem).rig)
 
 
-@pytest.mark.parametrize("lens", ["none", "k1k2"])
+@pytest.mark.parametrize("lens", slow_but(("k1k2",), ["none", "k1k2"]))
 def test_derivatives_are_those_of_finite_differences(lens: str) -> None:
     _, problem, state = made_problem(lens)
     columns = state.columns
@@ -67,7 +68,7 @@ def test_derivatives_are_those_of_finite_differences(lens: str) -> None:
         assert block / outer == pytest.approx(hessian[np.ix_(shared, place)] / outer, abs=1e-6)
 
 
-@pytest.mark.parametrize("lens", ["none", "k1k2"])
+@pytest.mark.parametrize("lens", slow_but(("k1k2",), ["none", "k1k2"]))
 def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
     from scipy.optimize import least_squares
 

@@ -53,7 +53,7 @@ def image_errors(scene: RigScene, X: Array, left: Array, right: Array) -> Array:
     return np.asarray((du**2).sum(axis=1) + (dv**2).sum(axis=1))
 
 
-@pytest.mark.parametrize("seed", slow_but(range(8), range(20)))
+@pytest.mark.parametrize("seed", slow_but(range(4), range(20)))
 def test_opencv_gives_the_same_without_noise_and_never_better_with_noise(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene = random_rig(rng, KINDS[seed % len(KINDS)], 3)
@@ -69,7 +69,7 @@ def test_opencv_gives_the_same_without_noise_and_never_better_with_noise(seed: i
 
 
 @pytest.mark.parametrize("lens", ["none", "k1k2", "fisheye"])
-@pytest.mark.parametrize("whitened", [False, True])
+@pytest.mark.parametrize("whitened", slow_but((True,), [False, True]))
 def test_the_point_is_the_minimum_of_the_pixel_error(lens: str, whitened: bool) -> None:
     from dataclasses import replace
 
@@ -164,7 +164,7 @@ def test_a_pixel_that_no_lens_could_have_seen_gives_no_point() -> None:
     assert np.isfinite(found.points[1]).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-3000, 3000))
 def test_any_two_pixels_give_an_answer_or_a_mark(a: float, b: float, c: float, d: float) -> None:
     scene = random_rig(np.random.default_rng(4), "verging", 3, "k1k2")

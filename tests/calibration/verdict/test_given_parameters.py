@@ -74,7 +74,7 @@ def test_neither_tangential_distortion_nor_a_bent_target_hides_a_wrong_centre(tr
         assert not any("is given, but" in reason for reason in right.reasons)
 
 
-@pytest.mark.parametrize("seeds", slow_but([2], [2, 12]))
+@pytest.mark.parametrize("seeds", slow_but([1], [1, 12]))
 def test_a_bent_board_does_not_make_a_true_centre_wrong(seeds: int) -> None:
     for seed in range(seeds):
         points, truth = photographed("parabola", seed, 12, 0.5)
@@ -170,7 +170,7 @@ def test_a_small_error_of_a_given_centre_counts_as_it_moves_the_poses(share: flo
         assert "standard deviations from the reported ones" in verdict.reasons[0]
 
 
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", slow_but((0,), (0, 5)))
 def test_given_poses_are_not_turned(seed: int) -> None:
     """Far boards have second poses; with poses that are off by a degree these would fit the points better."""
     scene = through(
@@ -197,7 +197,7 @@ def test_given_poses_that_are_off_are_not_excused_by_a_board_that_bends() -> Non
     points, truth = photographed("flat", 5, 8, 0.0)
     places = truth.t + np.array([0.0, 0.0, 2.0])
     poses = {name: Pose(R, t) for name, R, t in zip(points.view_names, truth.R, places, strict=True)}
-    verdict = calibrate(points, type=4, extrinsics=poses).verdict
+    verdict = calibrate(points, type=4, extrinsics=poses, distortion="k1k2").verdict
     assert verdict is not None
     assert verdict.word != "good"
 

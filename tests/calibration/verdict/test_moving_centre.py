@@ -23,11 +23,16 @@ def found(calibration: Calibration) -> MovingCentre | None:
     return gather_evidence(calibration).centre
 
 
-@pytest.mark.parametrize(("shape", "amount"), [("flat", 0.0), ("parabola", 0.5)])
-@pytest.mark.parametrize("size", [10.0, 20.0])
-def test_a_centre_that_moves_is_told_with_its_size(shape: str, amount: float, size: float) -> None:
+@pytest.mark.parametrize(
+    ("size", "shape", "amount"),
+    slow_but(
+        [(10.0, "parabola", 0.5)],
+        [(size, *shape) for size in (10.0, 20.0) for shape in (("flat", 0.0), ("parabola", 0.5))],
+    ),
+)
+def test_a_centre_that_moves_is_told_with_its_size(size: float, shape: str, amount: float) -> None:
     points, truth = photographed(shape, 3, amount=amount, sigma=0.15)
-    calibration = calibrate(stabilised(points, size, 3))
+    calibration = calibrate(stabilised(points, size, 3), distortion="k1k2")
     centre = found(calibration)
     assert centre is not None
     assert centre.size == pytest.approx(size, rel=0.4)
@@ -46,7 +51,7 @@ def test_no_centre_moves_in_clean_views(seed: int) -> None:
 @pytest.mark.parametrize(
     ("amount", "n_views", "target", "seed"),
     slow_but(
-        [(0.3, 10, "auto", 0), (0.3, 10, "given", 0)],
+        [(0.3, 10, "auto", 0)],
         [
             (amount, n_views, target, seed)
             for amount in (0.05, 0.1, 0.3, 1.0)
@@ -60,7 +65,7 @@ def test_a_board_that_bends_from_view_to_view_moves_no_centre(
     amount: float, n_views: int, target: str, seed: int
 ) -> None:
     points, _ = photographed("flexing", seed + 10, n_views, amount, sigma=0.12)
-    assert not told(calibrate(points, target=target))
+    assert not told(calibrate(points, distortion="k1k2", target=target))
 
 
 def test_one_image_that_is_cropped_is_no_moving_centre() -> None:

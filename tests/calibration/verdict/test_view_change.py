@@ -98,9 +98,7 @@ CHANGES = {
 @pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 0.02)))
 @pytest.mark.parametrize(
     "change",
-    slow_but(
-        ("drift", "every other image scaled"), ("drift", "every other image scaled", "focus that follows")
-    ),
+    slow_but(("drift",), ("drift", "every other image scaled", "focus that follows")),
 )
 def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float) -> None:
     make, words = CHANGES[change]
@@ -117,7 +115,7 @@ def test_changes_of_all_sizes(change: str, share: float) -> None:
     assert told(make(share), share, words, range(30)) >= least
 
 
-@pytest.mark.parametrize("seeds", slow_but((range(2, 5),), (range(2, 5), range(20))))
+@pytest.mark.parametrize("seeds", slow_but((range(2, 3),), (range(2, 3), range(20))))
 @pytest.mark.parametrize("curl", slow_but((0.5,), (0.5, 2.0)))
 def test_images_of_two_sizes_are_told_of_a_bent_board_too(curl: float, seeds: range) -> None:
     words = ("these views are scaled by",)

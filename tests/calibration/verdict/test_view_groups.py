@@ -17,10 +17,10 @@ ODD = ("view01", "view03", "view05", "view07", "view09")
 
 
 def groups(points) -> ViewGroups | None:
-    return gather_evidence(calibrate(points)).groups
+    return gather_evidence(calibrate(points, distortion="none")).groups
 
 
-@pytest.mark.parametrize("other", slow_but((570.0, 800.0), (540.0, 570.0, 630.0, 800.0)))
+@pytest.mark.parametrize("other", slow_but((570.0,), (540.0, 570.0, 630.0, 800.0)))
 def test_two_cameras_are_told_apart_view_by_view(other: float) -> None:
     found = groups(of_cameras([600.0, other]))
     assert found is not None
@@ -30,7 +30,7 @@ def test_two_cameras_are_told_apart_view_by_view(other: float) -> None:
 
 
 def test_a_crop_is_told_by_its_centre() -> None:
-    verdict = calibrate(of_cameras([600.0], shift=-60.0)).verdict
+    verdict = calibrate(of_cameras([600.0], shift=-60.0), distortion="none").verdict
     assert verdict is not None
     assert verdict.reasons[0].startswith("the images come from two cameras, or one part is cropped")
 
