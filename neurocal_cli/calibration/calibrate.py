@@ -17,6 +17,7 @@ from neurocal_cli.calibration.calibration import Calibration, Rejected, undistor
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.result import calibration_of, with_given_covariance
 from neurocal_cli.calibration.verdict.assessment import assess
+from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.calibration.verdict.odd_points import repeated_views
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
@@ -43,7 +44,6 @@ _NOT_FOUND = (
     "these points do not determine it, which needs three different views of most points and offsets below "
     "2 % of the target's size"
 )
-_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 
 
 def calibrate(
@@ -268,8 +268,7 @@ def _unused(points: Correspondences, why: str) -> tuple[str, ...]:
 
 def _refuse_misfit(calibration: Calibration) -> None:
     """Refuse a camera that does not fit its points at all."""
-    spread = np.sqrt(calibration.points.pixels.var(axis=0).sum())
-    if calibration.rmse_px < _MISFIT * spread:
+    if calibration.rmse_px < MISFIT * pixel_spread(calibration.points):
         return
     given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
     raise DegenerateGeometryError(

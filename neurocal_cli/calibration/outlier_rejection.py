@@ -34,7 +34,7 @@ from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, why_odd
 from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
-from neurocal_cli.calibration.verdict.findings import pixel_spread
+from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
@@ -81,52 +81,53 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
     Raises `DegenerateGeometryError` if the points do not determine the camera (the message says why), or if
     at least half of them are outliers.
     """
-    failure: DegenerateGeometryError | None = None
-    first: Solution | None = None
     try:
         first = fit(problem, options)
-        if not _suspicious(first):
-            return first, Rejected()
-    except DegenerateGeometryError as error:
-        failure = error
-    kept, solution = _agreeing(problem, options, first, failure)
-    kept, solution = _without_outlier_views(problem, options, kept, solution)
-    kept, solution = _all_judged(problem.points, options, kept, solution)
-    if not (kept.mask.all() or _is_borne_out(kept, solution, first)):
-        if first is not None and not first.refusal:
-            return first, Rejected()
-        _refuse_exact(solution, failure)
+    except DegenerateGeometryError as failure:
+        kept, solution = _searched(problem, options, None, failure)
+        if solution.spare_equations <= 0:
+            raise
+        return solution, _rejected(problem.points, kept, solution)
+    contradicts = _contradicts_noise(first)
+    if not (contradicts or _is_rough(first)):
+        return first, Rejected()
+    try:
+        kept, solution = _searched(problem, options, first, None)
+    except DegenerateGeometryError:
+        if contradicts or rms(first) > MISFIT * pixel_spread(problem.points):
+            raise
+        return first, Rejected()
+    few = solution.spare_equations < _FEW
+    if (few or not contradicts) and not _is_more_probable(kept, solution, first):
+        return first, Rejected()
     return replace(solution, of_all=first), _rejected(problem.points, kept, solution)
 
 
-def _is_borne_out(kept: _Kept, solution: Solution, first: Solution | None) -> bool:
-    """Whether the fit of the points kept is more probable than that of all points, or is well determined."""
-    if solution.spare_equations >= _FEW:
-        return True
-    if first is None or first.refusal or solution.spare_equations <= 0:
-        return solution.spare_equations > 0
+def _searched(
+    problem: Problem, options: Options, first: Solution | None, failure: DegenerateGeometryError | None
+) -> tuple[_Kept, Solution]:
+    """The three steps; `first` is the fit of all points, or `failure` the reason why there is none."""
+    kept, solution = _agreeing(problem, options, first, failure)
+    kept, solution = _without_outlier_views(problem, options, kept, solution)
+    return _all_judged(problem.points, options, kept, solution)
+
+
+def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
+    """Whether the evidence of the fit of the points kept is larger than that of all points."""
     points = first.problem.points
     n, k = len(points), int((~kept.mask).sum())
+    if first.refusal or not k:
+        return True
     area = float(np.prod(points.image_size or np.ptp(points.pixels, axis=0)))
-    return _evidence(solution) - k * log(area) - log(comb(n, k)) > _evidence(first)
+    gain = _evidence(solution) - k * log(area) - log(comb(n, k)) - _evidence(first)
+    return solution.spare_equations > 0 and gain > 0
 
 
 def _evidence(solution: Solution) -> float:
     """Log evidence of the fit of some points; see the module."""
-    half = 0.5 * solution.spare_equations
+    half = 0.5 * max(solution.spare_equations, 1e-9)
     floor = (_EXACT * pixel_spread(solution.problem.points)) ** 2
     return lgamma(half) - half * log(pi * (solution.squared_error + floor))
-
-
-def _refuse_exact(solution: Solution, failure: DegenerateGeometryError | None) -> None:
-    """Refuse the exact fit of points of which others were left out."""
-    if failure is not None:
-        raise failure
-    if solution.spare_equations <= 0:
-        raise DegenerateGeometryError(
-            "some points contradict each other, and without them nothing is left to test the others; "
-            "correct them, or add points"
-        )
 
 
 def judged_again(
@@ -154,7 +155,7 @@ def _is_of(points: Correspondences, view: str) -> NDArray[np.bool_]:
     return points.view_index == points.view_names.index(view)
 
 
-def _suspicious(solution: Solution) -> bool:
+def _contradicts_noise(solution: Solution) -> bool:
     """Whether anything in a fit is inconsistent with normal noise."""
     if solution.refusal:
         return True
@@ -166,9 +167,12 @@ def _suspicious(solution: Solution) -> bool:
     everything = np.ones(len(points), dtype=bool)
     if (error >= largest_expected(errors, everything, points)[points.view_index]).any():
         return True
-    if np.sqrt((error**2).mean()) > _ROUGH * pixel_spread(points):
-        return True
     return find_outlier_view(solution) is not None
+
+
+def _is_rough(solution: Solution) -> bool:
+    """Whether the error is so large that it may hide outliers."""
+    return rms(solution) > _ROUGH * pixel_spread(solution.problem.points)
 
 
 def _fitted(problem: Problem, mask: NDArray[np.bool_], options: Options) -> Solution:

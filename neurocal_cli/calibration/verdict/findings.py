@@ -16,6 +16,7 @@ WORDS = ("good", "usable", "poor")
 Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
+MISFIT = 0.05  # of the pixels' spread: an rms error this large is neither noise nor distortion
 _SHOWN = 3
 
 
