@@ -103,7 +103,7 @@ def _metavar(ctx: click.Context, option: click.Option) -> str:
 
 
 def _option(ctx: click.Context, option: click.Option) -> tuple[str, str]:
-    names = ", ".join(option.opts)
+    names = ", ".join(sorted(option.opts, key=len))
     values = "" if option.is_flag or option.count else f" {_metavar(ctx, option)}"
     if isinstance(option.show_default, str):
         default = option.show_default

@@ -139,7 +139,7 @@ def _options(ctx: click.Context) -> list[tuple[str, str]]:
     rows = []
     for option in ctx.command.get_params(ctx):
         if isinstance(option, click.Option) and not option.hidden:
-            head = ", ".join(option.opts)
+            head = ", ".join(sorted(option.opts, key=len))  # Click 8.1 has those of help in any order
             bare = option.is_flag or option.count
             choices = option.type.choices if isinstance(option.type, click.Choice) else ()
             values = option.metavar or "|".join(map(str, choices)) or option.type.name.upper()
