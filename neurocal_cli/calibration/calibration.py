@@ -62,6 +62,8 @@ class ViewResult:
     n_points: int
     rmse_px: float
     fixed: bool = False  # whether the pose was given
+    # Less than 1 if the flat target has a second pose that noise may have made the worse one.
+    probability: float = 1.0
 
 
 @frozen_dataclass(eq=False)
@@ -107,6 +109,9 @@ class Calibration:
     rejected : Rejected
     target : Target or None
         The estimated target; None if it was used as given.
+    second_poses : dict of ViewResult by view name
+        Poses of flat targets that fit nearly as well as those of `views`, tilted the other way, with their
+        probability. The standard deviations of `views` cover both poses; those here are left out.
     target_stretched : float
         If the given target was selected: the probability that its print is nevertheless stretched or leans by
         a few thousandths, which the standard deviations include. 0 if it is below 0.001.
@@ -153,6 +158,7 @@ class Calibration:
     rejected: Rejected = field(default_factory=Rejected)
     target: Target | None = None
     lens_choice: Mapping[str, float] = field(default_factory=dict)
+    second_poses: Mapping[str, ViewResult] = field(default_factory=dict)
     target_stretched: float = 0.0
     would_take: frozenset[str] = frozenset()
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None

@@ -20,6 +20,7 @@ from neurocal_cli.adjustment.covariance import (
 from neurocal_cli.adjustment.observability import refuse_undetermined
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.adjustment.problem import intrinsic_matrix, normalised, translations
+from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
@@ -27,10 +28,13 @@ from neurocal_cli.calibration.lens_choice.given_model import undetermined_coeffi
 from neurocal_cli.calibration.verdict.odd_points import are_normalised
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.network.local_minima import second_poses
 from neurocal_cli.observations.target import scale_of
 
 _XI = 5  # index of xi, after A's five entries
 _TOLD = 0.1  # width of the range of xi from which on a warning is given
+_PROBABLE = 0.01  # odds from which on a second pose is told
+_LEAST = 0.04  # probability with which it is in the std, so that it is never more than five of them away
 _NAMED = 5  # number of outliers that the warning names
 
 
@@ -74,11 +78,13 @@ def calibration_of(
     elif not record.certain:
         reason = StopReason.NO_AGREEMENT
     chosen = solution.model_errors is not None
+    found, second = _with_second_poses(solution, _view_results(solution, cov, squared))
     return Calibration(
         intrinsics=intrinsics,
         std=std,
         fixed=fixed,
-        views=_view_results(solution, cov, squared),
+        views=found,
+        second_poses=second,
         points=problem.points,
         type=problem.type,
         method=method,
@@ -166,6 +172,42 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
         name: ViewResult(Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, given)
         for name, R_k, t_k, sigma, n, r in rows
     }
+
+
+def _with_second_poses(
+    solution: Solution, found: dict[str, ViewResult]
+) -> tuple[dict[str, ViewResult], dict[str, ViewResult]]:
+    """Views with the probability of their poses, and second poses of flat targets that are probable, too.
+
+    Seen from afar, a flat target tilted the other way looks nearly the same (Schweighofer and Pinz 2006). For
+    normal noise of the variance s^2, a second pose with the squared error c_2 instead of c_1 is
+    exp(-(c_2 - c_1) / (2 s^2)) times as probable. The variance about the reported pose covers both.
+    """
+    problem, adjusted = solution.problem, solution.adjusted
+    seconds = second_poses(problem, adjusted)
+    if seconds is None or solution.spare_equations <= 0:
+        return found, {}
+    which, posed = seconds
+    variance = max(float(adjusted.cost.sum()) / solution.spare_equations, 1e-300)
+    odds = np.exp(-0.5 * np.maximum(posed.cost - adjusted.cost[which], 0.0) / variance)
+    views = problem.views.subset(which)
+    t = translations(views, posed.state)
+    squared = (point_residuals(views, posed.state) ** 2).sum(axis=1) * views.pixel_scale**2
+    rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
+    second: dict[str, ViewResult] = {}
+    for k in np.flatnonzero(odds > _PROBABLE):
+        name, p = views.names[k], float(odds[k] / (1 + odds[k]))
+        other = Pose.exact(posed.state.R[k], t[k])
+        one = found[name]
+        turned = (other.euler - one.pose.euler + np.pi) % (2 * np.pi) - np.pi
+        apart = np.concatenate([turned, other.t - one.pose.t])
+        own = np.array([one.std[key] for key in POSE_NAMES])
+        if (np.abs(apart) < own).all():  # seen from the front, both are one pose
+            continue
+        std = dict(zip(POSE_NAMES, np.hypot(own, np.sqrt(max(p, _LEAST)) * apart).tolist(), strict=True))
+        found[name] = replace(one, std=std, probability=1 - p)
+        second[name] = ViewResult(other, {}, one.n_points, float(rms[k]), probability=p)
+    return found, second
 
 
 def _network_record(solution: Solution, rmse: float) -> NetworkRecord:

@@ -57,6 +57,12 @@ def have_same_std(views: Mapping[str, ViewResult]) -> bool:
     return len({frozenset(view.std) for view in views.values()}) <= 1
 
 
+def second_pose_lines(views: Mapping[str, ViewResult], K: Array) -> Iterator[str]:
+    """Lines of the block ``second_poses``; none if there are none."""
+    if views:
+        yield from ["second_poses:", *list(view_lines(views, K, False))[1:]]
+
+
 def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterator[str]:
     """Lines of the block ``views``."""
     if not views:
@@ -73,6 +79,8 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
         columns["rmse_px"] = error
         columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
         columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
+        if any(view.probability < 1 for view in views.values()):
+            columns["probability"] = np.array([view.probability for view in views.values()])
         columns |= dict(zip(_R, R.reshape(-1, 9).T, strict=True))
         yield from block("views", column_lines(columns))
         return
@@ -89,6 +97,8 @@ def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterato
         yield f"    R: {rotation}"  # the angles do not reproduce the last bits
         if view.fixed:
             yield "    fixed: true"
+        if view.probability < 1:
+            yield f"    probability: {number(view.probability)}"
 
 
 def _estimates(pose: Array, views: Collection[ViewResult]) -> Iterator[list[str]]:
@@ -126,6 +136,9 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
     pose = numbers_of(columns, POSE_NAMES).T
     R = numbers_of(columns, _R).T.reshape(-1, 3, 3)
     std = numbers_of(columns, [f"std_{name}" for name in known], unknown=True).T
+    probability = np.ones(len(pose))
+    if "probability" in columns:
+        probability = numbers_of(columns, ["probability"])[0]
     if np.abs(R - np.stack([euler_to_rotation(*angles) for angles in pose[:, :3]])).max() > _SAME:
         field.refuse(f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited")
     return {
@@ -135,6 +148,7 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
             n_points=Field(table["n_points"][k], field.source, f"{field.path}.n_points").integer(),
             rmse_px=Field(table["rmse_px"][k], field.source, f"{field.path}.rmse_px").number_or_nan(),
             fixed=bool(table["fixed"][k]),
+            probability=float(probability[k]),
         )
         for k, name in enumerate(table["name"])
     }
@@ -161,6 +175,7 @@ def _view(entry: Field) -> ViewResult:
         n_points=entry.get("n_points", 0).integer(),
         rmse_px=entry["rmse_px"].number_or_nan(),
         fixed=entry.get("fixed", False).boolean(),
+        probability=entry.get("probability", 1.0).number(),
     )
 
 

@@ -91,6 +91,7 @@ def calibration_from_field(root: Field) -> Calibration:
         lens_choice={
             name: error.number_or_nan() for name, error in block.get("lens_choice", {}).entries().items()
         },
+        second_poses=read_views(block.get("second_poses", [])),
         target_stretched=block.get("target_stretched", 0.0).number(),
     )
 

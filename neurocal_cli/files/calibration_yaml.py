@@ -22,6 +22,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.files.calibration_blocks import (
     have_same_std,
     rejected_lines,
+    second_pose_lines,
     target_lines,
     verdict_lines,
     view_lines,
@@ -88,6 +89,7 @@ def _block_lines(cal: Calibration, long: bool) -> Iterator[str]:
         yield f"image_center: {flow(np.array(cal.points.image_center))}"
     yield from _parameter_lines(cal)
     yield from view_lines(cal.views, cal.K, long)
+    yield from second_pose_lines(cal.second_poses, cal.K)
     if cal.network is None:
         yield "network: null"
     else:

@@ -80,6 +80,7 @@ def lean_calibration(calibration: Calibration) -> Calibration:
         calibration,
         points=Correspondences.none(calibration.image_size, calibration.unit),
         views={},
+        second_poses={},
         network=None,
         rejected=Rejected(),
         target=None,

@@ -134,9 +134,23 @@ _Second = tuple[NDArray[np.intp], Adjusted]  # views, and their second poses wit
 
 def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, _Second] | None:
     """Flip all views whose mirrored pose fits better with the current camera; and all near mirrored poses."""
+    found = second_poses(problem, adjusted)
+    if found is None:
+        return None
+    candidates, posed = found
+    better = posed.cost < adjusted.cost[candidates] * (1 - 1e-9)
+    again = _with_poses(problem, adjusted, candidates[better], posed, better) if better.any() else None
+    return again, found
+
+
+def second_poses(problem: Problem, adjusted: Adjusted) -> _Second | None:
+    """Views of flat targets whose mirrored pose fits nearly as well, and these poses; None if there are none.
+
+    The camera stays as it is.
+    """
     views, state = problem.views, adjusted.state
     flat = np.flatnonzero(views.nearly_flat)
-    if not flat.size:
+    if not flat.size or not problem.free_poses:
         return None
     R, t = state.R.copy(), state.t.copy()
     R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
@@ -153,9 +167,7 @@ def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, 
         close = posed.cost < _FLIP_CLOSE**2 * adjusted.cost[candidates] + 1e-20
         if steps == _FLIP_STEPS:
             candidates = candidates[close]
-    better = posed.cost < adjusted.cost[candidates] * (1 - 1e-9)
-    again = _with_poses(problem, adjusted, candidates[better], posed, better) if better.any() else None
-    return again, (candidates, posed)
+    return candidates, posed
 
 
 def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:

@@ -230,6 +230,14 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "pose count as one",
             "add views of other poses instead of more frames of the same ones",
         )
+    if calibration.second_poses:
+        likely = max(view.probability for view in calibration.second_poses.values())
+        yield (
+            1,
+            f"{name_some(calibration.second_poses)}: the flat target may be tilted the other way as well, "
+            f"with a probability of up to {likely:.2g}; the std of these poses cover both",
+            "bring the target nearer, tilt it more, or use one that is not flat; the file has both poses",
+        )
     if e.mirrored:
         yield (
             1,

@@ -170,6 +170,7 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "rmse_px": number_or_none(calibration.rmse_px),
         "max_px": number_or_none(calibration.max_px),
         "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
+        "second_poses": {name: view.probability for name, view in calibration.second_poses.items()},
         "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
         "target": target_json(calibration.target, calibration.unit),
         "converged": bool(calibration.converged),
