@@ -260,12 +260,7 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
 
 def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
     """Warn of images that were turned differently: each way of turning has its own image centre."""
-    from neurocal_cli.files.images import BY_EXIF
-
-    turns = Counter(
-        next((text.split(BY_EXIF)[0] for text in outcome.notes if BY_EXIF in text), "as stored")
-        for outcome in outcomes
-    )
+    turns = Counter(outcome.turned or "as stored" for outcome in outcomes)
     if len(turns) < 2:
         return []
     counts = ", ".join(f"{count} {turn}" for turn, count in turns.most_common())

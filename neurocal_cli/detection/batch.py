@@ -41,7 +41,7 @@ from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_at_once
 from neurocal_cli.observations.board import Board
 
-_FORMAT = 5  # raised when the same image gives other points than before
+_FORMAT = 6  # raised when the same image gives other points than before
 # Of a detection; its grids are not cached, which only its picture needs.
 _FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings")
 _WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
@@ -65,6 +65,7 @@ class Outcome:
     overlay: bytes | None = None  # a PNG; images without the board have one, too
     # (cols, rows): number of inner vertices of another board in the image
     shown: tuple[int, int] | None = None
+    turned: str = ""  # what was done to the image as its EXIF orientation says
 
 
 @frozen_dataclass
@@ -113,7 +114,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         if options.strict:
             raise
         problem = f"internal error: {type(error).__name__}: {error}; run with NEUROCAL_DEBUG=1 to see where"
-    return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
+    return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes, turned=image.turned)
 
 
 def _stored(found: Outcome, data: bytes, cache: DetectionCache | None) -> Outcome:
@@ -142,10 +143,11 @@ def _detected(image: Image, options: DetectionOptions) -> Outcome:
         if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
         shown = error.shown if isinstance(error, NoBoardError) else None
-        return Outcome("", None, str(error), image.notes, overlay, shown)
+        return Outcome("", None, str(error), image.notes, overlay, shown, image.turned)
     if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome("", found, "", (*image.notes, *_remarks(found, options.board)), overlay)
+    notes = (*image.notes, *_remarks(found, options.board))
+    return Outcome("", found, "", notes, overlay, turned=image.turned)
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:
@@ -198,6 +200,7 @@ class DetectionCache:
                 notes=tuple(map(str, tree["notes"])),
                 overlay=None if tree["overlay"] is None else b64decode(tree["overlay"]),
                 shown=None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
+                turned=str(tree["turned"]),
             )
         except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: detect again
             return None
@@ -214,6 +217,7 @@ class DetectionCache:
             "notes": outcome.notes,
             "overlay": None if overlay is None else b64encode(overlay).decode(),
             "shown": outcome.shown,
+            "turned": outcome.turned,
         }
         os.makedirs(self._folder, exist_ok=True)
         text = json.dumps(tree, default=np.ndarray.tolist)

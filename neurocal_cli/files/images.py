@@ -23,8 +23,6 @@ from neurocal_cli.files.writing import write_at_once
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _MOST_PIXELS = 200_000_000  # more than any camera has; larger images are refused
-BY_EXIF = ", as its EXIF orientation says"
-"""Follows what was done to an image, in the note about it."""
 _TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -51,7 +49,12 @@ class Image:
 
     grey: Pixels  # (height, width) [DN]; of colours 0.299 R + 0.587 G + 0.114 B, as in OpenCV
     source: str = "image"  # name for messages
-    notes: tuple[str, ...] = ()  # changes of the pixels that a user may not expect
+    turned: str = ""  # what was done to it as its EXIF orientation says; empty if nothing
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Changes of the pixels that a user may not expect."""
+        return _notes(self.turned)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,18 +84,18 @@ def read_image(path: str | Path) -> Image:
 def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
     """Read an image with its colours (R, G, B; no transparency), its name, and notes as of an `Image`."""
     data, source = read_bytes(path)
-    pixels, notes = _upright(data, source, _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    return _reversed(pixels), source, notes
+    pixels, turned = _upright(data, source, _MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    return _reversed(pixels), source, _notes(turned)
 
 
 def parse_image(data: bytes, source: str = "image", most_pixels: int = _MOST_PIXELS) -> Image:
     """Read an image from the bytes of a file; see `read_image`."""
-    grey, notes = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    return Image(grey, source, notes)
+    grey, turned = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    return Image(grey, source, turned)
 
 
-def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, tuple[str, ...]]:
-    """Pixels of a file with its EXIF orientation applied, and a note if that changed them."""
+def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, str]:
+    """Pixels of a file with its EXIF orientation applied, and what that did to them."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
         raise FormatError(
@@ -100,14 +103,16 @@ def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pi
             "read; scale it down",
             source,
         )
-    pixels = _decoded(data, header, source, flags)
-    if header.orientation == 1:
-        return pixels, ()
-    note = (
-        f"{_TURNS[header.orientation]}{BY_EXIF} and OpenCV does; pixel coordinates are those of the turned "
-        "image"
+    return _decoded(data, header, source, flags), _TURNS.get(header.orientation, "")
+
+
+def _notes(turned: str) -> tuple[str, ...]:
+    if not turned:
+        return ()
+    return (
+        f"{turned}, as its EXIF orientation says and OpenCV does; pixel coordinates are those of the turned "
+        "image",
     )
-    return pixels, (note,)
 
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
