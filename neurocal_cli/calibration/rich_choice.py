@@ -26,6 +26,7 @@ from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displac
 from neurocal_cli.calibration.outlier_rejection import judged_again
 from neurocal_cli.calibration.verdict.view_groups import view_groups
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import Options
 
 # Repeated by test_rich_lens.py (slow). The rms error on held-out views drops by a factor of 1.28 or
@@ -56,7 +57,10 @@ def with_rich_lens(
         return solution, rejected
     found = rich.model_errors
     if len(rejected):
-        rich, rejected = judged_again(problem, rich, rejected, options)
+        try:
+            rich, rejected = judged_again(problem, rich, rejected, options)
+        except DegenerateGeometryError:  # with other points there is no such lens
+            return solution, rejected
     return replace(rich, model_errors=found), rejected
 
 
@@ -76,7 +80,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
         if not promised(start, repeated).sum() * _PROMISED**2 < others.sum():
             return None
         rich = with_displacement(start)
-    except np.linalg.LinAlgError:
+    except (DegenerateGeometryError, np.linalg.LinAlgError):
         return None
     lost = _lost(rich, repeated)
     if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):

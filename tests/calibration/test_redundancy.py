@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
-from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, Pose, calibrate, read_points
 from neurocal_cli.errors import NeurocalError
 
 CAMERA = Camera(Intrinsics(1400.0, 1400.0, 950.0, 545.0), image_size=(1920, 1080))
@@ -68,3 +69,28 @@ def test_few_spare_equations_name_no_other_lens(n: int) -> None:
         found = calibrated(seen(n, seed))
         if found is not None and found.verdict is not None:
             assert not any("distortion" in reason for reason in found.verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("name", "n"), [("few_n6_0", 6), ("few_m7_24", 7), ("few_n6skew_1", 6), ("few_t2n6_0", 6)]
+)
+def test_reported_sets_of_few_points(name: str, n: int, real_files: RealFiles) -> None:
+    """Cameras of 1400 px and (950, 545); of some, one point or two were called outliers."""
+    (path,) = real_files(f"field_reports/{name}.csv")
+    given = {"type": 2, "image_center": (950.0, 545.0)} if "t2" in name else {}
+    found = calibrate(read_points(path), skew="skew" in name, distortion="none", **given)
+    assert len(found.points) == n
+    assert found.verdict is not None
+    assert found.verdict.word == "poor"
+    if "skew" not in name:  # a single equation is left there, and its residual is 0.0006 px by chance
+        assert abs(found.intrinsics.alpha_u - 1400) < 3 * found.std["alpha_u"]
+
+
+@pytest.mark.parametrize("name", ["pnp_small", "pnp1_11"])
+def test_reported_small_targets_are_right(name: str, real_files: RealFiles) -> None:
+    (path,) = real_files(f"field_reports/{name}.csv")
+    camera = Camera(Intrinsics(1000.0, 1000.0, 960.0, 540.0), image_size=(1920, 1080))
+    found = calibrate(read_points(path), type=3, intrinsics=camera)
+    assert found.n_rejected == 0
+    assert not found.rejected.views
+    assert found.rmse_px < 0.4

@@ -45,6 +45,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
 from neurocal_cli.camera.state import CameraState
+from neurocal_cli.errors import DegenerateGeometryError
 
 _N = len(NODES)
 # Indices of k1 to k4 and the nodes among the coefficients; and the parts of these unknowns.
@@ -70,11 +71,18 @@ _NEARLY = 0.1  # change of the log evidence that ends the rounds
 def with_displacement(solution: Solution) -> Solution:
     """Fit a rich lens, starting from a fisheye or a rich lens at the minimum, or near it.
 
-    The penalty of the resulting problem is the prior; `shared` is the covariance with the prior.
+    The penalty of the resulting problem is the prior; `shared` is the covariance with the prior. Raises
+    `DegenerateGeometryError` if no fisheye is near the lens, so that the displacement is not determined.
     """
-    solution = _by_evidence(_begun(solution))
-    if solution.problem.points.covariance is not None:
-        solution = _by_evidence(reweighted(solution))
+    try:
+        solution = _by_evidence(_begun(solution))
+        if solution.problem.points.covariance is not None:
+            solution = _by_evidence(reweighted(solution))
+    except np.linalg.LinAlgError as error:
+        raise DegenerateGeometryError(
+            "no fisheye with a smooth displacement fits these points; choose --distortion auto, and give "
+            "images as the camera has recorded them, not stretched or stabilised"
+        ) from error
     return solution
 
 

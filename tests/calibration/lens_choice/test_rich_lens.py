@@ -11,6 +11,7 @@ import pytest
 from scipy.optimize import least_squares
 from support.distorted import BENT, SIGMA, bent_set
 from support.random_lenses import KINDS, RandomLens, random_lens
+from support.real_data import RealFiles
 from support.targets import SHAPES, photographed
 
 from neurocal_cli.calibration import rich_choice
@@ -24,6 +25,7 @@ from neurocal_cli.commands.show.camera_report import calibration_report
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.observations.points import Correspondences
 
 NOISE, SIZE = 0.15, (1000, 800)
@@ -280,3 +282,13 @@ def test_errors_of_random_lenses_are_true_where_no_point_is(part: str, within: f
     seen, unseen = np.sqrt(np.nanmean(found, axis=0))
     assert 0.85 < seen < 1.2
     assert 0.8 < unseen < 1.3
+
+
+@pytest.mark.slow
+def test_a_stretched_image_is_no_rich_lens_and_no_internal_error(real_files: RealFiles) -> None:
+    """The image of an action camera, stretched more towards its left and right sides, has no fisheye."""
+    (path,) = real_files("field_reports/superview.csv")
+    points = read_points(path)
+    with pytest.raises(DegenerateGeometryError, match="no fisheye with a smooth displacement"):
+        calibrate(points, distortion="rich")
+    assert calibrate(points).distortion_model != "rich"
