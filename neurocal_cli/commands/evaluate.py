@@ -9,7 +9,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import first_of, note, print_summary, show, warn
+from neurocal_cli.commands.streams import first_of, note, print_summary, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     from neurocal_cli.calibration.verdict.assessment import assess
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
@@ -190,6 +191,7 @@ def stereo(
         stereo_evaluation_tables,
         views_alone,
     )
+    from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
 
     note(*views_alone(evaluation.alone))

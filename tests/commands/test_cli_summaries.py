@@ -178,3 +178,18 @@ def test_a_target_and_a_zoom_lens_sum_up_as_json(tmp_path: Path) -> None:
     )
     assert told["setting"] == {"zoom": 250, "focus": 100}
     assert told["parameters"]["alpha_u"]["value"] == read_calibration(tmp_path / "c.yaml").intrinsics.alpha_u
+
+
+def test_the_three_most_important_reasons_are_told_and_all_with_verbose(tmp_path: Path) -> None:
+    all_points, points = read_points(SAMPLES / "points.csv"), tmp_path / "few.csv"
+    few = np.zeros(len(all_points), dtype=bool)
+    few[:: len(few) // 7] = True
+    write_points(all_points.select(few), points)
+    brief = run("calibrate", points, "-o", tmp_path / "few.yaml").stderr
+    whole = run("-v", "calibrate", points, "-o", tmp_path / "few.yaml").stderr
+    counts = [[text.count(f"\n  {kind}: ") for kind in ("reason", "advice")] for text in (brief, whole)]
+    assert max(counts[0]) == 3
+    assert max(counts[1]) > 3
+    hidden = sum(counts[1]) - sum(counts[0])
+    assert f"  {hidden} more of less weight: `neurocal -v` shows them" in brief
+    assert "of less weight" not in whole

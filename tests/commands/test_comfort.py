@@ -19,8 +19,8 @@ from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, read_image
-from neurocal_cli.commands import streams
 from neurocal_cli.commands.detect import _another_board, _shown
+from neurocal_cli.commands.show import terminal
 from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
@@ -108,9 +108,9 @@ def test_the_shell_can_complete(shell: str) -> None:
 @pytest.mark.parametrize("width", [30, 60, 100])
 def test_tables_break_no_word_on_a_narrow_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.StringIO()
-    monkeypatch.setattr(streams, "is_terminal", lambda stream: True)
+    monkeypatch.setattr(terminal, "is_terminal", lambda stream: True)
     monkeypatch.setattr("rich.console.Console", lambda: Console(file=shown, width=width))
     words = ["correspondence", "reprojection", "cross-validation"]
-    streams.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
+    terminal.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
     for word in words:
         assert word in shown.getvalue()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.commands.streams import verbose
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
@@ -23,6 +24,7 @@ Table = list[list[str]]
 UNITS = dict.fromkeys(INTRINSIC_NAMES, "px") | {"theta": "rad"}
 """Of the intrinsic parameters; the coefficients of the distortion have none."""
 
+_MOST_TOLD = 3  # reasons, and pieces of advice, that a reader takes in
 _MOST_VIEWS = 20  # rows of a table that fit on a screen
 _MOST_DECIMALS = 9  # further digits are rounding errors
 # The main measures of a verdict, in words.
@@ -114,16 +116,19 @@ def parameters(calibration: Calibration) -> dict[str, float]:
 
 
 def verdict_lines(verdict: Verdict | None) -> list[str]:
-    """Lines of a verdict: the word, the main measures, reasons and advice."""
+    """Lines of a verdict: the word, the main measures, and the most important reasons and advice.
+
+    With ``neurocal -v``, all of them.
+    """
     if verdict is None:
         return []
     found = facts(verdict)
-    return [
-        f"verdict: {verdict.word}",
-        *([f"  {found}"] if found else []),
-        *(f"  reason: {reason}" for reason in verdict.reasons),
-        *(f"  advice: {advice}" for advice in verdict.advice),
-    ]
+    lines = [f"verdict: {verdict.word}", *([f"  {found}"] if found else [])]
+    told = {"reason": verdict.reasons, "advice": verdict.advice}
+    most = None if verbose() else _MOST_TOLD
+    lines += [f"  {kind}: {text}" for kind, texts in told.items() for text in texts[:most]]
+    hidden = 0 if most is None else sum(max(len(texts) - most, 0) for texts in told.values())
+    return [*lines, f"  {hidden} more of less weight: `neurocal -v` shows them"] if hidden else lines
 
 
 def verdict_json(verdict: Verdict | None) -> dict[str, Any]:
