@@ -9,7 +9,9 @@ from pathlib import Path
 from matplotlib.patches import Arc, FancyBboxPatch, Rectangle
 from style import BLUE, GREY, INK, PALE_BLUE, PALE_GREEN, PALE_ORANGE, drawing, save
 
-PACKAGE = Path(__file__).resolve().parents[2] / "neurocal_cli"
+import neurocal_cli
+
+PACKAGE = Path(neurocal_cli.__file__).parent
 # From the top down, with the colour of what a room is about: people and files, cameras, mathematics.
 ROOMS = {
     "commands": PALE_ORANGE,

@@ -119,7 +119,13 @@ def _explain(error: Exception) -> str:
 @click.option(
     "-q", "--quiet", count=True, show_default="no", help="Print only warnings and errors; twice: only errors."
 )
-@click.option("-v", "--verbose", is_flag=True, show_default="no", help="Also print progress with times, and all reasons of a verdict.")
+@click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    show_default="no",
+    help="Also print progress with times, and all reasons of a verdict.",
+)
 @click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")
 def neurocal(quiet: int, verbose: bool) -> None:
     """Calibrate cameras with a neural network whose weights are the camera.
