@@ -18,6 +18,7 @@ from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import can_tell, common_target, on_one_target
 from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, free_parameters, rig_problem
+from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.contradiction import contradiction
 from neurocal_cli.calibration.rig.covariance import (
@@ -217,6 +218,7 @@ def fit_rig(
     left, right = on_one_target(left, right)
     views = pair_views(left.points.view_names, right.points.view_names)
     pair_points(left.points, right.points, views)
+    left, right = with_agreeing_poses(left, right, views)
     sound = sound_pairs(left, right, views)
     if sound.left_out and outliers == "keep":
         raise DegenerateGeometryError(sound.contradiction(outliers))
