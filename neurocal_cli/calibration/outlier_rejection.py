@@ -14,6 +14,9 @@ Few points fit better without some of them whether these are wrong or not, up to
 equations are left, the evidence decides. For s spare equations with the squared error c, its logarithm is
 log Gamma(s / 2) - s / 2 log(pi c), with the noise level integrated out (Jeffreys' prior). Each of k outliers
 is anywhere in the image, of area F, and any k of n points may be those: - k log F - log(n over k).
+
+A large error that agrees with normal noise begins the search as well, because it may hide outliers. They are
+left out only if the error falls to less than half without them, which trimming noise does not reach.
 """
 
 from __future__ import annotations
