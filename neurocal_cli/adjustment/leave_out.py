@@ -55,7 +55,8 @@ class Quadratics:
 
     def summed(self, member: Array) -> tuple[Array, Array]:
         """S (F, f, f) and g (F, f) of sets of groups; member (F, G) is 1 where a group belongs to a set."""
-        return np.einsum("fg,gij->fij", member, self.S), member @ self.g
+        of_S = member @ self.S.reshape(len(self.S), -1)
+        return of_S.reshape(len(member), *self.S.shape[1:]), member @ self.g
 
     @quietly
     def steps(self, member: Array, penalty: tuple[Array, Array] | None = None) -> Array:
@@ -114,3 +115,22 @@ def _solved(S: Array, right: Array) -> Array:
         scale = scale[..., None]
         solved[usable] = scale[usable] * np.linalg.solve(scaled[usable], (scale * right)[usable])
     return solved
+
+
+def least_by_precision(M: Array, values: Array, along: Array) -> Callable[[Array], tuple[Array, Array]]:
+    """Minimum (k,) and log determinant (k,) of a quadratic, by precisions (k,) of independent unknowns.
+
+    M (f + 1, f + 1) is the quadratic in the common unknowns, bordered by the right side and the cost. Besides
+    these there are K unknowns with the information `values` (K,) and the coupling `along` (K, f + 1) to M,
+    and a normal prior of the given precision. The log determinant is over that of the prior.
+    """
+    f = len(M) - 1
+
+    def least(precision: Array) -> tuple[Array, Array]:
+        left = values + precision[:, None]
+        N = M - (along.T / left[:, None]) @ along
+        S, g = N[:, :f, :f], N[:, :f, f]
+        cost = N[:, f, f] - (g * np.linalg.solve(S, g[..., None])[..., 0]).sum(axis=1)
+        return cost, np.log(left / precision[:, None]).sum(axis=1) + np.linalg.slogdet(S)[1]
+
+    return least

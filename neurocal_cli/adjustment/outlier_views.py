@@ -127,3 +127,9 @@ def seen_from_behind(views: Views, state: CameraState) -> list[str]:
     side = ((state.R @ normal[..., None])[..., 0] * state.t).sum(axis=1)
     behind = (side < 0) != (np.sign(side).sum() < 0)
     return [views.names[k] for k in np.flatnonzero(behind)]
+
+
+def variance_of_views(views: Views, state: CameraState) -> float:
+    """Variance of the residuals with a separate camera for each view, normalised."""
+    unknowns = int((6 + conditions_on_views(views, state)).sum())
+    return float(free_networks(views, state).sum()) / max(views.n_equations - unknowns, 1)

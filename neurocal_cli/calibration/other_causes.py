@@ -1,7 +1,7 @@
 """Causes of errors on the given target other than its shape: of all views, and of one that is left out.
 
-All views. Wrong stated sigmas, a distortion model that is too simple, wrong given parameters, two cameras and
-a camera that changes between the views all leave residuals that a target of another shape explains in part.
+All views. Wrong stated sigmas and the rivals of the contest (`verdict.rivals`) leave residuals that a target
+of another shape explains in part. The more probable one is the cause.
 
 One view of a flat target. Each hypothesis about why it contradicts the camera of the other views changes its
 pixels, its world points or its camera. Its pose is then estimated as in a problem of type 3 and adjusted. The
@@ -17,34 +17,20 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
-from neurocal_cli.adjustment.board.find import Found, evidence_as_given
-from neurocal_cli.adjustment.cross_validation import reduced
-from neurocal_cli.adjustment.outlier_views import least_of_free_networks
+from neurocal_cli.adjustment.board.find import Found, evidence_as_given, views_for_target
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.lens_choice.model_selection import (
-    named_lens_is_too_simple,
     richer_lens_is_better,
 )
 from neurocal_cli.calibration.point_errors import places_of_views
+from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import pixel_spread
-from neurocal_cli.calibration.verdict.given_parameters import (
-    AS_WELL,
-    TOLD_APART,
-    other_distortion_explains,
-    reestimate_centre,
-    reestimate_given,
-)
 from neurocal_cli.calibration.verdict.noise import stated_noise
-from neurocal_cli.calibration.verdict.turned_images import best_turned, middle_of
-from neurocal_cli.calibration.verdict.view_change import view_change
-from neurocal_cli.calibration.verdict.view_groups import ViewGroups, view_groups
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
@@ -53,11 +39,8 @@ from neurocal_cli.network.orthogonality import cameras_from_products
 from neurocal_cli.network.view_networks import train_networks
 from neurocal_cli.observations.points import Correspondences
 
-_OCCAM = 0.5  # of the logarithm of the number of equations, for one unknown (Schwarz 1978)
-# The cameras of single views have the common distortion, so they are no strict bound: half of one is used.
-_SURELY = 0.5
+_FAR = 2.0  # times the log evidence of the found target
 _TELL_BENDS = 3  # views that tell bent planes from distortion (test_cli_stereo.py)
-_ALL = 1.0 - 1e-9  # largest share of the squared error that counts as explained
 
 # Of one view.
 _HOLDS = 2.0  # times the rms error of the other views
@@ -76,21 +59,17 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
     if contradicts_sigma(solution):
         return True
     named = solution.model_errors is None and solution.straight_lines is None
-    if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
-        return True
     # One or two views of planes that bend and were set up by hand show distortion as another target.
     if named and problem.views.n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
-    if not problem.free_poses:
+    fits = views_for_target([(problem, solution.adjusted)])
+    held, gain = contest_of(solution, fits[0]), found.evidence - evidence_as_given(fits)
+    if held is None or not held.causes:
         return False
-    if _given_is_wrong(solution, found):
-        return True
-    # No camera that changes between views fits better than one of each view's own.
-    own = float(least_of_free_networks(solution.adjusted.normal).sum())
-    if _are_two_cameras(solution, found, own):
-        return True
-    rivals = _Rivals(solution, found.evidence - evidence_as_given([(problem, solution.adjusted)]))
-    return rivals.may_explain(own) and (_changes_between_views(rivals) or _are_turned(rivals))
+    if held.beside_board:
+        return held.evidence > gain
+    # A shape that is far more probable than the found one is not open: no print is stretched by percents.
+    return held.causes[0].pattern == "all" and sum(one.evidence for one in held.causes) > _FAR * gain
 
 
 def contradicts_sigma(solution: Solution) -> bool:
@@ -103,96 +82,20 @@ def contradicts_sigma(solution: Solution) -> bool:
     return any(grade for grade, *_ in stated_noise(points, predicted - points.pixels, alike))
 
 
-def _given_is_wrong(solution: Solution, found: Found) -> bool:
-    """Whether other values of the given parameters explain the points as well as the found target does."""
-    problem, (_, after) = solution.problem, found.fits[0]
-    views, given = problem.views, problem.fixed
-    unknowns = int(problem.free_camera.sum()) + 6 * views.n_views
-    variance = float(after.cost.sum()) / max(views.n_equations - unknowns, 1)
-    for asked in (
-        reestimate_given(views, solution.state, given, True, variance=AS_WELL * variance),
-        reestimate_centre(views, solution.state, given, True, variance),
-    ):
-        if any(abs(a.found - a.given) > TOLD_APART * a.std for a in asked):
-            return True
-    return other_distortion_explains(views, solution.state, given, AS_WELL * variance)
+def contest_of(solution: Solution, fit: tuple[Problem, Adjusted] | None = None) -> Contest | None:
+    """The contest at a fit, by default that of the solution."""
+    problem, adjusted = fit or (solution.problem, solution.adjusted)
+    return contest(
+        problem.views, adjusted.state, problem.free_camera, problem.free_poses, problem.points.image_size,
+        named_lens=solution.model_errors is None and solution.straight_lines is None,
+        worth=solution.repeated.worth,
+    )  # fmt: skip
 
 
-def _are_two_cameras(solution: Solution, found: Found, own: float) -> bool:
-    """Whether two cameras (or a moving zoom) on the given target fit better than one on the found target.
-
-    `own` is the squared error with a camera for each view.
-
-    A bent board alone can look like two cameras on the given target, so two cameras must also show on the
-    found target. A board that bends differently in some views shows that as well, but then two cameras fit
-    worse than the found target.
-    """
-    before, (_, after) = solution.adjusted, found.fits[0]
-    if _SURELY * own > after.cost.sum() or groups_of_views(*found.fits[0]) is None:
-        return False
-    groups = groups_of_views(solution.problem, before)
-    return groups is not None and bool((1.0 - groups.explained) * before.cost.sum() < after.cost.sum())
-
-
-def groups_of_views(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
-    """Test for two cameras among the views, or a moving zoom."""
-    if not problem.free.any():
-        return None
-    return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
-
-
-@frozen_dataclass(eq=False)
-class _Rivals:
-    """Causes that a small number of unknowns describes, on the given target, beside the found target."""
-
-    solution: Solution
-    wanted: float  # log evidence of the found target over that of the given one
-
-    @property
-    def spare(self) -> float:
-        """Number of equations beyond that of the unknowns."""
-        return self.solution.problem.views.n_equations - self.solution.problem.n_parameters
-
-    def more_probable(self, after: float, choices: float = 1.0) -> bool:
-        """Whether one unknown that leaves this squared error is more probable than the found target.
-
-        `choices` is the number of such causes among which this one was selected.
-        """
-        left = max(after / float(self.solution.adjusted.cost.sum()), 1.0 - _ALL)
-        occam = _OCCAM * np.log(self.solution.problem.views.n_equations) + np.log(choices)
-        return bool(-0.5 * self.spare * np.log(left) - occam > self.wanted)
-
-    def may_explain(self, own: float) -> bool:
-        """Whether a change of the camera may be more probable; `own` is the error with one for each view."""
-        before = float(self.solution.adjusted.cost.sum())
-        return bool(self.solution.problem.free.any()) and self.more_probable(
-            before - min((before - own) / _SURELY, _ALL * before)
-        )
-
-
-def _changes_between_views(rivals: _Rivals) -> bool:
-    """Whether a small change of the camera between the views is more probable than the found target.
-
-    A change of the image's size by 1 % looks like a target of another shape, or like bends of single views.
-    """
-    problem, adjusted, repeated = rivals.solution.problem, rivals.solution.adjusted, rivals.solution.repeated
-    views, free = problem.views, problem.free_camera
-    scores = scores_of_poses(adjusted.normal, free, problem.free_poses, repeated)
-    before = float(adjusted.cost.sum())
-    variance = before / rivals.spare
-    change = view_change(views, adjusted.state, free, scores, repeated.group, variance, rivals.spare)
-    return change is not None and rivals.more_probable((1.0 - change.explained) * before)
-
-
-def _are_turned(rivals: _Rivals) -> bool:
-    """Whether images turned by 180 degrees are more probable than the found target."""
-    problem, adjusted = rivals.solution.problem, rivals.solution.adjusted
-    views, free, size = problem.views, problem.free_camera, problem.points.image_size
-    if size is None or not problem.free[3:].all():
-        return False
-    q = reduced(adjusted.normal, free, problem.free_poses)
-    best, _ = best_turned(views, adjusted, q, free, middle_of(size, views))
-    return rivals.more_probable(float(best.cost.sum()), 2.0**views.n_views)
+def other_causes(solution: Solution, fit: tuple[Problem, Adjusted]) -> float:
+    """Log odds of the causes of the errors of a fit, if they are not the target's shape alone; else 0."""
+    held = contest_of(solution, fit)
+    return held.evidence if held is not None and held.beside_board else 0.0
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:

@@ -23,8 +23,8 @@ from neurocal_cli.calibration.lens_choice.candidate_models import as_fisheye
 from neurocal_cli.calibration.lens_choice.model_selection import predicts_decidedly_better
 from neurocal_cli.calibration.lens_choice.monotonic_fit import normal_part
 from neurocal_cli.calibration.lens_choice.rich_fit import promised, with_displacement
+from neurocal_cli.calibration.other_causes import contest_of
 from neurocal_cli.calibration.outlier_rejection import judged_again
-from neurocal_cli.calibration.verdict.view_groups import view_groups
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import Options
@@ -38,6 +38,7 @@ _PROMISED = 1.05  # the same for its prediction before the adjustment, which is 
 # Correlation of neighbouring residuals: from _ALIKE on the rich lens is tried, and up to _NOISE its own
 # residuals count as noise. Ordinary lenses leave 0.04 or less, a narrow bump 0.09.
 _ALIKE, _NOISE = 0.05, 0.15
+_MOST = 0.5  # share of the squared error that another cause explains if the lens does not
 
 
 def with_rich_lens(
@@ -70,7 +71,7 @@ def _rich_lens(solution: Solution) -> Solution | None:
     if views.n_views < _FEWEST or correlation(views, solution.residuals) < _ALIKE:
         return None
     repeated = solution.repeated
-    if repeated.n_poses < _FEWEST:
+    if repeated.n_poses < _FEWEST or _has_other_cause(solution):
         return None
     problem = problem.with_points(problem.points if target is None else target.as_given(problem.points))
     fisheye, adjusted = as_fisheye(problem, normalised(solution.in_pixels, problem.views))
@@ -88,10 +89,14 @@ def _rich_lens(solution: Solution) -> Solution | None:
     views, state = rich.problem.views, rich.state
     if correlation(views, point_residuals(views, state)) > _NOISE:
         return None
-    if view_groups(views, state, rich.adjusted.normal, rich.problem.free_of_prior) is not None:
-        return None
     rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale
     return replace(rich, model_errors={**(solution.model_errors or {}), "rich": rms})
+
+
+def _has_other_cause(solution: Solution) -> bool:
+    """Whether something else than the lens or the target explains half of the squared error."""
+    held = contest_of(solution)
+    return held is not None and held.beside_board and held.explained > _MOST
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:

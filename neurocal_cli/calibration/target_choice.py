@@ -20,22 +20,27 @@ import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.bend_evidence import most_probable_precision
-from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, Search, enough_views, find_target
+from neurocal_cli.adjustment.board.find import (
+    LEAST_GAIN,
+    Found,
+    Search,
+    enough_views,
+    evidence_as_given,
+    find_target,
+)
 from neurocal_cli.adjustment.board.information import of_views, without_points
 from neurocal_cli.adjustment.board.posterior import evidence_of_given
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.common_noise import reweighted
-from neurocal_cli.adjustment.outlier_views import free_networks
 from neurocal_cli.adjustment.problem import Problem, normalised
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.common_target import find_shape, views_suffice
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.other_causes import groups_of_views, has_other_cause, may_be_bent
+from neurocal_cli.calibration.other_causes import has_other_cause, may_be_bent, other_causes
 from neurocal_cli.calibration.outlier_rejection import NO_WORSE, fit_robustly
 from neurocal_cli.calibration.point_errors import places_of_views, rms, squared_whitened
-from neurocal_cli.calibration.verdict.view_groups import OWN_STEPS, variance_of_views
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.options import Options
@@ -48,10 +53,6 @@ _WORTH = 0.8  # least effective share of the views, where some repeat a pose
 _SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
 _FEWEST = 4  # fewest views for bends
 _EARLY = 0.5  # share of the required gain that the first step must predict
-# Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
-# most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
-# half 3 % worse.
-_SHARE, _NOISE = 0.9, 1.1
 _MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
 _HALVINGS = 30
 _LEAST_NOISE = 1e-3  # least pixel noise, as a share of the residuals' level
@@ -102,20 +103,30 @@ def _searched(
     """Alternate between target and camera as `with_target` does, from the views of one solution."""
     if not _can_tell(solution, choice, None):
         return solution, rejected
-    found = _found(solution, choice, None)
-    if choice != "flat":
-        found = _with_bends(solution, found)
+    common = _found(solution, choice, None)
+    found = common if choice == "flat" else _with_bends(solution, common)
     if found is not None and choice == "auto" and has_other_cause(solution, found):
         return solution, rejected
-    best = replace(solution, target_kept=choice == "auto")
+    kept = replace(solution, target_kept=choice == "auto")
+    # Bends that do not last when the camera is fitted to them were none.
+    for start in dict.fromkeys((found, common)):
+        settled = None if start is None else _settled(problem, kept, rejected, options, choice, start)
+        if settled is not None:
+            return settled
+    return kept, rejected
+
+
+def _settled(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str, start: Found
+) -> tuple[Solution, Rejected] | None:
+    """Alternate from a found target until the distortion model stays the same; None if it does not last."""
+    best, found = None, start
     for _ in range(_ROUNDS):
-        if found is None:
-            break
         (new, adjusted), *_ = found.fits
-        lens = new.distortion.model
+        lens, record = new.distortion.model, (solution if best is None else best).record
         # Views that contradicted only the given target have come back, so the record is the latest one.
-        start = replace(solution, problem=new, adjusted=adjusted, record=best.record)
-        again = _fitted_to(problem, found.target, start, rejected, options)
+        at = replace(solution, problem=new, adjusted=adjusted, record=record)
+        again = _fitted_to(problem, found.target, at, rejected, options)
         if again is None:
             break
         fitted, outliers = again
@@ -123,9 +134,10 @@ def _searched(
         if not (same_views or _can_tell(fitted, choice, found.target)):
             break
         if not _is_where_it_was(found, fitted):
-            found = _found(fitted, choice, found.target)
-        if found is None:
-            break
+            refound = _found(fitted, choice, found.target)
+            if refound is None:
+                break
+            found = refound
         (new, adjusted), *_ = found.fits
         posterior = None if found.posterior is None else (adjusted, found.posterior)
         best = replace(
@@ -134,7 +146,7 @@ def _searched(
         rejected = outliers
         if new.distortion.model == lens:
             break
-    return best, rejected
+    return None if best is None else (best, rejected)
 
 
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
@@ -204,24 +216,15 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
 def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     """Add a bend to each view if that explains why the views contradict each other.
 
-    Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
+    If another cause is more probable, the common target stays.
     """
     given = solution.problem, solution.adjusted
     found = _find_bends(given, common)
     if found is None or found.target.bends is None:
         return found
-    before, after = given if common is None else common.fits[0], found.fits[0]
-    least, flat = variance_of_views(after[0].views, after[1].state), _noise(*before, 0.0)
-    bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
-    if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
-        return common
-    # No two cameras of this lens can fit better than a camera for each view.
-    least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
-    if float(after[1].cost.sum()) < least_of_groups:
-        return found
-    groups = groups_of_views(*before)
-    explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
-    return found if groups is None or groups.explained < explained else common
+    before = given if common is None else common.fits[0]
+    rigid = evidence_as_given([given]) if common is None else common.evidence
+    return common if other_causes(solution, before) > found.evidence - rigid else found
 
 
 def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:
@@ -265,12 +268,6 @@ def _may_bend(problem: Problem, known: Target | None) -> bool:
         return is_flat(known.given) and not known.plane.any()
     given, _, ids = distinct_points([problem.points])
     return is_flat(given) and not planes_of(given, ids).any()
-
-
-def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
-    """Residual variance, normalised; `determined` unknowns are counted besides camera and poses."""
-    unknowns = int(problem.free_camera.sum()) + 6 * problem.views.n_views + determined
-    return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
 
 
 def _with_survey(

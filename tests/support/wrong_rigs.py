@@ -223,7 +223,7 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: in_parts(scene(), zoomed(zoomed(scene(), 0, 1.02), 1, 1.02), 6, right_only=False),
         "focal length of the left and the right"),
     "left camera zoomed by 10 % half way": (
-        lambda: in_parts(scene(), zoomed(scene(), 0, 1.1), 6, right_only=False), "two zooms"),
+        lambda: in_parts(scene(), zoomed(scene(), 0, 1.1), 6, right_only=False), "zoom or focus"),
     "images of one pair exchanged": (
         lambda: exchanged(seen(scene()), [3]), "left04/right04: the left and the right image are exchanged"),
     "images of every other pair exchanged": (

@@ -18,6 +18,7 @@ import numpy as np
 
 from neurocal_cli.adjustment.board.information import Information, Sight, of_views, without_points
 from neurocal_cli.adjustment.board.posterior import camera_step_of, log_evidence
+from neurocal_cli.adjustment.leave_out import least_by_precision
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.camera.geometry import Array
 
@@ -78,25 +79,6 @@ def evidence_by_precision(info: Information) -> Callable[[Array], Array]:
         return np.array([log_evidence(info.spare, *one) for one in both])
 
     return evidence
-
-
-def least_by_precision(M: Array, values: Array, along: Array) -> Callable[[Array], tuple[Array, Array]]:
-    """Minimum (k,) and log determinant (k,) of a quadratic, by precisions (k,) of independent unknowns.
-
-    M (f + 1, f + 1) is the quadratic in the common unknowns, bordered by the right side and the cost. Besides
-    these there are K unknowns with the information `values` (K,) and the coupling `along` (K, f + 1) to M,
-    and a normal prior of the given precision. The log determinant is over that of the prior.
-    """
-    f = len(M) - 1
-
-    def least(precision: Array) -> tuple[Array, Array]:
-        left = values + precision[:, None]
-        N = M - (along.T / left[:, None]) @ along
-        S, g = N[:, :f, :f], N[:, :f, f]
-        cost = N[:, f, f] - (g * np.linalg.solve(S, g[..., None])[..., 0]).sum(axis=1)
-        return cost, np.log(left / precision[:, None]).sum(axis=1) + np.linalg.slogdet(S)[1]
-
-    return least
 
 
 def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,12 @@ from neurocal_cli.adjustment.chi_squared import chi_squared
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.covariance import covariance_by_camera, entry_covariance
 from neurocal_cli.adjustment.cross_validation import FOLDS, Minimum, disagreement, held_out, reduced
+from neurocal_cli.adjustment.leave_out import inverse_or_nan
 from neurocal_cli.adjustment.outlier_views import conditions_on_views, free_networks, seen_from_behind
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.repeated_poses import repeated_poses
 from neurocal_cli.adjustment.reprojection import farthest_angle, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
-from neurocal_cli.adjustment.view_covariance import scores_of_poses
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import (
     Calibration,
@@ -32,7 +31,7 @@ from neurocal_cli.calibration.calibration import (
     estimated_parameters,
     free_entries,
 )
-from neurocal_cli.calibration.verdict.board_shape import BoardShape, board_shape
+from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import pixel_spread, verdict_of
 from neurocal_cli.calibration.verdict.given_parameters import (
@@ -43,7 +42,6 @@ from neurocal_cli.calibration.verdict.given_parameters import (
     reestimate_centre_and_target,
     reestimate_given,
 )
-from neurocal_cli.calibration.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import repeated_views
 from neurocal_cli.calibration.verdict.projection_uncertainty import (
@@ -53,21 +51,13 @@ from neurocal_cli.calibration.verdict.projection_uncertainty import (
 )
 from neurocal_cli.calibration.verdict.proportions import Proportions, proportions
 from neurocal_cli.calibration.verdict.rules import reach_verdict
-from neurocal_cli.calibration.verdict.view_change import ViewChange, view_change
-from neurocal_cli.calibration.verdict.view_groups import ViewGroups, view_groups
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.points import Correspondences
 
-if TYPE_CHECKING:
-    from neurocal_cli.calibration.verdict.moving_centre import MovingCentre
-
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
-# Relative change of the focal length that bends of single views can mimic: 0.26 % in one of 18 sets of
-# photographs and their halves, and none in simulated boards that bend from view to view.
-_BY_FLEXING = 0.005
 _CONTRADICTED = 1.6  # error over the noise floor from which on the board's proportions are tested
 _EXACT = 1e-4  # of the spread of the pixels: negligible errors
 _DISTANT = 10.0  # times the distance of the farthest point
@@ -179,9 +169,6 @@ class _AtMinimum:
         """All measures that the rules use."""
         views = self.views
         precision, contradiction = self._precision()
-        # Residuals beyond an estimated target come from bends that differ from view to view.
-        found = self.calibration.target is not None
-        noise = self.variance * (max(contradiction, 1.0) ** 2 if found else 1.0)
         alike, residuals = correlation(views, self.errors), self._residuals()
         stated = tuple(stated_noise(self.points, residuals, alike))
         return Evidence(
@@ -197,10 +184,7 @@ class _AtMinimum:
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
             # Sigmas that are wrong give single points the weight that all this is computed with.
-            change=None if stated else self._change(noise),
-            centre=None if stated else self._centre(contradiction),
-            turned=() if stated else self._turned(contradiction),
-            board=None if stated else self._board(),
+            contest=None if stated else self._contest(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
             doubt=self._doubt(),
@@ -210,8 +194,6 @@ class _AtMinimum:
                 *noise_shape(self.points, residuals, alike),
             ),
             stated=bool(stated),
-            groups=None if stated else self._groups(),
-            missing=self._missing(),
             proportions=self._proportions(contradiction),
         )
 
@@ -249,11 +231,6 @@ class _AtMinimum:
     def _is_exact(self) -> bool:
         return self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
 
-    def _groups(self) -> ViewGroups | None:
-        if self._is_exact() or not (self.free_poses and self.free[:5].any()):
-            return None
-        return view_groups(self.views, self.state, self.normal, self.free, self.networks)
-
     @cached_property
     def networks(self) -> Array:
         """(V,) squared error of a free network for each view."""
@@ -288,71 +265,21 @@ class _AtMinimum:
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
-    def _change(self, variance: float) -> ViewChange | None:
-        if not self.free.any() or self.repeated.n_poses < 2:
+    def _contest(self) -> Contest | None:
+        """The causes of the residuals."""
+        if self._is_exact():
             return None
-        scores = scores_of_poses(self.normal, self.free, self.free_poses, self.repeated)
-        change = view_change(
-            self.views, self.state, self.free, scores, self.repeated.group, variance, self.spare
-        )
-        if change is None or change.pattern != "groups" or self.calibration.target is None:
-            return change
-        # A board that bends differently in each view mimics two slightly different groups of views.
-        return None if abs(change.amount) < _BY_FLEXING else change
-
-    def _centre(self, contradiction: float) -> MovingCentre | None:
-        # The rays of a wide lens do not meet in one point, and a rich lens takes in every error.
-        special = self.camera.distortion.wide or self.state.model == "rich"
-        if special or not self.free_poses or self._is_exact():
-            return None
-        from neurocal_cli.calibration.verdict.moving_centre import moving_centre
-
-        q = reduced(self.normal, self.free, self.free_poses)
-        try:
-            return moving_centre(self.views, self.state, self.free, q, self.spare, contradiction)
-        except np.linalg.LinAlgError:  # the views do not determine the camera
-            return None
-
-    def _turned(self, contradiction: float) -> tuple[str, ...]:
-        special = self._is_exact() or self.state.model == "rich"
-        if self.points.image_size is None or special or not (self.free_poses and self.free[3:5].all()):
-            return ()
-        from neurocal_cli.calibration.verdict.turned_images import WithBoard, can_show, turned_images
-
-        if not can_show(self.views.n_views, contradiction, self.spare):
-            return ()
-        points, views = self._as_given()
-        estimated = None
-        if self.calibration.target is not None:
-            q = reduced(self.normal, self.free, True)
-            estimated = WithBoard(self.views, self.state, q)
-        floor = self.cost * self.views.pixel_scale**2 / contradiction**2
-        try:
-            state = normalised(self.given, views)
-            return turned_images(points, views, state, self.free, self.spare, floor, estimated)
-        except np.linalg.LinAlgError:  # the views do not determine the camera
-            return ()
+        selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
+        return contest(
+            self.views, self.state, self.free, self.free_poses, self.points.image_size,
+            named_lens=not selected, worth=self.repeated.worth,
+        )  # fmt: skip
 
     def _as_given(self) -> tuple[Correspondences, Views]:
         """The points at the coordinates of the given target, also arranged by views."""
         target = self.calibration.target
         points = self.points if target is None else target.as_given(self.points)
         return points, self.views if target is None else self._arranged(points)
-
-    def _board(self) -> BoardShape | None:
-        if not self.free[0] or not self.free_poses or self.calibration.target is not None:
-            return None
-        std = float(np.sqrt(self.covariance[0, 0]))
-        times = float(self.repeated.variance.mean())
-        return board_shape(self.minimum, self.variance, self.spare, times, std)
-
-    def _missing(self) -> MissingCoefficients | None:
-        selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
-        if selected or self._is_exact() or not self.free[0]:
-            return None
-        std = np.zeros(len(self.free))
-        std[self.free] = np.sqrt(np.diagonal(self.covariance))
-        return missing_coefficients(self.minimum, std[:5])
 
     def _proportions(self, contradiction: float) -> Proportions | None:
         given = self.calibration.target is None and self.calibration.type in (1, 2)
@@ -366,8 +293,13 @@ class _AtMinimum:
         difference, cov = disagreement(self.minimum)
         if not np.isfinite(cov).all():
             return np.nan
-        chi = chi_squared(difference, cov)
-        return chi * self.spare / max(self.cost, 1e-300) / len(difference)
+        # What is reported beyond independent noise concerns both halves, and four times their difference.
+        independent = self.variance * inverse_or_nan(
+            reduced(self.normal, self.free, self.free_poses).S.sum(axis=0)
+        )
+        values, vectors = np.linalg.eigh(np.nan_to_num(self.covariance - independent))
+        cov = self.variance * cov + 4 * (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return chi_squared(difference, cov) / len(difference)
 
     def projection(self) -> ProjectionUncertainty | None:
         """Uncertainty of projected pixels over the image; None if its size is unknown."""

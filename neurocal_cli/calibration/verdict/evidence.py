@@ -5,26 +5,17 @@ Coverage of the image and of directions in space by the points.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from neurocal_cli.adjustment.views import Views
-from neurocal_cli.calibration.verdict.board_shape import BoardShape
+from neurocal_cli.calibration.verdict.contest import Contest
 from neurocal_cli.calibration.verdict.findings import Finding
 from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated
-from neurocal_cli.calibration.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.calibration.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.calibration.verdict.proportions import Proportions
-from neurocal_cli.calibration.verdict.view_change import ViewChange
-from neurocal_cli.calibration.verdict.view_groups import ViewGroups
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration.verdict.moving_centre import MovingCentre
-
 
 _CELLS = 6  # across and down
 _THIRDS = (
@@ -76,7 +67,7 @@ def _relief(points: Correspondences, views: Views, state: CameraState) -> float:
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """Measures of a calibration's quality; the last six are None if there is nothing of the kind."""
+    """Measures of a calibration's quality; the last two are None if there is nothing of the kind."""
 
     rmse_px: float  # rms reprojection error of the calibration
     held_out_px: float  # five-fold cross-validation error; nan if no data can be left out
@@ -100,10 +91,5 @@ class Evidence:
     noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
     stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
     poses: int  # number of different poses among the views (`repeated_poses`)
-    groups: ViewGroups | None  # two cameras among the views, or a changing focal length
-    change: ViewChange | None  # of the camera between views
-    centre: MovingCentre | None  # moving from view to view
-    turned: tuple[str, ...]  # images that are turned by 180 degrees against the others
-    board: BoardShape | None  # bend or stretch of a target that is given as flat
-    missing: MissingCoefficients | None  # effect of coefficients that the chosen distortion model lacks
+    contest: Contest | None  # the causes of the residuals
     proportions: Proportions | None  # of a board whose axes have different units

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -32,6 +33,16 @@ class Limit:
         return int(value > self.good) + int(value > self.poor)
 
 
+# Rms over the image's diagonal: 0.16 px and 4 px of 640 x 480. Boards that are held by hand or stand on an
+# easel bend by as much as the first from view to view.
+DISPLACED = Limit(0.0002, 0.005)
+"""Limits of displaced pixels, over the image's diagonal."""
+
+
+ERROR = Limit(0.00125, 0.006)
+"""Limits of the rms error over the image's diagonal: 1 and 5 px of 640 x 480."""
+
+
 def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:
     """Verdict with the word of the worst finding, and all reasons and advice, the worst first, each once."""
     found = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
@@ -59,6 +70,16 @@ def name_some(names: Iterable[object]) -> str:
     some = [str(name) for name in names]
     more = len(some) - _SHOWN
     return ", ".join(some[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def in_sequence(names: tuple[str, ...]) -> list[int]:
+    """Indices that sort names of views in natural order, in which img2 comes before img10."""
+
+    def key(place: int) -> list[tuple[bool, int, str]]:
+        parts = re.findall(r"\d+|\D+", names[place])
+        return [(not part[0].isdecimal(), int(part) if part[0].isdecimal() else 0, part) for part in parts]
+
+    return sorted(range(len(names)), key=key)
 
 
 def image_diagonal(points: Correspondences) -> float:

@@ -216,7 +216,8 @@ def doubt_about_given(
             continue
         left = float(adjusted.cost.sum()) / before
         alike = correlation(views, point_residuals(views, adjusted.state))
-        n = effective_number(views.n_equations, alike)
+        spare = views.n_equations - 6 * views.n_views - int(free.sum())
+        n = effective_number(max(spare, 1.0), alike)
         gain = -0.5 * n * np.log(max(left, _ROUNDING)) - (added.sum() - 1)
         moved = _change_of_poses(state, adjusted.state, std_of_poses)
         if gain > max(most, _DECISIVE) and moved > TOLD_APART:

@@ -10,6 +10,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.findings import (
+    ERROR,
     WORDS,
     Finding,
     Limit,
@@ -18,7 +19,7 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.rules import ERROR, given_parameters
+from neurocal_cli.calibration.verdict.rules import given_parameters
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.observations.points import Correspondences
 

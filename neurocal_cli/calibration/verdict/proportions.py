@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.outlier_views import variance_of_views
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
-from neurocal_cli.calibration.verdict.view_groups import variance_of_views
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, nearest_rotation
 from neurocal_cli.camera.pinhole import omega_of, product_of

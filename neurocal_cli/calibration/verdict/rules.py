@@ -8,9 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, StopReason, Verdict, spare_equations
-from neurocal_cli.calibration.verdict.common_errors import common_errors
+from neurocal_cli.calibration.verdict.causes import closest, explains
+from neurocal_cli.calibration.verdict.causes import findings as causes
 from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
+    DISPLACED,
+    ERROR,
     Finding,
     Limit,
     image_diagonal,
@@ -29,17 +32,7 @@ from neurocal_cli.observations.target import Target
 
 # Repeated by test_wrong_inputs.py, in which no wrong input may be good, and by test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
-ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = Limit(1.6, 2.3)
-# Rms error above the noise floor over the image's diagonal (0.16 px of 640 x 480) that a board leaves if it
-# is held by hand or on an easel and bends from view to view. If the target was estimated, the standard
-# deviations include it.
-_FLEXING = 0.0002
-# Contradiction and disagreement (three standard deviations between two halves) that flexing does not leave
-# together. Of 66 calibrations of photographs of one camera and of their halves, one with a wrong distortion
-# model exceeds both; of 18 of photographs of two cameras, two zooms, moved crops and turned images, 14 do.
-# test_two_real_cameras_are_not_good repeats one of each.
-_TOO_MUCH_TO_FLEX = (1.3, 9.0)
 # Spare equations from which 95 % lie within 1.4 and within 1.2 times two standard deviations (Student's t).
 _SPARE = (4, 8)
 _HELD_OUT = Limit(1.3, 2.0)  # over the rms error
@@ -53,15 +46,18 @@ _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _GIVEN = Limit(0.002, 0.05)  # difference over alpha
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
+_CROPPED = 0.02  # share of the image's size: three std of a centre that is well known
 _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # rad. From photographs, the image axes of eight cameras are estimated to be off a right angle by up to
 # 0.0018, and the sides of their boards by up to 0.003. A board that leans by 0.006 and stands upright in
 # all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEW, _LEAN = 0.003, 0.004
+# Of nine boards of photographs, none is stretched by more than 0.7 %, and none of their points lie farther
+# than 0.17 % of the size from where a stretched board has them. One side against the other; rms over rms.
+_STRETCH, _STRETCHED_POOR, _SPACING = 0.01, 0.025, 0.004
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
 _FAR_BETTER = 0.5  # share of the error that remains with another camera than the given one
 _SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
-_NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
 
@@ -87,11 +83,9 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     if are_normalised(calibration.points):  # the other rules are in pixels
         yield from odd_pixels(calibration.points)
         return
-    if _oblong(calibration):  # a target stretched in one direction makes views differ as well
-        evidence = replace(evidence, groups=None)
     axes = evidence.proportions
     if axes is not None:  # the axes of the board explain what would be taken for another cause
-        evidence = replace(evidence, groups=None, change=None, board=None, missing=None)
+        evidence = replace(evidence, contest=None)
         yield 2, unlike_axes(axes), MEASURE_AXES
     if not calibration.converged:
         named = not calibration.lens_choice and calibration.distortion_model != "none"
@@ -102,10 +96,11 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
     # A given camera that is wrong explains the errors, so it is reported before them.
     yield from _given(calibration, evidence)
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
-    # A common error explains the others, so it is reported first even if it hardly biases the camera.
-    wide, estimated = calibration.camera.distortion.wide, calibration.target is not None
-    for grade, reason, advice in common_errors(evidence, calibration.unit, wide, estimated):
-        yield max([grade, *(of_error for of_error, *_ in errors)]), reason, advice
+    # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
+    contest = evidence.contest
+    if contest is not None and _explains(calibration, evidence):
+        for grade, reason, advice in causes(contest, calibration):
+            yield max([grade, *(of_error for of_error, *_ in errors)] if grade else [0]), reason, advice
     yield from errors
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
@@ -140,7 +135,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             _CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
-            "(the error of a separate camera for each view)",
+            f"(the error of a separate camera for each view){_unexplained(calibration, e)}",
             "check that all views are of one camera at one zoom and focus, that the target has the true "
             "shape, and that given parameters are right",
         )
@@ -152,9 +147,9 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "add points and views",
         )
         yield (
-            0 if flexes else _DISAGREEMENT.grade(e.disagreement),
-            f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            f"deviations{'' if _is_explained(e) else _NO_SINGLE_CAMERA}",
+            _DISAGREEMENT.grade(e.disagreement),
+            f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} times as much as "
+            "the standard deviations say",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
@@ -166,18 +161,24 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         )
 
 
-def _is_explained(e: Evidence) -> bool:
-    """Whether a cause is known why no single camera fits."""
-    return bool(e.groups or e.missing or e.proportions or e.stated or e.turned)
+def _unexplained(calibration: Calibration, e: Evidence) -> str:
+    """What is said of the cause, if no known one explains the error."""
+    if e.proportions or e.stated or _explains(calibration, e):
+        return ""
+    nearest = closest(e.contest, calibration)
+    return f", and no known cause explains it{f'; closest: {nearest}' if nearest else ''}"
+
+
+def _explains(calibration: Calibration, e: Evidence) -> bool:
+    """Whether causes are known that explain the error."""
+    error = e.rmse_px / image_diagonal(calibration.points)
+    return e.contest is not None and explains(e.contest, e.contradiction, error)
 
 
 def _by_flexing(e: Evidence, diagonal: float) -> bool:
     """Whether a board that bends from view to view may cause the error above the noise floor."""
     above = float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
-    contradiction, disagreement = _TOO_MUCH_TO_FLEX
-    return above < _FLEXING * diagonal and not (
-        e.contradiction > contradiction and e.disagreement > disagreement
-    )
+    return above < DISPLACED.good * diagonal
 
 
 def given_parameters(
@@ -319,26 +320,45 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "hardly any camera has such axes; check that the sides of the target are perpendicular, turn it "
             "by 90 degrees in some views, or give --no-skew",
         )
-    lean = 0.0 if calibration.target is None else _lean(calibration.target)
-    if "theta" not in fixed and lean > _LEAN:
-        yield (
-            1,
-            f"the sides of the target are off a right angle by {np.degrees(lean):.2f} degrees, more than "
-            "those of prints, so theta may be wrong by more than its std",
-            "measure the target, turn it by 90 degrees in some views, or give --no-skew",
-        )
+    if calibration.target is not None:
+        yield from _print(calibration.target, calibration)
     yield from off_centre
 
 
-def _lean(target: Target) -> float:
-    """Angle by which the sides of an estimated flat target are off a right angle [rad]; 0 for others."""
+def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
+    """Findings about an estimated flat target that differs from its description as no print does."""
     if target.plane.any() or not is_flat(target.given):
-        return 0.0
+        return
     from neurocal_cli.adjustment.board.open_stretch import stretches
 
     given, found = (points - points.mean(axis=0) for points in (target.given, target.found))
     linear = np.linalg.lstsq(given, found, rcond=None)[0]
-    return abs(float((stretches(given)[1] * linear).sum()))
+    stretch, lean = (stretches(given) * linear).sum(axis=(1, 2)).tolist()
+    if "theta" not in calibration.fixed and abs(lean) > _LEAN:
+        yield (
+            1,
+            f"the sides of the target are off a right angle by {np.degrees(abs(lean)):.2f} degrees, more "
+            "than those of prints, so theta may be wrong by more than its std",
+            "measure the target, turn it by 90 degrees in some views, or give --no-skew",
+        )
+    wrong = "no print is so far off, so its description is wrong, and the scale of the poses unknown"
+    measure = "measure the target along both sides, and give its true size"
+    if abs(stretch) > _STRETCH:
+        yield (
+            1 + int(abs(stretch) > _STRETCHED_POOR),
+            f"the target is {100 * abs(stretch):.2g} % {'longer' if stretch > 0 else 'shorter'} along its "
+            f"longer side, compared with the other one, than described: {wrong}",
+            measure,
+        )
+    plane = np.linalg.svd(given, full_matrices=False)[2][:2]
+    off = float(np.sqrt((((found - given @ linear) @ plane.T) ** 2).sum(axis=1).mean()))
+    if off > _SPACING * float(np.sqrt((given**2).sum(axis=1).mean())):
+        yield (
+            1,
+            f"the points of the target lie {off:.2g} {calibration.unit} rms from where it is described, "
+            f"within its plane: {wrong}",
+            measure,
+        )
 
 
 def _oblong(calibration: Calibration) -> bool:
@@ -356,9 +376,11 @@ def _off_centre(calibration: Calibration) -> Iterator[Finding]:
     off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
     uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
     if (off > np.array(size) / 2).any():
+        known = bool((uncertain < _CROPPED * np.array(size)).all())
         yield (
-            2,
-            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) lies outside the image",
+            1 if known else 2,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) lies outside the image"
+            + (", as in a cropped image" if known else ""),
             "add views from other angles, or give the centre with --type 2; check image_size",
         )
     elif (off > _OFF_CENTRE * np.array(size) + uncertain).any():

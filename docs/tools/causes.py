@@ -1,0 +1,41 @@
+"""Write the table of rival causes from the list of them.
+
+Run ``python docs/tools/causes.py`` and commit the result; a test compares the table.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "reference" / "causes.md"
+HEAD = "| cause | what the data look like | shared by | advice |\n| --- | --- | --- | --- |\n"
+
+
+def table() -> str:
+    """One row for each cause, and for each of its looks."""
+    sys.path[:0] = [str(ROOT)]
+    from neurocal_cli.calibration.verdict import patterns
+    from neurocal_cli.calibration.verdict.rivals import RIVALS
+
+    shared = {
+        patterns.common: "all views",
+        patterns.one_view: "one view",
+        patterns.changing: "all views in a pattern, or a group",
+        patterns.grouped: "a group of views",
+        None: "no views: each has its own",
+    }
+    rows = dict.fromkeys(
+        f"| {one.cause} | {one.looks} | {shared[one.patterns]} | {one.advice} |\n" for one in RIVALS
+    )
+    return HEAD + "".join(rows)
+
+
+def main() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(text[: text.index(HEAD)] + table(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Findings about the causes that won the contest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.verdict.contest import Contest
+from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, Finding, image_diagonal
+from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Told
+
+_SIGMAS = 2.0  # of the focal length, by which a cause may bias it
+_EXCESS = 0.5  # least share of the squared error above the noise floor that named causes explain
+_UNCLEAR = 3.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
+_LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
+
+
+def explains(contest: Contest, contradiction: float, error: float) -> bool:
+    """Whether hardly more than noise remains, or at least half of what is more than noise is explained.
+
+    `error` is the rms error over the image's diagonal; if it is large, a large one must not remain.
+    """
+    if error * np.sqrt(max(1.0 - contest.explained, 0.0)) > ERROR.good < error:
+        return False
+    excess = 1.0 - contradiction**-2
+    left = contradiction * float(np.sqrt(max(1.0 - contest.explained, 0.0)))
+    return not (left > _LEFT and contest.explained < _EXCESS * excess)
+
+
+def findings(contest: Contest, calibration: Calibration) -> Iterator[Finding]:
+    """What the causes do to the camera; nothing about one that cannot be told from the target's shape."""
+    estimated = calibration.target is not None
+    for place, (found, close) in enumerate(zip(contest.causes, contest.close, strict=True)):
+        if found.rival.of_board and estimated:
+            continue  # the standard deviations include it
+        if not found.rival.of_board and any(other.rival.of_board for other in close):
+            continue
+        grade, reason = _graded(contest, found, calibration)
+        if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
+            grade = max(grade, 1)  # the standard deviations do not include the board, lens and given values
+        names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
+        single = found.rival.patterns is None
+        if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
+            continue
+        if names:
+            reason += f" (or, hardly less probable: {', '.join(names)})"
+        yield grade, reason, found.rival.advice
+
+
+def closest(contest: Contest | None, calibration: Calibration) -> str:
+    """The words of the most probable cause; "" without any."""
+    if contest is None or not contest.causes:
+        return ""
+    return _graded(contest, contest.causes[0], calibration)[1]
+
+
+def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tuple[int, str]:
+    diagonal = image_diagonal(calibration.points)
+    told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal)
+    reason, size = found.rival.say(told)
+    grade = found.rival.limit.grade(size)
+    std = calibration.std["alpha_u"]
+    if found.weights.size and std > 0:
+        grade = max(grade, int(abs(told.longer) * told.alpha > _SIGMAS * std))
+    return grade, reason
+
+
+def _is_another(found: Estimate, other: Estimate) -> bool:
+    """Whether it is a cause of another kind; changes of zoom, size and camera between views are one kind."""
+    between_views = (found.rival, other.rival)
+    alike = all(one.patterns is not None and one.limit is not DISPLACED for one in between_views)
+    return other.rival.cause != found.rival.cause and not other.rival.unknown and not alike

@@ -1,0 +1,199 @@
+"""The contest of the rival causes: which ones explain the residuals, alone or together.
+
+The most probable rival wins, unless two simpler ones together are more probable. The winner is included in
+the camera, and the others compete for what is left, until none is more than chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
+from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Rival, estimates, including
+from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
+
+_AHEAD = 6  # rivals that are tried together with another one
+_MOST = 3  # causes at once
+_MINOR = 0.05  # share of a cause's evidence below which a further one is what its linearisation leaves
+_FAR = 0.25  # the same after a cause that was fitted
+_PART = 0.25  # of the evidence: a good part
+_STEPS = 30
+_MUCH = 0.3  # share of the squared error
+_LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
+
+
+@frozen_dataclass(eq=False)
+class Contest:
+    """The causes that explain the residuals of a camera, the first one found first."""
+
+    lin: Linearised
+    causes: tuple[Estimate, ...]  # that were included in turn
+    close: tuple[tuple[Estimate, ...], ...]  # rivals that are hardly less probable, of each cause
+    explained: float  # share of the squared error that all of them explain
+    evidence: float  # log odds over nothing if the residuals of neighbours were independent
+
+    @property
+    def beside_board(self) -> bool:
+        """Whether known causes other than the shape of the target are a good part of the explanation."""
+        others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
+        return sum(others) > _PART * sum(one.evidence for one in self.causes)
+
+
+def contest(
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    image_size: tuple[int, int] | None,
+    *,
+    named_lens: bool = True,
+    worth: float = 1.0,
+) -> Contest | None:
+    """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
+
+    The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
+    estimated. A lens that was selected is not too simple. `worth` is the effective share of the views if they
+    repeat poses.
+    """
+    if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
+        return None
+    lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
+    try:
+        return _held(lin, RIVALS, worth)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
+    n = lin.spare * worth
+    ranking = estimates(lin, n, rivals, LEVEL)
+    fits: dict[str, _Fit] = {}
+    if ranking and ranking[0].evidence > LEVEL:
+        fits = {one.rival.cause: fit for one in ranking if (fit := _fitted(lin, one)) is not None}
+        # Alike even with the best rival, not because of it.
+        errors = lin.residuals(_steps(lin, ranking[0]))
+        closest = min(fits.values(), key=lambda fit: fit.cost, default=_Fit(np.inf))
+        if closest.errors is not None and closest.cost < float((errors**2).sum()):
+            errors = closest.errors
+        n = effective_number(n, correlation(lin.views, errors))
+        ranking = [
+            fits[one.rival.cause].of(one, lin) if one.rival.cause in fits else one
+            for one in estimates(lin, n, rivals)
+        ]
+        ranking.sort(key=lambda one: -one.evidence)
+    share = n / lin.spare
+    at, evidence, left, least = lin, 0.0, 1.0, 0.0
+    causes: list[Estimate] = []
+    close: list[tuple[Estimate, ...]] = []
+    while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
+        ranking = _known_first(ranking)
+        best = _with_another(at, ranking, rivals, share)
+        alone = best is ranking[0]
+        causes.append(best)
+        close.append(tuple(one for one in ranking[1:] if alone and one.evidence > best.evidence - LEVEL))
+        evidence, left = evidence + best.evidence, left * (1.0 - best.explained)
+        far = best.rival.cause in fits
+        at, least = including(at, best), max(least, (_FAR if far else _MINOR) * best.evidence)
+        ranking = estimates(at, at.spare * share, _others(rivals, causes))
+    # As an estimated target counts it: all residuals as independent.
+    evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
+    return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence)
+
+
+def _known_first(ranking: list[Estimate]) -> list[Estimate]:
+    """A known cause that is hardly less probable than that of none comes first."""
+    for one in ranking:
+        if one.evidence < ranking[0].evidence - LEVEL:
+            break
+        if not one.rival.unknown:
+            return [one, *(other for other in ranking if other is not one)]
+    return ranking
+
+
+def _others(rivals: Iterable[Rival], causes: Iterable[Estimate]) -> tuple[Rival, ...]:
+    known = {one.rival.cause for one in causes}
+    return tuple(one for one in rivals if one.cause not in known)
+
+
+def _with_another(
+    at: Linearised, ranking: list[Estimate], rivals: tuple[Rival, ...], share: float
+) -> Estimate:
+    """The best rival, or that of the best pair which is more probable together."""
+    best, highest = ranking[0], ranking[0].evidence + LEVEL
+    if best.weights.size and best.pattern == "all":
+        return best  # few unknowns do not look like two causes by chance
+    for one in ranking[:_AHEAD]:
+        if not one.weights.size or one.evidence < LEVEL or one.rival.unknown:
+            continue
+        both = including(at, one)
+        second = estimates(both, both.spare * share, _others(rivals, [one]))
+        # Groups of views that are found by their residuals look like changes of single views.
+        alone = one.pattern in ("all", "one")
+        second = [other for other in second if not other.rival.unknown and (alone or other.pattern == "all")]
+        if second and one.evidence + second[0].evidence > highest:
+            best, highest = one, one.evidence + second[0].evidence
+    return best
+
+
+@frozen_dataclass(eq=False)
+class _Fit:
+    """A rival that was fitted, because it looks different beyond the linear range."""
+
+    cost: float
+    entries: Array | None = None  # of A, if the views share one camera
+    errors: Array | None = None  # (N, 2) residuals, if so
+
+    def of(self, one: Estimate, lin: Linearised) -> Estimate:
+        """The estimate with this cost, if it is lower."""
+        left = (1.0 - one.explained) * lin.cost
+        if not 0 < self.cost < left:
+            return one
+        n, camera = left / one.noise, one.camera
+        if self.entries is not None:
+            camera = camera.copy()
+            of_entries = lin.free < 5
+            camera[of_entries] = (self.entries - lin.state.entries[0])[lin.free[of_entries]]
+        gained = 0.5 * n * float(np.log(left / self.cost))
+        return replace(
+            one, evidence=one.evidence + gained, explained=1.0 - self.cost / lin.cost, camera=camera,
+            noise=self.cost / n,
+        )  # fmt: skip
+
+
+def _fitted(lin: Linearised, one: Estimate) -> _Fit | None:
+    """Fit two cameras that are far apart, or a lens that explains much; None for others."""
+    views, state, K = lin.views, lin.state, len(lin.state.k)
+    if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > _LINEAR:
+        free, member, cost = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5, 0.0
+        for which in (np.flatnonzero(member), np.flatnonzero(~member)):
+            cost += float(
+                adjust(views.subset(which).batches, state.of_views(which), free, True, _STEPS).cost.sum()
+            )
+        return _Fit(cost)
+    if one.rival.cause == "a lens that is too simple" and one.explained > _MUCH:
+        added = lin.columns["lens"][: len(one.amounts)]
+        free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
+        fit = adjust(views.batches, state, free, True, _STEPS)
+        errors = point_residuals(views, fit.state)
+        return _Fit(float(fit.cost.sum()), fit.state.entries[0], errors)
+    return None
+
+
+def _steps(lin: Linearised, found: Estimate) -> np.ndarray:
+    """(V, c) steps of all columns with a rival."""
+    V = lin.views.n_views
+    amounts = found.amounts if not found.weights.size else found.weights[:, None] * found.amounts
+    steps = amounts @ found.rival.steps_at(lin).T
+    own = np.zeros((V, lin.width))
+    own[:, lin.free] = found.camera
+    return own + steps

@@ -1,0 +1,119 @@
+"""What rival causes do to the pixels: columns of derivatives, and steps of the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen
+from neurocal_cli.calibration.verdict.rival import Steps
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.geometry import Array
+
+BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Powers of x and y of a smooth bend; lower ones describe the plane."""
+_GLASS = 1.5  # its refractive index
+
+
+def bends(seen: Seen) -> Array | None:
+    """Heights of the board that are powers of the place on it."""
+    if seen.by_board is None or seen.places is None:
+        return None
+    x, y = seen.places
+    return np.stack([x**i * y**j for i, j in BENDS], axis=1)[:, :, None] * seen.by_board[:, 2:]
+
+
+def stretch(seen: Seen) -> Array | None:
+    """A print that is longer along the board, and whose sides lean."""
+    if seen.by_board is None or seen.places is None:
+        return None
+    return seen.by_board[:, :1] * np.stack(list(seen.places), axis=1)[:, :, None]
+
+
+def glass(seen: Seen) -> Array | None:
+    """A plate of glass on the board: points move away from the foot of the camera's perpendicular."""
+    if seen.by_board is None or seen.to_camera is None:
+        return None
+    slope = seen.to_camera[:, :2] / np.abs(seen.to_camera[:, 2:])  # tangents of the angles of incidence
+    s2 = (slope**2).sum(axis=1, keepdims=True)
+    shift = slope * (1 / np.sqrt(_GLASS**2 * (1 + s2) - s2) - 1 / _GLASS)
+    return (seen.by_board[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
+
+
+def turning(seen: Seen) -> Array:
+    """The camera turns while the rows are read."""
+    return seen.by_entries[:, 3:5] * seen.pixels[:, None, None, 1]
+
+
+def moving(seen: Seen) -> Array | None:
+    """The target moves past the camera while the rows are read; nearer points move farther."""
+    if seen.to_camera is None:
+        return None
+    nearer = 1 / np.linalg.norm(seen.to_camera, axis=1)
+    return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
+
+
+def cut(axis: int) -> Effect:
+    """The farther half of the images along u or v is displaced."""
+    return lambda seen: seen.by_entries[:, 3:5] * (seen.pixels[:, None, None, axis] > 0)
+
+
+def blocks(side: int) -> Effect:
+    """Displacements that depend on the place within blocks of this size [px]."""
+
+    def effect(seen: Seen) -> Array:
+        phase = 2 * np.pi * (seen.observed + 0.5) / side
+        waves = np.stack([np.cos(phase), np.sin(phase)], axis=2)[:, :, :, None]  # (T, axis, 2, 1, n)
+        return np.concatenate([seen.by_entries[:, 3 + a, None] * waves[:, a] for a in (0, 1)], axis=1)
+
+    return effect
+
+
+def focal_length(lin: Linearised) -> Array:
+    """A change of the focal length, relative."""
+    steps = np.zeros((lin.width, 1))
+    steps[:3, 0] = lin.state.entries[0, :3]
+    return steps if np.isin((0, 2), lin.free).all() else steps[:, :0]
+
+
+def image_size(lin: Linearised) -> Array:
+    """A change of the size of the image, relative."""
+    corner = lin.views.pixel_centre / lin.views.pixel_scale
+    return _of_entries(lin, lin.state.entries[0] + np.append([0.0, 0.0, 0.0], corner))
+
+
+def centre(lin: Linearised) -> Array:
+    """A change of the image centre, over the focal length."""
+    return _of_entries(lin, *(lin.state.entries[0, 0] * np.eye(5)[3:]))
+
+
+def camera(lin: Linearised) -> Array:
+    """A change of the focal lengths and the centre, over the focal length."""
+    return _of_entries(lin, *(lin.state.entries[0, 0] * np.eye(5)[[0, 2, 3, 4]]))
+
+
+def camera_and_lens(lin: Linearised) -> Array:
+    """The same, and the coefficients of the lens."""
+    steps, k = camera(lin), lin.free[(lin.free >= 5) & (lin.free < 5 + len(lin.state.k))]
+    return np.concatenate([steps, np.eye(lin.width)[:, k]], axis=1) if steps.size else steps
+
+
+def given(lin: Linearised) -> Array:
+    """A change of the given focal lengths and centre, over the focal length."""
+    places = lin.given[lin.given != 1]
+    steps = np.zeros((lin.width, len(places)))
+    steps[places, np.arange(len(places))] = lin.state.entries[0, 0]
+    return steps
+
+
+def lens(model: str) -> Steps:
+    """The coefficients that a model has and the chosen one lacks."""
+    lacking = 5 + len(coefficient_names(model))
+    return lambda lin: np.eye(lin.width)[:, lin.columns["lens"][lin.columns["lens"] < lacking]]
+
+
+def _of_entries(lin: Linearised, *changes: Array) -> Array:
+    steps = np.zeros((lin.width, len(changes)))
+    if not np.isin((0, 2, 3, 4), lin.free).all():
+        return steps[:, :0]
+    steps[:5] = np.stack(changes, axis=1)
+    return steps

@@ -1,0 +1,204 @@
+"""A camera at its minimum, linearised, with the effects by which rival causes would change its pixels.
+
+An effect is some columns of derivatives by what is usually not estimated, such as bends of the board or the
+movement of the camera while the rows are read. With each view's pose eliminated, a small matrix of each view
+tells all that the residuals say about the camera and the effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.normal_equations import eliminate
+from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, derivatives
+from neurocal_cli.adjustment.views import Views
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.state import CameraState
+
+_RIDGE = 1e-13  # as in cross-validation
+_FLAT = 0.02  # largest thickness over size of a board that counts as flat
+_ACROSS = 11  # points of a grid on the board
+
+
+@frozen_dataclass(eq=False)
+class Board:
+    """The axes of the one flat board that all views show."""
+
+    centre: Array
+    axes: Array  # (3, 3) columns: along the board, across it, its normal
+    size: float  # farthest point along it [world unit]
+    aspect: float  # across over along
+
+    @classmethod
+    def of(cls, views: Views) -> Board | None:
+        """Axes of the points of all views; None if they do not lie in a common plane."""
+        if not views.nearly_flat.all():
+            return None
+        world = views.local * np.repeat(views.scale, views.counts)[:, None]
+        world += np.repeat(views.centre, views.counts, axis=0)
+        centre = world.mean(axis=0)
+        axes = np.linalg.eigh((world - centre).T @ (world - centre))[1][:, ::-1]
+        size = np.abs((world - centre) @ axes).max(axis=0)
+        return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else None
+
+    def bend(self, height: Callable[[Array, Array], Array]) -> float:
+        """Height between the highest and the lowest point [world unit], of heights over the half length."""
+        ends = np.linspace(-1, 1, _ACROSS)
+        x, y = np.repeat(ends, _ACROSS), self.aspect * np.tile(ends, _ACROSS)
+        plane, z = np.column_stack([np.ones_like(x), x, y]), height(x, y)
+        return float(np.ptp(z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0])) * self.size
+
+
+@frozen_dataclass(eq=False)
+class Seen:
+    """T batches of n points each, for the functions that return an effect's columns (T, m, 2, n)."""
+
+    by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
+    pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
+    observed: Array  # (T, 2, n) where they were observed [px]
+    # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
+    # places x, y (2, T, n) on it, over the same; and the directions (T, 3, n) to the camera along these axes.
+    # They are None without a common flat board.
+    by_board: Array | None = None
+    places: Array | None = None
+    to_camera: Array | None = None
+
+
+Effect = Callable[[Seen], Array | None]
+
+
+@frozen_dataclass(eq=False)
+class Linearised:
+    """One camera, linearised at its minimum, with the poses of its views eliminated.
+
+    All is normalised. The columns are the entries of A, the coefficients of the lens, the effects and, as the
+    last one, the residual.
+    """
+
+    views: Views
+    state: CameraState  # with the coefficients that the distortion model lacks, as zeros
+    effects: tuple[Effect, ...]
+    middle: Array  # (2,) of the image
+    R: Array  # (V, c + 1, c + 1)
+    before: Array  # (V, c) diagonal of the same before the poses were eliminated
+    solved: Array  # (V, 6, c + 1) response of the poses to the columns, and their own step
+    columns: Mapping[
+        Effect | str, NDArray[np.intp]
+    ]  # of each effect, and of the "lens" that is not estimated
+    free: NDArray[np.intp]  # columns that are estimated
+    given: NDArray[np.intp]  # those of the entries of A that are given
+    spare: float  # equations beyond the unknowns
+    board: Board | None
+
+    @property
+    def width(self) -> int:
+        """Number of columns c without the residual."""
+        return self.R.shape[1] - 1
+
+    @property
+    def cost(self) -> float:
+        """Squared error."""
+        return float(self.R[:, -1, -1].sum())
+
+    def residuals(self, step: Array) -> Array:
+        """(N, 2) residuals in the order of the points, after steps (V, c) of all columns."""
+        poses = self.solved[..., -1] - (self.solved[..., :-1] @ step[..., None])[..., 0]
+        batches, camera = self.views.batches, 5 + len(self.state.k)
+        whole = np.concatenate([step[:, :5], poses, step[:, 5:camera], step[:, camera:]], axis=1)
+        left = np.empty((len(batches.view), 2, batches.local.shape[2]))
+        for chunk, J, _ in _derivatives(self.views, self.state, self.middle, self.board, self.effects):
+            left[chunk] = J[:, -1] - np.einsum("tc,tcin->tin", whole[batches.view[chunk]], J[:, :-1])
+        errors = np.swapaxes(left, 1, 2).reshape(-1, 2)
+        if len(errors) == len(self.views.index):
+            return errors
+        return errors[np.repeat(batches.first * left.shape[2], self.views.counts) + self.views.rank]
+
+
+def linearised(
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    effects: tuple[Effect, ...],
+    image_size: tuple[int, int] | None,
+    richer: bool = True,
+) -> Linearised:
+    """Linearise a camera at its minimum.
+
+    The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
+    estimated. `richer` asks for the coefficients that the distortion model lacks.
+    """
+    if richer and state.model in POLYNOMIAL_MODELS[:-1]:
+        state = state.with_model(POLYNOMIAL_MODELS[-1])
+    K, board = len(state.k), Board.of(views)
+    middle = np.zeros(2)
+    if image_size is not None:
+        middle = ((np.array(image_size) - 1) / 2 - views.pixel_centre) / views.pixel_scale
+    parts = list(_derivatives(views, state, middle, board, effects))
+    widths = parts[0][2]
+    flat = [J.reshape(*J.shape[:2], -1) for _, J, _ in parts]
+    N = views.batches.sum_by_view(np.concatenate([J @ np.swapaxes(J, 1, 2) for J in flat]))
+    kept = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[1])])
+    if free_poses:
+        R, solved = eliminate(N, kept, POSE_COLUMNS, _RIDGE)
+    else:
+        R, solved = N[:, kept[:, None], kept], np.zeros((len(N), 6, len(kept)))
+    columns: dict[Effect | str, NDArray[np.intp]] = {"lens": np.arange(len(free), 5 + K)}
+    at = 5 + K
+    for effect, width in widths.items():
+        columns[effect] = np.arange(at, at + width)
+        at += width
+    spare = views.n_equations - int(free.sum()) - (6 * views.n_views if free_poses else 0)
+    return Linearised(
+        views, state, effects, middle, R, N[:, kept[:-1], kept[:-1]], solved, columns,
+        np.flatnonzero(free), np.flatnonzero(~free[:5]), max(spare, 1.0), board,
+    )  # fmt: skip
+
+
+def _derivatives(
+    views: Views, state: CameraState, middle: Array, board: Board | None, effects: tuple[Effect, ...]
+) -> Iterator[tuple[slice, Array, dict[Effect, int]]]:
+    """Derivatives (T, c + 7, 2, n) of chunks of the batches, and the widths of the effects among them."""
+    batches, K = views.batches, len(state.k)
+    for chunk in batches.chunks():
+        view, observed = batches.view[chunk], batches.pixels[chunk]
+        J = np.zeros((len(view), 12 + K, 2, observed.shape[2]))
+        derivatives(batches, chunk, state, J)
+        # An effect at the observed places would contain the noise that it has to explain.
+        off = J[:, -1].copy()
+        if batches.whitening is not None:
+            w = batches.whitening[chunk].swapaxes(0, 1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off[:, 1] /= w[2]
+                off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
+            off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
+        px = views.pixel_scale * observed + views.pixel_centre[:, None]
+        seen = Seen(J[:, :5], observed - off - middle[:, None], px)
+        if board is not None:
+            seen = _on_board(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
+        found = {effect: part for effect in effects if (part := effect(seen)) is not None}
+        widths = {effect: part.shape[1] for effect, part in found.items()}
+        yield chunk, np.concatenate([J[:, :-1], *found.values(), J[:, -1:]], axis=1), widths
+
+
+def _on_board(
+    seen: Seen,
+    views: Views,
+    state: CameraState,
+    board: Board,
+    view: NDArray[np.intp],
+    local: Array,
+    by_pose: Array,
+) -> Seen:
+    n, scale, back = local.shape[2], views.scale[view][:, None, None], np.swapaxes(state.R[view], 1, 2)
+    world = local * scale + views.centre[view][:, :, None]
+    places = np.moveaxis(board.axes[:, :2].T @ (world - board.centre[:, None]) / board.size, 1, 0)
+    by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
+    by_board = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
+    to_camera = np.einsum("ia,tin->tan", board.axes, -back @ state.t[view][:, :, None] - local)
+    return Seen(seen.by_entries, seen.pixels, seen.observed, by_board, places, to_camera)

@@ -1,0 +1,205 @@
+"""The list of rival causes.
+
+To add a cause, add a `Rival`: what it does to the pixels (`effects`) or to the camera, the pattern in which
+views share it (`patterns`), and its words. Ten lines are usual.
+"""
+
+from __future__ import annotations
+
+from neurocal_cli.calibration.verdict import effects, patterns, words
+from neurocal_cli.calibration.verdict.findings import DISPLACED, Limit
+from neurocal_cli.calibration.verdict.rival import Rival
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
+
+# A result is off by half of a change; careful calibrations state 0.05 %.
+_CHANGED = Limit(0.001, 0.05)  # of the focal length
+_APART = Limit(0.01, 0.05)  # of the focal length
+# Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 %.
+_OFF = Limit(0.005, 0.05)  # of the focal length
+_GIVEN = Limit(0.002, 0.05)  # of the focal length
+_LENS = Limit(0.0002, 0.002)  # of the image's diagonal: 0.16 px and 1.6 px of 640 x 480
+_MOVED = Limit(0.0012, 0.02)  # of the image's diagonal; photographs taken by hand move by up to 0.001
+_BLOCKS = (8, 16)  # sizes of the blocks of video codecs [px]
+_FIXED = "keep zoom and focus fixed, autofocus off, and all images at one size"
+_APART_ADVICE = "calibrate these views and the others separately, and give all images as they were stored"
+_FLAT = "use a board that is flat, or measure its shape and give X,Y,Z as measured"
+_STIFF = "fix the target to something stiff"
+_STILL = "keep camera and target still, or use a camera with a global shutter"
+_WHOLE = "give the images as the sensor has them, or calibrate each half as a camera of its own"
+
+RIVALS: tuple[Rival, ...] = (
+    *(
+        Rival(
+            "a lens that is too simple",
+            "residuals that grow towards the corners in the same way in all views",
+            "give --distortion auto, or a model with more coefficients",
+            words.too_simple(model),
+            _LENS,
+            patterns.common,
+            steps=effects.lens(model),
+        )
+        for model in POLYNOMIAL_MODELS[1:]
+    ),
+    Rival(
+        "a wrong given parameter",
+        "the given focal length or centre, moved, takes the residuals away",
+        "check that what is given is of the same camera at the same zoom, focus and image size",
+        words.wrongly_given,
+        _GIVEN,
+        patterns.common,
+        steps=effects.given,
+    ),
+    Rival(
+        "a changing focal length",
+        "scaled residuals around the centre, along the sequence, by distance or tilt, or in a group of views",
+        _FIXED,
+        words.changing("the focal length"),
+        _CHANGED,
+        patterns.changing,
+        steps=effects.focal_length,
+    ),
+    Rival(
+        "a changing image size",
+        "scaled residuals around the image's corner, in the same patterns",
+        _FIXED,
+        words.changing("the size of the image"),
+        _CHANGED,
+        patterns.changing,
+        steps=effects.image_size,
+    ),
+    Rival(
+        "a zoom that moves",
+        "each view asks for a focal length of its own",
+        "calibrate one zoom and one focus at a time; switch autofocus off",
+        words.zooming,
+        _APART,
+        steps=effects.focal_length,
+    ),
+    Rival(
+        "image stabilisation",
+        "each view asks for a centre of its own",
+        "switch image stabilisation off, or expect that predicted pixels are off by as much",
+        words.stabilised,
+        _CHANGED,
+        steps=effects.centre,
+    ),
+    *(
+        Rival(
+            "two cameras",
+            "two groups of views, each with one camera: other images, crops, images turned or exchanged",
+            _APART_ADVICE,
+            words.two_cameras,
+            _APART,
+            patterns.grouped,
+            steps=steps,
+        )
+        for steps in (effects.camera_and_lens, effects.centre)
+    ),
+    Rival(
+        "one odd view",
+        "one view asks for another camera than the others",
+        "leave this view out, or give it as the camera has stored it",
+        words.odd_view,
+        DISPLACED,
+        patterns.one_view,
+        steps=effects.camera,
+    ),
+    Rival(
+        "a bent target",
+        "residuals that repeat on the target in all views, along its normal",
+        _FLAT,
+        words.bent,
+        _OFF,
+        patterns.common,
+        effect=effects.bends,
+        of_board=True,
+    ),
+    Rival(
+        "a stretched target",
+        "residuals that repeat on the target in all views, within its plane",
+        _FLAT,
+        words.stretched,
+        _OFF,
+        patterns.common,
+        effect=effects.stretch,
+        of_board=True,
+    ),
+    Rival(
+        "a target that bends",
+        "smooth residuals along the target's normal, in each view others",
+        _STIFF,
+        words.plain("the target bends from view to view, by {px} px rms"),
+        DISPLACED,
+        effect=effects.bends,
+        of_board=True,
+    ),
+    Rival(
+        "a target that is bent in one view",
+        "the same in one view alone",
+        f"leave this view out, or {_STIFF}",
+        words.bent_view,
+        DISPLACED,
+        patterns.one_view,
+        effect=effects.bends,
+        of_board=True,
+    ),
+    Rival(
+        "a plate of glass",
+        "points that move away from the foot of the camera's perpendicular on the target",
+        "take the glass away",
+        words.plain("the points are displaced by {px} px rms, as if seen through a plate of glass"),
+        DISPLACED,
+        patterns.common,
+        effect=effects.glass,
+    ),
+    *(
+        Rival(
+            "a rolling shutter",
+            "displacements that grow with the row, in each view others",
+            _STILL,
+            words.rolling,
+            _MOVED,
+            effect=effect,
+        )
+        for effect in (effects.turning, effects.moving)
+    ),
+    *(
+        Rival(
+            f"a cut along {'vu'[axis]}",
+            "two halves of the images that are displaced against each other",
+            _WHOLE,
+            words.cut(*halves),
+            DISPLACED,
+            patterns.common,
+            effect=effects.cut(axis),
+        )
+        for axis, halves in enumerate((("left", "right"), ("upper", "lower")))
+    ),
+    *(
+        Rival(
+            "a video codec",
+            f"residuals that repeat in blocks of {side} px",
+            "take single images, or a video of higher quality",
+            words.plain(f"residuals of {{px}} px rms repeat in blocks of {side} px, as of a video codec"),
+            DISPLACED,
+            patterns.common,
+            effect=effects.blocks(side),
+        )
+        for side in _BLOCKS
+    ),
+    Rival(
+        "no single camera",
+        "each view asks for a camera of its own, for no known reason",
+        "check that all views are of one camera, and that the target has the true shape",
+        words.plain(
+            "each view asks for a camera of its own, by {px} px rms: no single camera fits, as with a target "
+            "of another shape"
+        ),
+        DISPLACED,
+        steps=effects.camera,
+        unknown=True,
+    ),
+)
+"""All rivals; those with the same name are alternatives of one cause."""
+EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
+"""All effects of the rivals."""

@@ -1,0 +1,226 @@
+"""What is said of the causes that won: a reason with amounts, and the size by which it is graded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from neurocal_cli.adjustment.adjust import adjust
+from neurocal_cli.adjustment.outlier_views import seen_from_behind
+from neurocal_cli.calibration.verdict.effects import BENDS
+from neurocal_cli.calibration.verdict.findings import in_sequence, name_some
+from neurocal_cli.calibration.verdict.rival import Said, Say, Told
+from neurocal_cli.camera.geometry import Array
+
+_NEAR = 0.02  # of the focal length: equal up to this
+_HALF_SIZE = 0.05  # relative difference between the ratios of two image sizes
+_TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
+_AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
+_PRINTED = 0.01  # stretch that printers do not make
+_DETERMINE = 3  # views that determine a camera of their own
+_STEPS = 30
+_WRONG_PRINT = "; no print is so far off, so its description is wrong, and the scale unknown"
+
+
+def plain(text: str) -> Say:
+    """Words whose only amount is that of the displaced pixels."""
+    return lambda told: (text.format(px=f"{told.displaced:.2g}"), told.displaced / told.diagonal)
+
+
+def changing(what: str) -> Say:
+    """A focal length or an image size that changes between the views."""
+
+    def say(told: Told) -> Said:
+        amount, pattern = float(told.found.amounts[0]), told.found.pattern
+        by = f"{what} {'grows' if amount > 0 else 'shrinks'} by {100 * abs(amount):.2g} %"
+        turned = "the target changes its shape as it is turned, or the lens gives way"
+        wide = told.lin.state.distortion.wide
+        rays = ", or the rays of this wide lens do not meet in one point" if wide else ""
+        how = {
+            "line": "along the sequence of the views, so zoom or focus moves",
+            "distance": f"from the farthest to the nearest view, so the focus moves{rays}",
+            "tilt along u": f"from views of the target turned to the left to those to the right, so {turned}",
+            "tilt along v": f"from views of the target turned upwards to downwards, so {turned}",
+            "step": f"from view {told.members[0]} on, so zoom or focus has moved" if told.members else "",
+        }
+        if pattern in how:
+            return f"{by} {how[pattern]}", abs(amount)
+        return (
+            f"{name_some(told.members)}: these views are scaled by {1 + amount:.4g} against the others, so "
+            "the images are of two sizes, or of two settings of zoom or focus",
+            abs(amount),
+        )
+
+    return say
+
+
+def zooming(told: Told) -> Said:
+    """A focal length of each view's own."""
+    size = float(np.ptp(told.found.amounts))
+    by = f"{100 * size:.2g} %"
+    return f"the focal length changes from view to view, by {by} in all: the zoom or the focus moved", size
+
+
+def stabilised(told: Told) -> Said:
+    """A centre of each view's own; not of interest if it moves less than it is known."""
+    size = float(np.sqrt((told.found.amounts**2).mean()))
+    known = max(told.std["u0"], told.std["v0"])
+    return (
+        f"the image centre moves from view to view, by about {size * told.alpha:.2g} px, as image "
+        "stabilisation moves it",
+        size if size * told.alpha > known else 0.0,
+    )
+
+
+def two_cameras(told: Told) -> Said:
+    """The cameras of both groups, adjusted, and what may make the difference."""
+    lin, px = told.lin, told.lin.views.pixel_scale
+    member = told.found.weights > 0.5
+    if 2 * np.count_nonzero(member) > len(member):
+        member = ~member
+    free = np.zeros(5 + len(lin.state.k), dtype=bool)
+    free[lin.free[lin.free < len(free)]] = True
+    cameras = []
+    for which in (np.flatnonzero(member), np.flatnonzero(~member)):
+        step = told.found.rival.steps_at(lin) @ told.found.amounts * told.found.weights[which[0]]
+        step[lin.free] += told.found.camera
+        entries = lin.state.entries[0] + step[:5]
+        if len(which) >= _DETERMINE:
+            batches, state = lin.views.subset(which).batches, lin.state.of_views(which)
+            entries = adjust(batches, state, free, True, _STEPS).state.entries[0]
+        cameras.append(entries[[0, 2, 3, 4]] * px + np.append([0.0, 0.0], lin.views.pixel_centre))
+    order = in_sequence(lin.views.names)
+    names, others = ([lin.views.names[k] for k in order if member[k] == some] for some in (True, False))
+    behind = set(seen_from_behind(lin.views, lin.state))
+    exchanged = behind.issuperset(names) or behind.issuperset(others)
+    middle = lin.middle * px + lin.views.pixel_centre
+    alternative = _alternative(cameras[0], cameras[1], middle, exchanged)
+    apart = float(np.abs(cameras[0] - cameras[1]).max() / cameras[1][0])
+    if alternative == "turned by 180 degrees":
+        return (
+            f"{name_some(names)}: {alternative} against the other images, so their centre is mirrored",
+            max(apart, 1.0),
+        )
+    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in cameras]
+    return (
+        f"the images come from two cameras, or {alternative}: {name_some(names)} fit {asked[0]}, the others "
+        f"{asked[1]}",
+        apart,
+    )
+
+
+def _alternative(first: Array, second: Array, middle: Array, exchanged: bool) -> str:
+    """The alternative to two cameras, from alpha_u, alpha_v, u0 and v0 of both [px].
+
+    `middle` is that of the image, and `exchanged` tells whether one group shows the target mirrored.
+    """
+    ratio, near = first / second, _NEAR * second[0]
+    if exchanged:
+        return "u and v are exchanged in one part"
+    if np.abs(ratio / ratio[0] - 1).max() < min(0.3 * abs(ratio[0] - 1), _HALF_SIZE):
+        return "are of two sizes"
+    zoomed, apart = np.abs(first[:2] - second[:2]).max(), np.abs(first[2:] - second[2:]).max()
+    if zoomed < 2 * near and np.abs(0.5 * (first[2:] + second[2:]) - middle).max() < 0.5 * _TURNED * apart:
+        return "turned by 180 degrees"
+    if zoomed >= near:
+        return "from two zooms"
+    if np.abs(first[2:] - second[:1:-1]).max() < 2 * near:
+        return "some are turned by 90 degrees"
+    return "one part is cropped or turned"
+
+
+def odd_view(told: Told) -> Said:
+    """One view with another camera."""
+    moved = told.found.amounts * told.alpha
+    return (
+        f"{told.members[0]}: it fits another camera or crop: its focal length is {moved[0]:+.2g} px and its "
+        f"centre ({moved[2]:+.2g}, {moved[3]:+.2g}) px from that of the others",
+        told.displaced / told.diagonal,
+    )
+
+
+def bent(told: Told) -> Said:
+    """A common bend."""
+    assert told.lin.board is not None
+    heights = zip(told.found.amounts, BENDS, strict=True)
+    terms = [(float(height), i, j) for height, (i, j) in heights]
+    bend = told.lin.board.bend(lambda x, y: np.sum([h * x**i * y**j for h, i, j in terms], axis=0))
+    return _on_board(told, f"bent by {bend:.2g} {told.unit}")
+
+
+def stretched(told: Told) -> Said:
+    """A print that is stretched, or whose sides lean."""
+    assert told.lin.board is not None
+    by, lean = told.found.amounts.tolist()
+    side = "XYZ"[int(np.argmax(np.abs(told.lin.board.axes[:, 0])))]
+    shape = f"{'stretched' if by > 0 else 'shrunk'} by {100 * abs(by):.2g} % along {side}"
+    if abs(lean) > abs(by):
+        shape = f"printed with sides that are {abs(lean):.2g} rad off a right angle"
+    reason, size = _on_board(told, shape)
+    return reason + (_WRONG_PRINT if max(abs(by), abs(lean)) > _PRINTED else ""), size
+
+
+def _on_board(told: Told, shape: str) -> Said:
+    off = told.longer
+    makes = f"makes the focal length {100 * abs(off):.2g} % too {'short' if off > 0 else 'long'}"
+    return f"the residuals repeat on the board in all views: it seems {shape}, which {makes}", abs(off)
+
+
+def bent_view(told: Told) -> Said:
+    """One view with a bent target."""
+    return f"{told.members[0]}: the target is bent in this view", told.displaced / told.diagonal
+
+
+def rolling(told: Told) -> Said:
+    """Rows that were read while the camera moved."""
+    rows = float(np.ptp(told.lin.views.pixels[:, 1])) * told.lin.views.pixel_scale
+    px = float(np.sqrt((told.found.amounts**2).mean())) * rows
+    return (
+        f"camera or target moved while the rows of the images were read, by about {px:.2g} px from the first "
+        "points to the last: a rolling shutter",
+        px / told.diagonal,
+    )
+
+
+def cut(first: str, second: str) -> Say:
+    """Halves of the images that are displaced against each other."""
+
+    def say(told: Told) -> Said:
+        du, dv = told.found.amounts * told.lin.views.pixel_scale
+        return (
+            f"the {second} half of the images is displaced by ({du:.2g}, {dv:.2g}) px against the {first} "
+            "one: a cut through the image, as in stitched images",
+            float(np.hypot(du, dv)) / told.diagonal,
+        )
+
+    return say
+
+
+def too_simple(model: str) -> Say:
+    """A distortion model without coefficients that the lens needs."""
+
+    def say(told: Told) -> Said:
+        left, longer, moved = np.sqrt(1.0 - told.found.explained), told.longer, 0.0
+        if np.isin((3, 4), told.lin.free).all():
+            by = told.found.camera[np.searchsorted(told.lin.free, (3, 4))]
+            moved = float(np.linalg.norm(by)) * told.lin.views.pixel_scale
+        return (
+            f"the distortion model is too simple: {model} lowers the error by {100 * (1 - left):.2g} %, "
+            f"makes the focal length {100 * abs(longer):.2g} % {'longer' if longer > 0 else 'shorter'}, and "
+            f"moves the image centre by {moved:.2g} px",
+            max(told.displaced / told.diagonal, _AS_MUCH * abs(longer)),
+        )
+
+    return say
+
+
+def wrongly_given(told: Told) -> Said:
+    """Given parameters, and how far off they are."""
+    names: Mapping[int, str] = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
+    places = told.lin.given[told.lin.given != 1].tolist()
+    by = [f"{names[k]} {a * told.alpha:+.2g} px" for k, a in zip(places, told.found.amounts, strict=True)]
+    return (
+        f"other values than the given ones fit the points: {', '.join(by)}",
+        float(np.abs(told.found.amounts).max()),
+    )
