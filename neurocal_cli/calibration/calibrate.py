@@ -194,8 +194,12 @@ def calibrate(
 
 def _true_cause(points: Correspondences, type: int) -> str:
     """Why points are refused, if it is another cause than what the refusal says; else ""."""
+    from neurocal_cli.calibration.verdict.exchanged_rows import exchanged_rows
     from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, proportions, unlike_axes
 
+    exchanged = exchanged_rows(points)
+    if exchanged:
+        return exchanged
     found = proportions(points) if type in (1, 2) else None
     return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
 

@@ -22,7 +22,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 
-_AHEAD = 6  # rivals that are tried together with another one
+_AHEAD = 4  # rivals that are tried together with another one
 _MOST = 3  # causes at once
 _MINOR = 0.05  # share of a cause's evidence below which a further one is what its linearisation leaves
 _FAR = 0.25  # the same after a cause that was fitted
@@ -136,7 +136,7 @@ def _with_another(
         if not one.weights.size or one.evidence < LEVEL or one.rival.unknown:
             continue
         both = including(at, one)
-        second = estimates(both, both.spare * share, _others(rivals, [one]))
+        second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
         # Groups of views that are found by their residuals look like changes of single views.
         alone = one.pattern in ("all", "one")
         second = [other for other in second if not other.rival.unknown and (alone or other.pattern == "all")]

@@ -115,7 +115,7 @@ class _Board:
         self.to_pixels = np.array([[spread, 0, u], [0, spread, v], [0, 0, 1]])
         pixels = (points.pixels - [u, v]) / spread
         rows = [points.view_index == k for k in range(points.n_views)]
-        self.homographies = np.stack([_homography(points.world[one][:, axes], pixels[one]) for one in rows])
+        self.homographies = np.stack([homography(points.world[one][:, axes], pixels[one]) for one in rows])
 
     def omega(self, s: float) -> tuple[Array, float]:
         """The omega (3, 3) of least residual for this s, and that residual."""
@@ -198,7 +198,7 @@ class _Board:
         return np.inf if fit is None else fit[2] * fit[0].pixel_scale ** 2
 
 
-def _homography(plane: Array, pixels: Array) -> Array:
+def homography(plane: Array, pixels: Array) -> Array:
     """Homography (3, 3) from points of a plane (n, 2) to pixels (n, 2)."""
     middle, size = plane.mean(axis=0), plane.std(axis=0)
     x = np.column_stack([(plane - middle) / size, np.ones(len(plane))])

@@ -23,7 +23,7 @@ from neurocal_cli.camera.geometry import Array
 LEVEL = 6.0
 """Log odds from which on a rival is more than chance, and by which it has to beat another one."""
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
-_NOTHING, _NO_COST = 1e-300, 1e-12
+_NOTHING, _NO_COST, _ROUNDING = 1e-300, 1e-12, 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves
 _ABSORBED = (
     1e-7  # share of the information about an unknown that poses and camera leave: not more than rounding
@@ -136,7 +136,7 @@ def estimates(lin: Linearised, n: float, rivals: tuple[Rival, ...], least: float
         S, along = X[:, :, :-1] @ steps, X[:, :, kept]
         absorbed = _ABSORBED * lin.before @ steps[: lin.before.shape[1]] ** 2  # (V, m)
         effect = _Effect(rival, lin, S, along, absorbed)
-        for one in [effect.own(known)] if rival.patterns is None else effect.shared(known, least):
+        for one in (effect.own if rival.patterns is None else effect.shared)(known, least):
             if one.evidence > (best[rival.cause].evidence if rival.cause in best else -np.inf):
                 best[rival.cause] = one
     return sorted(best.values(), key=lambda one: -one.evidence)
@@ -198,18 +198,21 @@ class _Effect:
     along: Array  # (V, m, f + 1) coupling to the free parameters, and right side
     absorbed: Array  # (V, m) information that is not more than rounding
 
-    def own(self, known: _Known) -> Estimate:
+    def own(self, known: _Known, least: float) -> Iterator[Estimate]:
         """Each view with unknowns of its own."""
         V, m = self.S.shape[:2]
         values, vectors = np.linalg.eigh(self.S)
         told = values > (vectors**2 * self.absorbed[:, :, None]).sum(axis=1)
         values = np.where(told, values, 0.0).ravel()
         turned = np.where(told[..., None], vectors.swapaxes(1, 2) @ self.along, 0.0).reshape(V * m, -1)
-        least = least_by_precision(known.M, values, turned)
+        by_precision = least_by_precision(known.M, values, turned)
+        freely, _ = by_precision(np.array([_ROUNDING * values.max(initial=_NOTHING)]))
+        if not known.evidence(np.maximum(freely, _NO_COST * known.cost), np.zeros(1))[0] > least:
+            return
         _, logdet = np.linalg.slogdet(known.M[:-1, :-1])
         left = np.full(len(_SIZES), known.cost)
         for _ in range(_ITERATIONS):
-            cost, by_size = least(left / known.n / _SIZES**2)
+            cost, by_size = by_precision(left / known.n / _SIZES**2)
             left = np.maximum(cost, _NO_COST * known.cost)
         evidence = known.evidence(left, by_size - logdet)
         best = int(np.argmax(evidence))
@@ -218,7 +221,7 @@ class _Effect:
         N = known.M - (turned.T / (values + precision)) @ turned
         camera = np.linalg.solve(N[:-1, :-1], N[:-1, -1])
         amounts = (turned[:, -1] - turned[:, :-1] @ camera) / (values + precision)
-        return Estimate(
+        yield Estimate(
             self.rival, "", float(evidence[best]), 1.0 - float(left[best]) / known.cost,
             (vectors @ amounts.reshape(V, m, 1))[..., 0], np.zeros(0), camera, float(_SIZES[best]), noise,
         )  # fmt: skip
