@@ -93,9 +93,11 @@ def contest_of(solution: Solution, fit: tuple[Problem, Adjusted] | None = None) 
 
 
 def other_causes(solution: Solution, fit: tuple[Problem, Adjusted]) -> float:
-    """Log odds of the causes of the errors of a fit, if they are not the target's shape alone; else 0."""
+    """Log odds of the causes of the errors of a fit, known or not, beside the target's shape; 0 if none."""
     held = contest_of(solution, fit)
-    return held.evidence if held is not None and held.beside_board else 0.0
+    if held is None or not held.causes:
+        return 0.0
+    return held.evidence if held.beside_board or held.causes[0].rival.unknown else 0.0
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:

@@ -13,7 +13,7 @@ from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Told
 
 _SIGMAS = 2.0  # of the focal length, by which a cause may bias it
 _EXCESS = 0.5  # least share of the squared error above the noise floor that named causes explain
-_UNCLEAR = 3.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
+_UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 _LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
 

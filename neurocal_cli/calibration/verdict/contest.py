@@ -44,9 +44,9 @@ class Contest:
 
     @property
     def beside_board(self) -> bool:
-        """Whether known causes other than the shape of the target are a good part of the explanation."""
+        """Whether a known cause other than the shape of the target is a good part of the explanation."""
         others = [one.evidence for one in self.causes if not (one.rival.of_board or one.rival.unknown)]
-        return sum(others) > _PART * sum(one.evidence for one in self.causes)
+        return max(others, default=0.0) > _PART * sum(one.evidence for one in self.causes)
 
 
 def contest(

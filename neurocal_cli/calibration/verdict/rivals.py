@@ -96,6 +96,15 @@ RIVALS: tuple[Rival, ...] = (
         for steps in (effects.camera_and_lens, effects.centre)
     ),
     Rival(
+        "two targets",
+        "two groups of views, each with a target of another length along one side",
+        "give each view the points of the target that it shows",
+        words.two_targets,
+        _OFF,
+        patterns.grouped,
+        effect=effects.stretch,
+    ),
+    Rival(
         "one odd view",
         "one view asks for another camera than the others",
         "leave this view out, or give it as the camera has stored it",

@@ -17,6 +17,7 @@ _NEAR = 0.02  # of the focal length: equal up to this
 _HALF_SIZE = 0.05  # relative difference between the ratios of two image sizes
 _TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
 _AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
+_STRETCHED = 0.004  # relative
 _PRINTED = 0.01  # stretch that printers do not make
 _DETERMINE = 3  # views that determine a camera of their own
 _STEPS = 30
@@ -84,7 +85,7 @@ def two_cameras(told: Told) -> Said:
     cameras = []
     for which in (np.flatnonzero(member), np.flatnonzero(~member)):
         step = told.found.rival.steps_at(lin) @ told.found.amounts * told.found.weights[which[0]]
-        step[lin.free] += told.found.camera
+        step[lin.free] += told.found.camera[: len(lin.free)]  # without the unknowns of an earlier cause
         entries = lin.state.entries[0] + step[:5]
         if len(which) >= _DETERMINE:
             batches, state = lin.views.subset(which).batches, lin.state.of_views(which)
@@ -123,11 +124,22 @@ def _alternative(first: Array, second: Array, middle: Array, exchanged: bool) ->
     zoomed, apart = np.abs(first[:2] - second[:2]).max(), np.abs(first[2:] - second[2:]).max()
     if zoomed < 2 * near and np.abs(0.5 * (first[2:] + second[2:]) - middle).max() < 0.5 * _TURNED * apart:
         return "turned by 180 degrees"
+    if abs(ratio[0] - ratio[1]) > 0.5 * abs(ratio[:2] - 1).max() > _STRETCHED:
+        return "their target or their images are stretched in one part"
     if zoomed >= near:
         return "from two zooms"
     if np.abs(first[2:] - second[:1:-1]).max() < 2 * near:
         return "some are turned by 90 degrees"
     return "one part is cropped or turned"
+
+
+def two_targets(told: Told) -> Said:
+    """A target that is stretched in a group of views."""
+    by, lean = told.found.amounts.tolist()
+    shape = f"longer by {100 * by:.2g} %" if abs(by) > abs(lean) else f"leaning by {lean:.2g} rad"
+    return f"{name_some(told.members)}: a target of another shape than in the others, {shape}", max(
+        abs(by), abs(lean)
+    )
 
 
 def odd_view(told: Told) -> Said:
