@@ -23,14 +23,15 @@ class InputError(NeurocalError, ValueError):
 class FormatError(NeurocalError, ValueError):
     """A file that cannot be read as the expected format.
 
-    `problem` says what is wrong and what to do. The source is the file's name, ``<stdin>`` for a stream, and
-    its lines are counted from 1.
+    `problem` says what is wrong, and what to do unless that is the `advice`. The source is the file's name,
+    ``<stdin>`` for a stream, and its lines are counted from 1.
     """
 
-    def __init__(self, problem: str, source: str = "", line: int | None = None) -> None:
+    def __init__(self, problem: str, source: str = "", line: int | None = None, advice: str = "") -> None:
         place = source if line is None else f"{source}:{line}"
-        super().__init__(f"{place}: {problem}" if place else problem)
-        self.problem = problem
+        self.reason = f"{place}: {problem}" if place else problem
+        super().__init__(f"{self.reason}; {advice}" if advice else self.reason)
+        self.problem = f"{problem}; {advice}" if advice else problem
         self.source = source
         self.line = line
 

@@ -107,8 +107,7 @@ def calibration_or_camera(
             points, camera = given_camera(name, points)
         except FormatError:
             raise error from None
-        why = str(error).partition("; ")[0]  # what follows is advice for files that have to be calibrations
-        note(f"only the intrinsic parameters and the distortion are used{besides}: {why}")
+        note(f"only the intrinsic parameters and the distortion are used{besides}: {error.reason}")
     return camera_of(camera), points
 
 

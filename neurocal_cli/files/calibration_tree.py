@@ -130,18 +130,18 @@ def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Arra
 def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
-        root.refuse("is not a calibration; give a file that calibrate wrote")
+        root.refuse("is not a calibration", "give a file that calibrate wrote")
     if "neurocal" not in root:
         if "stereo" in root and "left" in root:
-            root.refuse("is a stereo rig; give the file of one camera")
+            root.refuse("is a stereo rig", "give the file of one camera")
         if "camera_matrix" in root:
             root.refuse(
-                "has no neurocal block, so the poses and points are missing; it can serve as --intrinsics, "
-                "here give a file that calibrate wrote"
+                "has no neurocal block, so the poses and points are missing",
+                "it can serve as --intrinsics, here give a file that calibrate wrote",
             )
         if "neurocal_lens" in root:
-            root.refuse("is a zoom lens; give its camera at one setting, from neurocal lens camera")
-        root.refuse("has no neurocal block; give a file that calibrate wrote")
+            root.refuse("is a zoom lens", "give its camera at one setting, from neurocal lens camera")
+        root.refuse("has no neurocal block", "give a file that calibrate wrote")
     block = root["neurocal"]
     form = block["format"].integer()
     if form not in FORMATS:

@@ -28,9 +28,9 @@ class Field:
         self.source = source
         self.path = path
 
-    def refuse(self, problem: str) -> NoReturn:
+    def refuse(self, problem: str, advice: str = "") -> NoReturn:
         """Raise a FormatError about the file."""
-        raise FormatError(problem, self.source)
+        raise FormatError(problem, self.source, advice=advice)
 
     def fail(self, expected: str) -> NoReturn:
         """Raise a FormatError about an unexpected value."""
