@@ -163,8 +163,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 def _unexplained(calibration: Calibration, e: Evidence) -> str:
     """What is said of the cause, if no known one explains the error."""
-    unknown = e.contest is not None and e.contest.causes and e.contest.causes[0].rival.unknown
-    if e.proportions or e.stated or (_explains(calibration, e) and not unknown):
+    if e.proportions or e.stated or (_explains(calibration, e) and not _is_unknown(e)):
         return ""
     nearest = closest(e.contest, calibration)
     return f", and no known cause explains it{f'; closest: {nearest}' if nearest else ''}"
@@ -179,8 +178,12 @@ def _explains(calibration: Calibration, e: Evidence) -> bool:
 def _by_flexing(e: Evidence, diagonal: float) -> bool:
     """Whether a board that bends from view to view may cause the error above the noise floor."""
     above = float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
-    other = e.contest is not None and e.contest.causes and not e.contest.causes[0].rival.of_board
-    return above < DISPLACED.good * diagonal and not other
+    return above < DISPLACED.good * diagonal and not _is_unknown(e)
+
+
+def _is_unknown(e: Evidence) -> bool:
+    """Whether no known cause explains the residuals best."""
+    return e.contest is not None and bool(e.contest.causes) and e.contest.causes[0].rival.unknown
 
 
 def given_parameters(
