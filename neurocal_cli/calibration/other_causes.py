@@ -97,7 +97,9 @@ def other_causes(solution: Solution, fit: tuple[Problem, Adjusted]) -> float:
     held = contest_of(solution, fit)
     if held is None or not held.causes:
         return 0.0
-    return held.evidence if held.beside_board or held.causes[0].rival.unknown else 0.0
+    first = held.causes[0]
+    another = held.beside_board or first.rival.unknown or first.pattern == "one"
+    return held.evidence if another else 0.0
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import run
+from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.surveyed import K, surveyed
 
-from neurocal_cli import calibrate, read_calibration
+from neurocal_cli import calibrate, read_calibration, read_points
 from neurocal_cli.adjustment.board import posterior as posterior_module
 from neurocal_cli.adjustment.board.find import sight_of
 from neurocal_cli.adjustment.board.information import Information, information_of
@@ -105,6 +106,12 @@ def test_a_survey_that_is_wrong_about_itself_is_told_so_and_does_no_harm(stated:
     times, size = re.search(r"points are ([0-9.]+) times too (\w+)", reason).groups()
     assert size == said
     assert 8 < float(times) < 12.5
+
+
+def test_points_that_take_in_all_of_the_error_are_told(real_files: RealFiles) -> None:
+    found = calibrate(read_points(real_files("field_reports/lidars1.csv")[0]))
+    assert found.verdict is not None
+    assert "with the points as stated it is 4.17 px rms" in found.verdict.reasons[0]
 
 
 def test_a_poor_point_is_no_outlier_and_a_wrong_one_is() -> None:

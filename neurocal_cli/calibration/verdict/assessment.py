@@ -6,6 +6,7 @@ fresh result.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -33,7 +34,7 @@ from neurocal_cli.calibration.calibration import (
 )
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
-from neurocal_cli.calibration.verdict.findings import pixel_spread, verdict_of
+from neurocal_cli.calibration.verdict.findings import Finding, pixel_spread, verdict_of
 from neurocal_cli.calibration.verdict.given_parameters import (
     Doubt,
     Reestimated,
@@ -190,7 +191,7 @@ class _AtMinimum:
             doubt=self._doubt(),
             noise=(
                 *stated,
-                *stated_survey(self.calibration.target),
+                *self._survey(),
                 *noise_shape(self.points, residuals, alike),
             ),
             stated=bool(stated),
@@ -227,6 +228,14 @@ class _AtMinimum:
         """(N, 2) predicted minus observed [px], in the order of the points."""
         predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
         return predicted - self.points.pixels
+
+    def _survey(self) -> Iterator[Finding]:
+        target = self.calibration.target
+        if target is not None and target.stated is not None:
+            points = target.as_given(self.points)
+            predicted, _ = predicted_pixels(self.given, points.world, points.view_index)
+            given_px = float(np.sqrt(((predicted - points.pixels) ** 2).sum(axis=1).mean()))
+            yield from stated_survey(target, self.calibration.rmse_px, given_px)
 
     def _is_exact(self) -> bool:
         return self.calibration.rmse_px < _EXACT * pixel_spread(self.points)

@@ -97,13 +97,14 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     close: list[tuple[Estimate, ...]] = []
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _known_first(ranking)
-        best = _with_another(at, ranking, rivals, share)
-        alone = best is ranking[0]
-        causes.append(best)
-        close.append(tuple(one for one in ranking[1:] if alone and one.evidence > best.evidence - LEVEL))
-        evidence, left = evidence + best.evidence, left * (1.0 - best.explained)
-        far = best.rival.cause in fits
-        at, least = including(at, best), max(least, (_FAR if far else _MINOR) * best.evidence)
+        chosen = _best(at, ranking, rivals, share)
+        least = max(least, (_FAR if chosen[0].rival.cause in fits else _MINOR) * chosen[0].evidence)
+        for one in chosen:
+            causes.append(one)
+            alone = one is ranking[0]
+            close.append(tuple(x for x in ranking[1:] if alone and x.evidence > one.evidence - LEVEL))
+            evidence, left = evidence + one.evidence, left * (1.0 - one.explained)
+            at = including(at, one)
         ranking = estimates(at, at.spare * share, _others(rivals, causes))
     # As an estimated target counts it: all residuals as independent.
     evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
@@ -125,23 +126,23 @@ def _others(rivals: Iterable[Rival], causes: Iterable[Estimate]) -> tuple[Rival,
     return tuple(one for one in rivals if one.cause not in known)
 
 
-def _with_another(
+def _best(
     at: Linearised, ranking: list[Estimate], rivals: tuple[Rival, ...], share: float
-) -> Estimate:
-    """The best rival, or that of the best pair which is more probable together."""
-    best, highest = ranking[0], ranking[0].evidence + LEVEL
-    if best.weights.size and best.pattern == "all":
+) -> tuple[Estimate, ...]:
+    """The best rival, or the best two that are more probable together."""
+    best: tuple[Estimate, ...] = (ranking[0],)
+    highest = ranking[0].evidence + LEVEL
+    if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
     for one in ranking[:_AHEAD]:
         if not one.weights.size or one.evidence < LEVEL or one.rival.unknown:
             continue
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
-        # Groups of views that are found by their residuals look like changes of single views.
-        alone = one.pattern in ("all", "one")
-        second = [other for other in second if not other.rival.unknown and (alone or other.pattern == "all")]
+        # One of them is common to all views: changes of groups and of single views look like each other.
+        second = [x for x in second if not x.rival.unknown and "all" in (one.pattern, x.pattern)]
         if second and one.evidence + second[0].evidence > highest:
-            best, highest = one, one.evidence + second[0].evidence
+            best, highest = (one, second[0]), one.evidence + second[0].evidence
     return best
 
 

@@ -27,6 +27,7 @@ _SHARE = 0.5  # common share of the noise from which on the stated sigmas are wr
 # Points with a sigma below this share of the median one are compared with the others, from so many on.
 _FAR_BELOW, _FEWEST_SMALL = 0.5, 6
 _CHANCE = 4.75  # sigmas: one clean set in a million
+_TAKEN_IN = 1e-2  # share of the error that is left
 _FACTOR = 2.0  # between views whose sigma is too small and the others
 
 
@@ -110,15 +111,24 @@ def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[
         )
 
 
-def stated_survey(target: Target | None) -> Iterator[Finding]:
-    """Finding about surveyed points that are more or less exact than stated."""
-    factor = 1.0 if target is None or target.stated is None else target.sizes["stated"]
-    if factor == 1.0:
-        return
-    small = factor > 1.0
-    yield (
-        1,
-        f"the standard deviations sX,sY,sZ of the points are {factor if small else 1 / factor:.2g} times too "
-        f"{'small' if small else 'large'}; they are scaled to match the residuals",
-        "state sX,sY,sZ as the survey has them, in the unit of the points",
-    )
+def stated_survey(target: Target, rmse_px: float, given_px: float) -> Iterator[Finding]:
+    """Findings about surveyed points that are more or less exact than stated, or take in all of the error.
+
+    The rms errors [px] are those with the points found, and with the points as they were stated.
+    """
+    if rmse_px < _TAKEN_IN * given_px:
+        yield (
+            1,
+            "the points take in all of the error, within their stated standard deviations: with the points "
+            f"as stated it is {given_px:.3g} px rms, and the pixels' own noise is unknown",
+            "let several views show the same points, or state smaller sX,sY,sZ if the survey is better",
+        )
+    factor = target.sizes["stated"]
+    if factor != 1.0:
+        small = factor > 1.0
+        yield (
+            1,
+            f"the standard deviations sX,sY,sZ of the points are {factor if small else 1 / factor:.2g} times "
+            f"too {'small' if small else 'large'}; they are scaled to match the residuals",
+            "state sX,sY,sZ as the survey has them, in the unit of the points",
+        )

@@ -19,6 +19,7 @@ _TURNED = 0.3  # of the distance of two centres: how far their mean may be from 
 _AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
 _STRETCHED = 0.004  # relative
 _PRINTED = 0.01  # stretch that printers do not make
+_LINEAR = 0.2  # of the focal length: changes up to this are estimated, if roughly
 _DETERMINE = 3  # views that determine a camera of their own
 _STEPS = 30
 _WRONG_PRINT = "; no print is so far off, so its description is wrong, and the scale unknown"
@@ -144,12 +145,13 @@ def two_targets(told: Told) -> Said:
 
 def odd_view(told: Told) -> Said:
     """One view with another camera."""
-    moved = told.found.amounts * told.alpha
-    return (
-        f"{told.members[0]}: it fits another camera or crop: its focal length is {moved[0]:+.2g} px and its "
-        f"centre ({moved[2]:+.2g}, {moved[3]:+.2g}) px from that of the others",
-        told.displaced / told.diagonal,
-    )
+    moved, reason = told.found.amounts * told.alpha, f"{told.members[0]}: it fits another camera or crop"
+    if np.abs(told.found.amounts).max() < _LINEAR:
+        reason += (
+            f": its focal length is {moved[0]:+.2g} px and its centre ({moved[2]:+.2g}, {moved[3]:+.2g}) px "
+            "from that of the others"
+        )
+    return reason, told.displaced / told.diagonal
 
 
 def bent(told: Told) -> Said:
