@@ -15,6 +15,7 @@ from neurocal_cli.errors import FormatError, NeurocalError
 from neurocal_cli.files.failures import one_line, reading_failures
 from neurocal_cli.files.writing import held_back
 
+_IMAGES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")  # how PNG, JPEG, BMP and TIFF begin
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
     (b"\x00\x00\xfe\xff", "UTF-32"),
@@ -110,6 +111,13 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         even, odd = head[::2].count(0), head[1::2].count(0)
         if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
+        if data.startswith(_IMAGES):
+            detect = (
+                "find its points first: neurocal detect IMAGES --cols 9 --rows 6 --square 25 -o points.csv"
+            )
+            raise FormatError(
+                f"is an image, not {kind}", source, advice=detect if "points" in kind else f"give {kind}"
+            )
         raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
         return data.decode("utf-8-sig")
