@@ -35,7 +35,7 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.other_causes import contest_of, contradicts_sigma, why_odd
+from neurocal_cli.calibration.other_causes import contradicts_sigma, why_odd
 from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -62,9 +62,6 @@ NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
-# Share of the points that outliers may be before a common cause is looked for, and the largest variance with
-# it, over that of the points kept.
-_MANY, _AS_WELL = 0.05, 1.5
 _FALLS = 0.5  # factor on the rms error without outliers that noise hid; without half of the noise it is 0.55
 _BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
 
@@ -112,7 +109,7 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
         better = _is_more_probable(kept, solution, first)
     else:
         better = contradicts or rms(solution) < _FALLS * rms(first)
-    if not better or _have_common_cause(first, solution):
+    if not better:
         return first, Rejected()
     return replace(solution, of_all=first), _rejected(problem.points, kept, solution)
 
@@ -124,18 +121,6 @@ def _searched(
     kept, solution = _agreeing(problem, options, first, failure)
     kept, solution = _without_outlier_views(problem, options, kept, solution)
     return _all_judged(problem.points, options, kept, solution)
-
-
-def _have_common_cause(first: Solution, solution: Solution) -> bool:
-    """Whether a cause that all views share explains the errors of all points, too many to be outliers."""
-    points = len(first.problem.points)
-    if first.refusal or points - len(solution.problem.points) < _MANY * points:
-        return False
-    held = contest_of(first)
-    if held is None or not held.causes or held.causes[0].pattern != "all" or held.causes[0].rival.of_board:
-        return False
-    with_it = (1.0 - held.explained) * first.squared_error / max(first.spare_equations, 1.0)
-    return with_it < _AS_WELL * solution.squared_error / max(solution.spare_equations, 1.0)
 
 
 def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:

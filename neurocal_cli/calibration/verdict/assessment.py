@@ -44,7 +44,7 @@ from neurocal_cli.calibration.verdict.given_parameters import (
     reestimate_given,
 )
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
-from neurocal_cli.calibration.verdict.odd_points import repeated_views
+from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
@@ -55,12 +55,14 @@ from neurocal_cli.calibration.verdict.rules import reach_verdict
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
 _CONTRADICTED = 1.6  # error over the noise floor from which on the board's proportions are tested
 _EXACT = 1e-4  # of the spread of the pixels: negligible errors
+_MOST = 0.5  # share of the squared error, outliers included, that a cause explains
 _DISTANT = 10.0  # times the distance of the farthest point
 
 
@@ -278,10 +280,28 @@ class _AtMinimum:
         """The causes of the residuals."""
         if self._is_exact():
             return None
+        return self._with_outliers() or self._contest_at(self.views, self.state)
+
+    def _with_outliers(self) -> Contest | None:
+        """The same with the outliers, if a cause that all views share explains most of their error."""
+        if self.calibration.rejected.points is None or self.calibration.target is not None:
+            return None
+        points = with_rejected(self.calibration)
+        points = points.select(np.isin(points.view_names, self.points.view_names)[points.view_index])
+        views = arrange(points)
+        start = normalised(self.calibration.state(points.view_names), views)
+        state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
+        held = self._contest_at(views, state)
+        if held is None or not held.causes or held.explained < _MOST:
+            return None
+        first = held.causes[0]
+        return held if first.pattern == "all" and not first.rival.of_board else None
+
+    def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
         return contest(
-            self.views, self.state, self.free, self.free_poses, self.points.image_size,
-            named_lens=not selected, worth=self.repeated.worth,
+            views, state, self.free, self.free_poses, self.points.image_size, named_lens=not selected,
+            worth=self.repeated.worth,
         )  # fmt: skip
 
     def _as_given(self) -> tuple[Correspondences, Views]:

@@ -48,7 +48,7 @@ _OF_A_POINT = 0.6  # share of its views in which a target point must be an outli
 
 def odd_points(calibration: Calibration) -> Iterator[Finding]:
     """All findings about the points of a calibration, outliers included."""
-    points = _with_rejected(calibration)
+    points = with_rejected(calibration)
     yield from _rejected_points(calibration)
     # What is wrong with a view that was left out is a reason of its own.
     used = np.isin(points.view_names, calibration.points.view_names)
@@ -256,7 +256,7 @@ def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.b
     return shared
 
 
-def _with_rejected(calibration: Calibration) -> Correspondences:
+def with_rejected(calibration: Calibration) -> Correspondences:
     """All given points, outliers included: world points and pixels by view."""
     kept, lost = calibration.points, calibration.rejected.points
     if lost is None:
