@@ -30,6 +30,7 @@ from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.calibration.verdict.noise import stated_noise
+from neurocal_cli.calibration.verdict.rival import LEVEL
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
@@ -67,7 +68,7 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
     if held is None or not held.causes:
         return False
     if held.beside_board:
-        return held.evidence > gain
+        return held.evidence > gain + LEVEL
     # A shape that is far more probable than the found one is not open: no print is stretched by percents.
     return held.causes[0].pattern == "all" and sum(one.evidence for one in held.causes) > _FAR * gain
 
@@ -93,13 +94,16 @@ def contest_of(solution: Solution, fit: tuple[Problem, Adjusted] | None = None) 
 
 
 def other_causes(solution: Solution, fit: tuple[Problem, Adjusted]) -> float:
-    """Log odds of the causes of the errors of a fit, known or not, beside the target's shape; 0 if none."""
+    """Log odds of other causes of a fit's errors than the target's shape, known or not; 0 if there are none.
+
+    The level by which they have to beat the target's shape is taken off.
+    """
     held = contest_of(solution, fit)
     if held is None or not held.causes:
         return 0.0
     first = held.causes[0]
     another = held.beside_board or first.rival.unknown or first.pattern == "one"
-    return held.evidence if another else 0.0
+    return held.evidence - LEVEL if another else 0.0
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:
