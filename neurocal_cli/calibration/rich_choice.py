@@ -38,6 +38,7 @@ _PROMISED = 1.05  # the same for its prediction before the adjustment, which is 
 # Correlation of neighbouring residuals: from _ALIKE on the rich lens is tried, and up to _NOISE its own
 # residuals count as noise. Ordinary lenses leave 0.04 or less, a narrow bump 0.09.
 _ALIKE, _NOISE = 0.05, 0.15
+_BETWEEN = ("two cameras", "a zoom that moves")  # that a rich lens must not leave
 _MOST = 0.5  # share of the squared error that another cause explains if the lens does not
 
 
@@ -89,14 +90,22 @@ def _rich_lens(solution: Solution) -> Solution | None:
     views, state = rich.problem.views, rich.state
     if correlation(views, point_residuals(views, state)) > _NOISE:
         return None
+    odd = contest_of(rich)
+    if odd is not None and any(one.rival.cause in _BETWEEN for one in odd.causes):
+        return None
     rms = float(np.sqrt(lost.sum() / len(views.index))) * views.pixel_scale
     return replace(rich, model_errors={**(solution.model_errors or {}), "rich": rms})
 
 
 def _has_other_cause(solution: Solution) -> bool:
-    """Whether something else than the lens or the target explains half of the squared error."""
+    """Whether a cause that all views share, such as a cut, explains half of the squared error.
+
+    What differs from view to view may be the lens: other parts of it are seen.
+    """
     held = contest_of(solution)
-    return held is not None and held.beside_board and held.explained > _MOST
+    if held is None or not held.causes or held.explained < _MOST:
+        return False
+    return held.causes[0].pattern == "all" and not held.causes[0].rival.of_board
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:
