@@ -113,17 +113,6 @@ def _determined(S: Array) -> tuple[Array, Array] | None:
     return scale[:, None] * vectors, vectors.T / scale
 
 
-@quietly
-def scores_of_poses(
-    normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
-) -> Quadratics:
-    """Quadratics of the different poses at their minimum, weighted so that cov(g) is variance times S.
-
-    The parameters are those of `reduced`.
-    """
-    return _weighed(_by_pose(reduced(normal, free, free_poses), repeated), repeated.variance)
-
-
 def _weighed(q: Quadratics, times: Array) -> Quadratics:
     return Quadratics(q.S / times[:, None, None], q.g / times[:, None], q.cost / times).centred()
 

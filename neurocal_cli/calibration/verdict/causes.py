@@ -29,10 +29,15 @@ def explains(contest: Contest, contradiction: float, error: float) -> bool:
     return not (left > _LEFT and contest.explained < _EXCESS * excess)
 
 
-def findings(contest: Contest, calibration: Calibration) -> Iterator[Finding]:
-    """What the causes do to the camera; nothing about one that cannot be told from the target's shape."""
+def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:
+    """What the causes do to the camera; nothing about one that cannot be told from the target's shape.
+
+    `given_told` tells whether a wrong given value is named already, by the values that the points have.
+    """
     estimated = calibration.target is not None
     for place, (found, close) in enumerate(zip(contest.causes, contest.close, strict=True)):
+        if found.rival.of_given and given_told:
+            continue
         if found.rival.of_board and estimated:
             continue  # the standard deviations include it
         if not found.rival.of_board and any(other.rival.of_board for other in close):

@@ -77,19 +77,16 @@ def contest(
 def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     n = lin.spare * worth
     ranking = estimates(lin, n, rivals, LEVEL)
-    fits: dict[str, _Fit] = {}
+    fits: dict[_Key, _Fit | None] = {}
     if ranking and ranking[0].evidence > LEVEL:
-        fits = {one.rival.cause: fit for one in ranking if (fit := _fitted(lin, one)) is not None}
         # Alike even with the best rival, not because of it.
         errors = lin.residuals(_steps(lin, ranking[0]))
-        closest = min(fits.values(), key=lambda fit: fit.cost, default=_Fit(np.inf))
-        if closest.errors is not None and closest.cost < float((errors**2).sum()):
-            errors = closest.errors
+        found = [fit for one in ranking if (fit := _fitted(lin, one, fits)) is not None]
+        nearest = min(found, key=lambda fit: fit.cost, default=_Fit(np.inf))
+        if nearest.errors is not None and nearest.cost < float((errors**2).sum()):
+            errors = nearest.errors
         n = effective_number(n, correlation(lin.views, errors))
-        ranking = [
-            fits[one.rival.cause].of(one, lin) if one.rival.cause in fits else one
-            for one in estimates(lin, n, rivals)
-        ]
+        ranking = [_refined(lin, one, fits) for one in estimates(lin, n, rivals)]
         ranking.sort(key=lambda one: -one.evidence)
     share = n / lin.spare
     at, evidence, left, least = lin, 0.0, 1.0, 0.0
@@ -98,7 +95,7 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _known_first(ranking)
         chosen = _best(at, ranking, rivals, share)
-        least = max(least, (_FAR if chosen[0].rival.cause in fits else _MINOR) * chosen[0].evidence)
+        least = max(least, (_FAR if fits.get(_key(chosen[0])) else _MINOR) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)
             alone = one is ranking[0]
@@ -154,43 +151,58 @@ class _Fit:
     entries: Array | None = None  # of A, if the views share one camera
     errors: Array | None = None  # (N, 2) residuals, if so
 
-    def of(self, one: Estimate, lin: Linearised) -> Estimate:
-        """The estimate with this cost, if it is lower."""
-        left = (1.0 - one.explained) * lin.cost
-        if not 0 < self.cost < left:
-            return one
-        n, camera = left / one.noise, one.camera
-        if self.entries is not None:
-            camera = camera.copy()
-            of_entries = lin.free < 5
-            camera[of_entries] = (self.entries - lin.state.entries[0])[lin.free[of_entries]]
-        gained = 0.5 * n * float(np.log(left / self.cost))
-        return replace(
-            one, evidence=one.evidence + gained, explained=1.0 - self.cost / lin.cost, camera=camera,
-            noise=self.cost / n,
-        )  # fmt: skip
+
+_Key = tuple[str, int, bytes]
 
 
-def _fitted(lin: Linearised, one: Estimate) -> _Fit | None:
-    """Fit two cameras that are far apart, or a lens that explains much; None for others."""
+def _key(one: Estimate) -> _Key:
+    """What makes two estimates the same fit: the cause, its unknowns, and the views that have it."""
+    return one.rival.cause, len(one.amounts), one.weights.tobytes()
+
+
+def _refined(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> Estimate:
+    """The estimate with the cost of its fit, if there is one and it is lower."""
+    fit, left = _fitted(lin, one, fits), (1.0 - one.explained) * lin.cost
+    if fit is None or not 0 < fit.cost < left:
+        return one
+    n, camera = left / one.noise, one.camera
+    if fit.entries is not None:
+        camera = camera.copy()
+        of_entries = lin.free < 5
+        camera[of_entries] = (fit.entries - lin.state.entries[0])[lin.free[of_entries]]
+    gained = 0.5 * n * float(np.log(left / fit.cost))
+    return replace(
+        one, evidence=one.evidence + gained, explained=1.0 - fit.cost / lin.cost, camera=camera,
+        noise=fit.cost / n,
+    )  # fmt: skip
+
+
+def _fitted(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> _Fit | None:
+    """Fit two cameras that are far apart, or a lens that explains much, each once; None for others."""
+    key = _key(one)
+    if key not in fits:
+        fits[key] = _fit(lin, one)
+    return fits[key]
+
+
+def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
     views, state, K = lin.views, lin.state, len(lin.state.k)
     if one.rival.cause == "two cameras" and np.abs(one.amounts[:4]).max() > _LINEAR:
-        free, member, cost = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5, 0.0
-        for which in (np.flatnonzero(member), np.flatnonzero(~member)):
-            cost += float(
-                adjust(views.subset(which).batches, state.of_views(which), free, True, _STEPS).cost.sum()
-            )
-        return _Fit(cost)
+        free, member = np.isin(np.arange(5 + K), lin.free), one.weights > 0.5
+        groups = np.flatnonzero(member), np.flatnonzero(~member)
+        each = [
+            adjust(views.subset(some).batches, state.of_views(some), free, True, _STEPS) for some in groups
+        ]
+        return _Fit(sum(float(fit.cost.sum()) for fit in each))
     if one.rival.cause == "a lens that is too simple" and one.explained > _MUCH:
         added = lin.columns["lens"][: len(one.amounts)]
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, _STEPS)
-        errors = point_residuals(views, fit.state)
-        return _Fit(float(fit.cost.sum()), fit.state.entries[0], errors)
+        return _Fit(float(fit.cost.sum()), fit.state.entries[0], point_residuals(views, fit.state))
     return None
 
 
-def _steps(lin: Linearised, found: Estimate) -> np.ndarray:
+def _steps(lin: Linearised, found: Estimate) -> Array:
     """(V, c) steps of all columns with a rival."""
     V = lin.views.n_views
     amounts = found.amounts if not found.weights.size else found.weights[:, None] * found.amounts

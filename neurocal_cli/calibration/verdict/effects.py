@@ -105,6 +105,13 @@ def given(lin: Linearised) -> Array:
     return steps
 
 
+def given_lens(lin: Linearised) -> Array:
+    """A change of the given coefficients of the lens, if the focal length is given as well."""
+    end = lin.columns["lens"][0] if lin.columns["lens"].size else 5 + len(lin.state.k)
+    places = np.setdiff1d(np.arange(5, end), lin.free)
+    return np.eye(lin.width)[:, places if 0 in lin.given else places[:0]]
+
+
 def lens(model: str) -> Steps:
     """The coefficients that a model has and the chosen one lacks."""
     lacking = 5 + len(coefficient_names(model))

@@ -169,23 +169,6 @@ def reestimate_centre_and_target(
     )
 
 
-def other_distortion_explains(
-    views: Views, state: CameraState, given: frozenset[str], variance: float
-) -> bool:
-    """Whether the points are explained by another distortion than a given one; arguments as above.
-
-    `variance` is the largest variance of the residuals, normalised, with which the points count as explained.
-    """
-    if "alpha_u" not in given:
-        return False
-    if state.model == "none":
-        state = state.with_model(_DISPLACED)
-    free = np.arange(5 + len(state.k)) >= 5
-    adjusted = adjust(views.batches, state, free, True, _STEPS)
-    spare = views.n_equations - int(free.sum()) - 6 * views.n_views
-    return float(adjusted.cost.sum()) < variance * spare
-
-
 def told_apart(reestimated: tuple[Reestimated, ...], std: Mapping[str, float]) -> list[Reestimated]:
     """Those that the points tell apart from what is given with these standard deviations."""
     return [a for a in reestimated if abs(a.found - a.given) > TOLD_APART * np.hypot(a.std, std[a.name])]

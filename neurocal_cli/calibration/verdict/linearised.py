@@ -87,9 +87,8 @@ class Linearised:
     R: Array  # (V, c + 1, c + 1)
     before: Array  # (V, c) diagonal of the same before the poses were eliminated
     solved: Array  # (V, 6, c + 1) response of the poses to the columns, and their own step
-    columns: Mapping[
-        Effect | str, NDArray[np.intp]
-    ]  # of each effect, and of the "lens" that is not estimated
+    # Of each effect, and of the coefficients of the "lens" that are not estimated.
+    columns: Mapping[Effect | str, NDArray[np.intp]]
     free: NDArray[np.intp]  # columns that are estimated
     given: NDArray[np.intp]  # those of the entries of A that are given
     spare: float  # equations beyond the unknowns

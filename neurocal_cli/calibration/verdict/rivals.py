@@ -48,6 +48,19 @@ RIVALS: tuple[Rival, ...] = (
         _GIVEN,
         patterns.common,
         steps=effects.given,
+        of_given=True,
+    ),
+    Rival(
+        "a wrong given distortion",
+        "other coefficients than the given ones take the residuals away",
+        "check that what is given is of the same camera at the same zoom, focus and image size",
+        words.plain(
+            "another distortion than the given one fits the points, which it displaces by {px} px rms"
+        ),
+        DISPLACED,
+        patterns.common,
+        steps=effects.given_lens,
+        of_given=True,
     ),
     Rival(
         "a changing focal length",

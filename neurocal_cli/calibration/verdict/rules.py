@@ -14,6 +14,8 @@ from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
     DISPLACED,
     ERROR,
+    STRETCHED_PRINT,
+    WRONG_PRINT,
     Finding,
     Limit,
     image_diagonal,
@@ -52,9 +54,8 @@ _OBLONG, _OFF_CENTRE = 0.03, 0.1  # alpha_u / alpha_v, share of the image's size
 # 0.0018, and the sides of their boards by up to 0.003. A board that leans by 0.006 and stands upright in
 # all views may turn theta by as much; test_a_leaning_board_is_not_good has one that leans by 0.01.
 _SKEW, _LEAN = 0.003, 0.004
-# Of nine boards of photographs, none is stretched by more than 0.7 %, and none of their points lie farther
-# than 0.17 % of the size from where a stretched board has them. One side against the other; rms over rms.
-_STRETCH, _STRETCHED_POOR, _SPACING = 0.01, 0.025, 0.004
+_STRETCHED_POOR = 0.025  # stretch of one side against the other
+_SPACING = 0.004  # rms over rms; of nine boards of photographs none is off by more than 0.0017
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
 _FAR_BETTER = 0.5  # share of the error that remains with another camera than the given one
 _SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
@@ -94,12 +95,13 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         yield 2, f"training did not converge: {calibration.stop_reason}", more
     yield from _redundancy(calibration)
     # A given camera that is wrong explains the errors, so it is reported before them.
-    yield from _given(calibration, evidence)
+    given = list(_given(calibration, evidence))
+    yield from given
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
     contest = evidence.contest
     if contest is not None and _explains(calibration, evidence):
-        for grade, reason, advice in causes(contest, calibration):
+        for grade, reason, advice in causes(contest, calibration, any(grade for grade, *_ in given)):
             yield max([grade, *(of_error for of_error, *_ in errors)] if grade else [0]), reason, advice
     yield from errors
     yield from _data(calibration, evidence)
@@ -156,11 +158,16 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "flat",
         )
         yield (
-            _CORRELATION.grade(e.correlation) if unexcused else 0,
+            _CORRELATION.grade(e.correlation) if unexcused and not _is_common_noise(e) else 0,
             f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
             "model or the target does not fit",
             "try another --distortion, or measure the target",
         )
+
+
+def _is_common_noise(e: Evidence) -> bool:
+    """Whether no cause at all is probable: neighbours share their noise, which the std count."""
+    return e.contest is not None and not e.contest.causes and not _CONTRADICTION.grade(e.contradiction)
 
 
 def _unexplained(calibration: Calibration, e: Evidence) -> str:
@@ -348,13 +355,12 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
             "than those of prints, so theta may be wrong by more than its std",
             "measure the target, turn it by 90 degrees in some views, or give --no-skew",
         )
-    wrong = "no print is so far off, so its description is wrong, and the scale of the poses unknown"
     measure = "measure the target along both sides, and give its true size"
-    if abs(stretch) > _STRETCH:
+    if abs(stretch) > STRETCHED_PRINT:
         yield (
             1 + int(abs(stretch) > _STRETCHED_POOR),
             f"the target is {100 * abs(stretch):.2g} % {'longer' if stretch > 0 else 'shorter'} along its "
-            f"longer side, compared with the other one, than described: {wrong}",
+            f"longer side, compared with the other one, than described: {WRONG_PRINT}",
             measure,
         )
     plane = np.linalg.svd(given, full_matrices=False)[2][:2]
@@ -363,7 +369,7 @@ def _print(target: Target, calibration: Calibration) -> Iterator[Finding]:
         yield (
             1,
             f"the points of the target lie {off:.2g} {calibration.unit} rms from where it is described, "
-            f"within its plane: {wrong}",
+            f"within its plane: {WRONG_PRINT}",
             measure,
         )
 

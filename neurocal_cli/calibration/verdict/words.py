@@ -9,7 +9,7 @@ import numpy as np
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.outlier_views import seen_from_behind
 from neurocal_cli.calibration.verdict.effects import BENDS
-from neurocal_cli.calibration.verdict.findings import in_sequence, name_some
+from neurocal_cli.calibration.verdict.findings import STRETCHED_PRINT, WRONG_PRINT, in_sequence, name_some
 from neurocal_cli.calibration.verdict.rival import Said, Say, Told
 from neurocal_cli.camera.geometry import Array
 
@@ -18,11 +18,9 @@ _HALF_SIZE = 0.05  # relative difference between the ratios of two image sizes
 _TURNED = 0.3  # of the distance of two centres: how far their mean may be from the middle of the image
 _AS_MUCH = 0.04  # of the diagonal: a displacement that counts as much as another focal length
 _STRETCHED = 0.004  # relative
-_PRINTED = 0.01  # stretch that printers do not make
 _LINEAR = 0.2  # of the focal length: changes up to this are estimated, if roughly
 _DETERMINE = 3  # views that determine a camera of their own
 _STEPS = 30
-_WRONG_PRINT = "; no print is so far off, so its description is wrong, and the scale unknown"
 
 
 def plain(text: str) -> Say:
@@ -172,7 +170,8 @@ def stretched(told: Told) -> Said:
     if abs(lean) > abs(by):
         shape = f"printed with sides that are {abs(lean):.2g} rad off a right angle"
     reason, size = _on_board(told, shape)
-    return reason + (_WRONG_PRINT if max(abs(by), abs(lean)) > _PRINTED else ""), size
+    wrong = max(abs(by), abs(lean)) > STRETCHED_PRINT
+    return reason + (f"; {WRONG_PRINT}" if wrong else ""), size
 
 
 def _on_board(told: Told, shape: str) -> Said:

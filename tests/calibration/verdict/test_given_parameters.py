@@ -231,3 +231,13 @@ def test_points_all_around_a_given_camera_are_named() -> None:
     points = Correspondences(world, lens.project(world)[0])
     with pytest.raises(InputError, match=r"row 22: .*more than 84 degrees from the middle"):
         calibrate(points, type=3, intrinsics=lens, outliers="keep")
+
+
+def test_a_wrong_distortion_is_named_once_and_leaves_the_target_alone() -> None:
+    points, truth = photographed("flat", 5, 12, sigma=0.12)
+    K = truth.K
+    given = Intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], np.pi / 2)
+    found = calibrate(points, type=3, intrinsics=Camera(given, Distortion("k1k2", np.array([-0.18, 0.08]))))
+    assert found.target is None
+    assert found.verdict is not None
+    assert sum("distortion" in reason for reason in found.verdict.reasons) == 1

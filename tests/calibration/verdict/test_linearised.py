@@ -14,8 +14,9 @@ from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.problem import normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.verdict import effects
-from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
+from neurocal_cli.calibration.verdict.linearised import Effect, Linearised, Seen, linearised
+from neurocal_cli.calibration.verdict.patterns import common
+from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Rival, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
@@ -158,23 +159,25 @@ def test_what_is_included_is_explained(cause: str) -> None:
     assert found.evidence > 20.0
 
 
-def test_a_cause_is_a_few_lines_in_one_place() -> None:
-    def tilted(lin: Linearised) -> Array:
-        steps = np.zeros((lin.width, 1))
-        steps[1] = lin.state.entries[0, 0]
-        return steps
+def test_a_new_cause_is_a_rival_and_wins_where_it_is_the_cause() -> None:
+    def keystone(seen: Seen) -> Array:
+        """Rows get longer from the top of the image to its foot."""
+        return seen.by_entries[:, 3:4] * (seen.pixels[:, None, None, 0] * seen.pixels[:, None, None, 1])
 
-    a_new_one = Rival(
-        "a sensor that shears", "-", "-", lambda told: ("it shears", 0.0), RIVALS[0].limit, steps=tilted
-    )
+    new = Rival("a keystone", "-", "-", lambda told: ("", 0.0), RIVALS[0].limit, common, effect=keystone)
     points, state = exact()
     noise = 0.05 * np.random.default_rng(2).standard_normal(points.pixels.shape)
-    shear = np.random.default_rng(3).normal(0, 0.01, points.n_views)[points.view_index]
-    off = np.column_stack([shear * (points.pixels[:, 1] - 480), 0 * shear])
-    lin, *_ = at(with_pixels(points, off + noise), state, 5)
-    assert estimates(lin, lin.spare, (*RIVALS, a_new_one))[0].rival is not None
-    assert of_cause(lin, "a rolling shutter").evidence > 20.0
-    assert next(one for one in estimates(lin, lin.spare, (a_new_one,))).evidence > 20.0
+    u, v = ((points.pixels - (np.array(SIZE) - 1) / 2) / 1000).T
+    views = arrange(with_pixels(points, np.column_stack([3.0 * u * v, 0 * u]) + noise))
+    free = np.ones(5, dtype=bool)
+    there = adjust(views.batches, normalised(state, views), free, True, 20).state
+    lin = linearised(views, there, free, True, (*EFFECTS, keystone), SIZE, False)
+    first, second = estimates(lin, lin.spare, (*RIVALS, new))[:2]
+    assert first.rival is new
+    assert first.evidence > second.evidence + LEVEL
+    assert first.amounts[0] * views.pixel_scale == pytest.approx(
+        3.0 * (views.pixel_scale / 1000) ** 2, rel=0.1
+    )
 
 
 def test_the_page_lists_all_causes() -> None:
