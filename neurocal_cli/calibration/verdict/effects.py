@@ -108,7 +108,8 @@ def given(lin: Linearised) -> Array:
 def given_lens(lin: Linearised) -> Array:
     """A change of the given coefficients of the lens, if the focal length is given as well."""
     end = lin.columns["lens"][0] if lin.columns["lens"].size else 5 + len(lin.state.k)
-    places = np.setdiff1d(np.arange(5, end), lin.free)
+    of_lens = np.arange(5, end)
+    places = of_lens[~np.isin(of_lens, lin.free)]  # np.setdiff1d would load numpy.ma
     return np.eye(lin.width)[:, places if 0 in lin.given else places[:0]]
 
 
