@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.adjustment.normal_equations import damped_step, schur_step
+from neurocal_cli.adjustment.normal_equations import Arrowhead, damped_step
 from neurocal_cli.adjustment.reprojection import POSE, POSE_COLUMNS, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import PointBatches
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -125,7 +125,7 @@ class _Reprojection:
                 self.normal.sum(axis=0, keepdims=True), damping, active
             )
             return (by_camera, np.zeros((self.batches.n_views, 6))), promised
-        step, by_pose, gain = schur_step(self.normal, self.shared, POSE_COLUMNS, float(damping[0]))
+        step, by_pose, gain = Arrowhead.of(self.normal, self.shared, POSE_COLUMNS).step(float(damping[0]))
         by_camera = np.zeros((1, len(self.camera)))
         by_camera[0, self.free] = step
         return (by_camera, by_pose), np.array([gain])

@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import inverse_scaled, schur_covariance
+from neurocal_cli.adjustment.normal_equations import Arrowhead, inverse_scaled
 from neurocal_cli.adjustment.reprojection import (
     POSE,
     POSE_COLUMNS,
@@ -89,7 +89,7 @@ def covariance(
         inverse, smallest = inverse_scaled(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
     if shared is None:
-        found = schur_covariance(normal, f, POSE_COLUMNS)
+        found = Arrowhead.of(normal, f, POSE_COLUMNS).covariance()
         return Covariance(variance * found.shared, variance * found.own, found.smallest)
     B = normal[:, POSE, POSE]
     B_inverse, smallest = inverse_scaled(B, B)

@@ -92,35 +92,85 @@ def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tupl
     return N[..., kept[:, None], kept] - np.swapaxes(cross, -1, -2) @ solved, solved
 
 
-def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple[Array, Array, float]:
-    """Damped Gauss-Newton step.
+@frozen_dataclass(eq=False)
+class Arrowhead:
+    """Normal equations of unknowns that all blocks share, and of each block's own, summed over the blocks.
 
-    N (V, D, D) are the products of the derivatives and, in the last column, the residuals of each block.
-    `shared` (f,) and `own` (p,) are the columns of the unknowns, and `damping` is the share of the diagonal
-    that is added to it (Marquardt). Returns the steps of the shared (f,) and of the own unknowns (V, p), nan
-    where the system is singular, and the predicted drop of the sum of squares.
+    The last row and column of `shared` and the last column of `cross` belong to the residuals.
     """
-    # Eliminate the own unknowns first, then solve the reduced system of the shared ones.
-    p, f = len(own), len(shared)
-    columns = np.concatenate([own, shared, [N.shape[-1] - 1]])
-    M = N[:, columns[:, None], columns]
-    B, C = M[:, :p, :p], M[:, :p, p:]  # C (V, p, f + 1), with the right side
-    diagonal = np.einsum("vii->vi", B)  # a view
-    ridge_own = damping * (diagonal + NOTHING)
-    diagonal += ridge_own
-    solved = solve_scaled(B, C)
-    # (f, V p) times (V p, f + 1): one product sums over blocks and own unknowns.
-    flat = C.reshape(-1, f + 1)
-    S = M[:, p:-1, p:].sum(axis=0)
-    g = S[:, -1].copy()
-    diagonal = np.einsum("ii->i", S[:, :-1])
-    ridge = damping * (diagonal + NOTHING)
-    S -= flat[:, :-1].T @ solved.reshape(-1, f + 1)
-    diagonal += ridge
-    step = solve_scaled(S[:, :-1], S[:, -1:])[:, 0]
-    by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
-    gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
-    return step, by_own, float(gain)
+
+    shared: Array  # (s + 1, s + 1)
+    own: Array  # (V, p, p)
+    cross: Array  # (V, p, s + 1)
+
+    @classmethod
+    def of(cls, N: Array, shared: Columns, own: Columns) -> Arrowhead:
+        """From the products N (V, D, D) of each block's derivatives and, in the last column, residuals.
+
+        `shared` (s,) and `own` (p,) are the columns of the unknowns.
+        """
+        p = len(own)
+        columns = np.concatenate([own, shared, [N.shape[-1] - 1]])
+        M = N[:, columns[:, None], columns]
+        return cls(M[:, p:, p:].sum(axis=0), M[:, :p, :p], M[:, :p, p:])
+
+    @property
+    def cost(self) -> float:
+        """The sum of squares."""
+        return float(self.shared[-1, -1])
+
+    def only(self, kept: Columns) -> Arrowhead:
+        """Only these of the shared unknowns (f,); the others stay as they are."""
+        columns = np.append(kept, len(self.shared) - 1)
+        return Arrowhead(self.shared[np.ix_(columns, columns)], self.own, self.cross[:, :, columns])
+
+    def reduced(self) -> tuple[Array, Array]:
+        """The own unknowns eliminated: the Schur complement (s + 1, s + 1), and their response (V, p, s + 1).
+
+        The response to the shared unknowns has the opposite sign; in the residual's column it is their step.
+        """
+        solved = solve_scaled(self.own, self.cross)
+        s = len(self.shared)
+        return self.shared - self.cross.reshape(-1, s).T @ solved.reshape(-1, s), solved
+
+    def step(self, damping: float) -> tuple[Array, Array, float]:
+        """Damped Gauss-Newton step; `damping` is the share of the diagonal that is added to it (Marquardt).
+
+        Returns the steps of the shared (s,) and of the own unknowns (V, p), nan where the system is singular,
+        and the predicted drop of the sum of squares.
+        """
+        # Eliminate the own unknowns first, then solve the reduced system of the shared ones.
+        B, C, f = self.own.copy(), self.cross, len(self.shared) - 1
+        diagonal = np.einsum("vii->vi", B)  # a view
+        ridge_own = damping * (diagonal + NOTHING)
+        diagonal += ridge_own
+        solved = solve_scaled(B, C)
+        # (f, V p) times (V p, f + 1): one product sums over blocks and own unknowns.
+        flat = C.reshape(-1, f + 1)
+        S = self.shared[:-1].copy()
+        g = S[:, -1].copy()
+        diagonal = np.einsum("ii->i", S[:, :-1])
+        ridge = damping * (diagonal + NOTHING)
+        S -= flat[:, :-1].T @ solved.reshape(-1, f + 1)
+        diagonal += ridge
+        step = solve_scaled(S[:, :-1], S[:, -1:])[:, 0]
+        by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
+        gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
+        return step, by_own, float(gain)
+
+    def covariance(self) -> SchurCovariance:
+        """Inverse of the normal matrix, block by block.
+
+        Times the residual variance it is the Cramer-Rao bound at the estimate.
+        """
+        U, C = self.shared[:-1, :-1], np.swapaxes(self.cross[:, :, :-1], 1, 2)
+        B_inverse, smallest = inverse_scaled(self.own, self.own)
+        gain = C @ B_inverse
+        S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
+        S_inverse, smallest_shared = inverse_scaled(S, U)
+        cross = -S_inverse @ gain
+        covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
+        return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
 
 
 @frozen_dataclass(eq=False)
@@ -133,54 +183,35 @@ class SchurCovariance:
     smallest: float  # smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular
 
 
-def schur_covariance(N: Array, shared: Columns, own: Columns) -> SchurCovariance:
-    """Inverse of the normal matrix, block by block; see `schur_step` for the parameters.
-
-    Times the residual variance it is the Cramer-Rao bound at the estimate.
-    """
-    U = N[:, shared[:, None], shared].sum(axis=0)
-    B_inverse, smallest = inverse_scaled(B := N[:, own[:, None], own], B)
-    C = N[:, shared[:, None], own]
-    gain = C @ B_inverse
-    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
-    S_inverse, smallest_shared = inverse_scaled(S, U)
-    cross = -S_inverse @ gain
-    covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
-    return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
-
-
 class SharedAndOwn(Generic[State]):
     """A sum of squares of such unknowns as a `LeastSquaresProblem` of one group.
 
-    `blocks` returns the products (V, D, D) of derivatives and residuals at a state, as for `schur_step`.
-    `moved` returns the state after a step of the shared (f,) and of the own (V, p) unknowns, and whether it
-    is valid. `shared` (f,) and `own` (p,) are the columns of the unknowns.
+    `blocks` returns the normal equations at a state, of the unknowns that move. `moved` returns the state
+    after a step of the shared (f,) and of the own (V, p) unknowns, and whether it is valid.
     """
 
     def __init__(
         self,
         start: State,
-        blocks: Callable[[State], Array],
+        blocks: Callable[[State], Arrowhead],
         moved: Callable[[State, Array, Array], tuple[State, bool]],
-        shared: Columns,
-        own: Columns,
     ) -> None:
-        self.state, self.blocks, self.moved, self.shared, self.own = start, blocks, moved, shared, own
+        self.state, self.blocks, self.moved = start, blocks, moved
 
     @property
     def cost(self) -> Array:
         """(1,) sum of squares."""
-        return self.blocks(self.state)[:, -1, -1].sum(keepdims=True)
+        return np.array([self.blocks(self.state).cost])
 
     def solve(self, damping: Array, active: Columns) -> tuple[tuple[Array, Array], Array]:
         """Steps of the shared and of the own unknowns, and the predicted gain."""
-        *step, gain = schur_step(self.blocks(self.state), self.shared, self.own, float(damping[0]))
-        return (step[0], step[1]), np.array([gain])
+        by_shared, by_own, gain = self.blocks(self.state).step(float(damping[0]))
+        return (by_shared, by_own), np.array([gain])
 
     def move(self, step: tuple[Array, Array], active: Columns) -> tuple[State, Array, NDArray[np.bool_]]:
         """The state after a step, its cost, and whether it is valid."""
         trial, valid = self.moved(self.state, *step)
-        return trial, self.blocks(trial)[:, -1, -1].sum(keepdims=True), np.array([valid])
+        return trial, np.array([self.blocks(trial).cost]), np.array([valid])
 
     def accept(self, trial: State, better: NDArray[np.bool_], active: Columns) -> None:
         """Accept the trial."""

@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.normal_equations import schur_step
+from neurocal_cli.adjustment.normal_equations import Arrowhead
 from neurocal_cli.adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.adjustment.solution import TrainingRecord
 from neurocal_cli.camera.distortion import coefficient_names
@@ -194,7 +194,8 @@ def radial_step(problem: Problem, groups: Sequence[Group]) -> RadialStep | None:
     np.multiply(J[:, -3], share, out=J[:, -2])
     np.subtract(pixels, predicted, out=J[:, -1])
     rows = (J * np.sqrt(patterns.weights)[:, None, None]).reshape(K, len(own) + 3, -1)
-    strength, by_product, _ = schur_step(rows @ np.swapaxes(rows, 1, 2), len(own) + np.arange(2), own, _RIDGE)
+    normal = Arrowhead.of(rows @ np.swapaxes(rows, 1, 2), len(own) + np.arange(2), own)
+    strength, by_product, _ = normal.step(_RIDGE)
     if not np.isfinite(by_product).all() or not np.abs(strength).sum() < _STRONGEST:
         return None
     if 1 + strength @ [3.0, 5.0] <= 0:  # the undistorted radius decreases before the farthest point

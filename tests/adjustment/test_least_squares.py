@@ -13,11 +13,10 @@ from neurocal_cli.adjustment.leave_out import Quadratics, folds_of, inverse_or_n
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
 from neurocal_cli.adjustment.normal_equations import (
     ROUNDING,
+    Arrowhead,
     damped_step,
     eliminate,
     inverse_scaled,
-    schur_covariance,
-    schur_step,
     solve_scaled,
 )
 from neurocal_cli.camera.geometry import Array
@@ -275,7 +274,7 @@ def blocks(seed: int, V: int = 6) -> tuple[Array, Array, Array]:
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_the_schur_step_is_the_dense_step(damping: float) -> None:
     N, J, r = blocks(2)
-    by_shared, by_own, promised = schur_step(N, SHARED, OWN, damping)
+    by_shared, by_own, promised = Arrowhead.of(N, SHARED, OWN).step(damping)
     step, gain = damped_step((J.T @ J)[None], (J.T @ r)[None], np.array([damping]))
     np.testing.assert_allclose(np.concatenate([by_shared, by_own.ravel()]), step[0], rtol=1e-9)
     assert promised == pytest.approx(gain[0], rel=1e-12)
@@ -283,7 +282,7 @@ def test_the_schur_step_is_the_dense_step(damping: float) -> None:
 
 def test_without_shared_unknowns_every_block_is_solved_alone() -> None:
     N, _, _ = blocks(2)
-    by_shared, by_own, _ = schur_step(N, np.arange(0), OWN, 0.1)
+    by_shared, by_own, _ = Arrowhead.of(N, np.arange(0), OWN).step(0.1)
     step, _ = damped_step(N[:, OWN[:, None], OWN], N[:, OWN, -1], np.full(6, 0.1))
     assert by_shared.shape == (0,)
     np.testing.assert_allclose(by_own, step, rtol=1e-12)
@@ -291,7 +290,7 @@ def test_without_shared_unknowns_every_block_is_solved_alone() -> None:
 
 def test_the_schur_covariance_is_the_dense_inverse() -> None:
     N, J, _ = blocks(3)
-    inverse, found = np.linalg.inv(J.T @ J), schur_covariance(N, SHARED, OWN)
+    inverse, found = np.linalg.inv(J.T @ J), Arrowhead.of(N, SHARED, OWN).covariance()
     np.testing.assert_allclose(found.shared, inverse[:2, :2], rtol=1e-9)
     for v in range(6):
         own = slice(2 + 3 * v, 5 + 3 * v)

@@ -19,7 +19,7 @@ from neurocal_cli.adjustment.open_coefficients import SpreadOfOpen
 from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.rig import covariance
-from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.covariance import covariance_of_stretch
 from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.camera.distortion import Distortion
@@ -81,9 +81,9 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     rng = np.random.default_rng(4)
     scene = random_rig(rng, "verging", 4)
     left, right = (calibrate(scene.points(side, 1e-4, rng), skew=False, target="given") for side in (0, 1))
-    problem = rig_problem(left, right, pair_views(left.points.view_names, right.points.view_names))
+    problem = stereo_problem(left, right, pair_views(left.points.view_names, right.points.view_names).both)
     free = np.concatenate([*problem.estimated, [True] * 6])
-    adjusted = adjust_rig(problem, problem.start(scene.rig), free)
+    adjusted = adjust_rig(problem, problem.start([scene.rig]), free)
     only(0, monkeypatch, covariance)
     found = covariance_of_stretch(adjusted)
     assert found is not None
@@ -94,7 +94,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     ]
     problem = replace(problem, observations=(observations[0], observations[1]))
     new = adjust_rig(problem, adjusted.state, free).state
-    moved = (new.t - adjusted.state.t) / EPS
+    moved = (new.t - adjusted.state.t)[1] / EPS
     assert np.sqrt(np.diagonal(found[1]))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
 
 

@@ -1,21 +1,28 @@
-"""Bundle adjustment of two cameras on one rig: the reprojection error (3), its derivatives and its minimum.
+"""Bundle adjustment of the cameras of one rig: the reprojection error (3), its derivatives and its minimum.
 
-A view of both cameras has one pose, in the left camera's frame. Its pose in the right camera is R'_k = R R_k
-and t'_k = R t_k + t. A view of one camera alone has the pose in that camera and does not determine the rig.
-The derivatives of each camera are those of `adjustment.reprojection`. Those of the right camera are
-transformed by the chain rule:
+A frame is what the cameras saw at one moment: one view of each of some of them. A frame of several cameras
+has one pose (R_k, t_k), in the frame of reference of the first camera of the rig, whether that one saw it or
+not. Its pose in camera c is R'_k = R_c R_k and t'_k = R_c t_k + t_c. A frame of one camera alone has the pose
+in that camera and does not determine the rig. The derivatives of each camera are those of
+`adjustment.reprojection`, transformed by the chain rule:
 
-    R -> exp(w) R,  t -> t + tau,  R_k -> exp(w_k) R_k,  t_k -> t_k + tau_k   give
-    w' = w + R w_k,  tau' = w x (R t_k) + R tau_k + tau
+    R_c -> exp(w) R_c,  t_c -> t_c + tau,  R_k -> exp(w_k) R_k,  t_k -> t_k + tau_k   give
+    w' = w + R_c w_k,  tau' = w x (R_c t_k) + R_c tau_k + tau
 
-`rig_problem` makes one normalised problem of two calibrations, with common frames of the views.
+Where the images of a frame were taken at different times, the target moved in between. With the velocity
+(omega_k, v_k) of the target, known from the frames before and after, and the time d between the frame and the
+view, the pose exp(d omega_k) R_k, t_k + d v_k takes the place of R_k, t_k; d is the difference of the stated
+times plus a delay of each camera, which can be estimated.
+
+`rig_problem` makes one normalised problem of the calibrations, with common frames.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +30,27 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
-from neurocal_cli.adjustment.normal_equations import SharedAndOwn
+from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
 from neurocal_cli.adjustment.views import PointBatches, Views, batches_of
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
-from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, median, orthonormalised, rotation_step
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.state import CameraState
 
-_Linearised = tuple["RigState", Array]  # a state and its normal matrices
+# A state, its normal equations, and those of the unknowns that move.
+_Linearised = tuple["RigState", Arrowhead, Arrowhead]
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 # Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
 # test_without_noise_the_truth_comes_back checks such data.
 _LEAST_SHARE = 1e-3
 _LEAST_NOISE = 1e-12
+
+Frames = Sequence[NDArray[np.intp]]
+"""Of each camera, the frame (V_c,) of each of its views; views of one moment have one frame."""
 
 
 @frozen_dataclass(eq=False)
@@ -68,121 +78,235 @@ class Observations:
 
 
 @frozen_dataclass(eq=False)
+class Motion:
+    """The velocity of the target in each frame, and when the views were taken."""
+
+    velocity: Array  # (V, 6) rotation and translation by unit of time, normalised; 0 where it is not known
+    lag: tuple[Array, ...]  # of each camera, (V_c,) stated time of the view less that of its frame
+
+    def of(self, frames: NDArray[np.intp]) -> Motion:
+        """With the velocities of other frames, (V,) of the present ones."""
+        return replace(self, velocity=self.velocity[frames])
+
+
+@frozen_dataclass(eq=False)
 class Columns:
-    """Columns of the unknowns in the normal matrices: A's entries and coefficients, and steps w, tau."""
+    """Columns of the unknowns in the normal matrix: A's entries and coefficients, and steps w, tau."""
 
-    left: NDArray[np.intp]  # (5 + K,)
-    right: NDArray[np.intp]
-    rig: NDArray[np.intp]  # (6,)
-    pose: NDArray[np.intp]
-
-    @property
-    def cameras(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Columns of the left and of the right camera."""
-        return self.left, self.right
+    cameras: tuple[NDArray[np.intp], ...]  # (5 + K,) of each
+    rigs: tuple[NDArray[np.intp], ...]  # (6,) of each camera but the first, for which it is empty
+    delays: tuple[NDArray[np.intp], ...]  # (1,) likewise; all empty without a motion
 
     @property
     def n_shared(self) -> int:
         """Number of unknowns that all views share."""
-        return int(self.pose[0])
-
-    @property
-    def width(self) -> int:
-        """Number of all columns, the residual last."""
-        return int(self.pose[-1]) + 2
+        return sum(map(len, (*self.cameras, *self.rigs, *self.delays)))
 
 
 @frozen_dataclass(eq=False)
 class RigState:
-    """Two cameras, the rig X_right = R X_left + t, and the poses Xc / scale = R_k local + t_k; normalised."""
+    """The cameras, the rig X_c = R_c X_first + t_c, and the poses Xc / scale = R_k local + t_k."""
 
-    cameras: tuple[CameraState, CameraState]  # only their entries and distortion are used
-    R: Array  # (3, 3)
-    t: Array  # (3,) in units of `RigProblem.unit`
-    view_R: Array  # (V, 3, 3) of each frame, in the left camera or, for its single views, in the right one
+    cameras: tuple[CameraState, ...]  # only their entries and distortion are used
+    R: Array  # (C, 3, 3), the first is the identity
+    t: Array  # (C, 3) in units of `RigProblem.unit`, the first is 0
+    view_R: Array  # (V, 3, 3) of each frame, in the first camera or, for frames of one camera alone, in that
     view_t: Array  # (V, 3)
+    delay: Array  # (C,) of each camera's images [unit of time], the first is 0
+    timed: bool  # whether the delays are unknowns
 
     @cached_property
     def columns(self) -> Columns:
-        """Columns of the unknowns for the distortion models of both cameras."""
-        ends = np.cumsum([0, *(5 + len(camera.k) for camera in self.cameras), 6, 6])
-        return Columns(*(np.arange(a, b) for a, b in pairwise(ends.tolist())))
+        """Columns of the unknowns for the distortion models of the cameras."""
+        C = len(self.cameras)
+        widths = [5 + len(camera.k) for camera in self.cameras]
+        widths += [0, *[6] * (C - 1), 0, *[int(self.timed)] * (C - 1)]
+        places = [np.arange(end - width, end) for width, end in zip(widths, accumulate(widths), strict=True)]
+        return Columns(tuple(places[:C]), tuple(places[C : 2 * C]), tuple(places[2 * C :]))
 
     def moved(self, shared: Array, own: Array) -> RigState:
         """The state after a step: shared (columns.n_shared,), own (V, 6)."""
-        left, right = (
+        columns = self.columns
+        cameras = tuple(
             replace(camera, entries=camera.entries + shared[None, place[:5]], k=camera.k + shared[place[5:]])
-            for camera, place in zip(self.cameras, self.columns.cameras, strict=True)
+            for camera, place in zip(self.cameras, columns.cameras, strict=True)
         )
-        w, tau = np.split(shared[self.columns.rig], 2)
+        steps = np.zeros((len(cameras), 6))
+        steps[1:] = shared[np.concatenate(columns.rigs)].reshape(-1, 6)
+        delay = self.delay.copy()
+        if self.timed:
+            delay[1:] += shared[np.concatenate(columns.delays)]
         return RigState(
-            (left, right),
-            rotation_step(w) @ self.R,
-            self.t + tau,
+            cameras,
+            rotation_step(steps[:, :3]) @ self.R,
+            self.t + steps[:, 3:],
             rotation_step(own[:, :3]) @ self.view_R,
             self.view_t + own[:, 3:],
+            delay,
+            self.timed,
         )
 
 
 @frozen_dataclass(eq=False)
 class RigProblem:
-    """Observations of both cameras in common frames, and the poses in each camera alone.
+    """Observations of C cameras in V common frames, and the poses in each camera alone."""
 
-    The V frames are those of the left camera's views, in their order, then of the views of the right camera
-    alone. P of them are paired. Tuples of two are of the left and of the right camera.
-    """
-
-    calibrations: tuple[Calibration, Calibration]  # each camera alone
-    names: tuple[tuple[str, ...], tuple[str, ...]]  # views of each camera, in the order of its observations
+    calibrations: tuple[Calibration, ...]  # each camera alone
+    names: tuple[tuple[str, ...], ...]  # views of each camera, in the order of its observations
     centre: Array  # (V, 3) world = centre + scale * local
     scale: Array  # (V,)
-    unit: float  # of the rig's translation [world unit]
-    observations: tuple[Observations, Observations]
-    cameras: tuple[CameraState, CameraState]  # as calibrated alone, with the poses of the views
-    own_normal: tuple[Array, Array]  # (V_c, 12 + K, 12 + K) whitened `normal_blocks` in each camera alone
-    paired: NDArray[np.intp]  # (P,) frames of both cameras
-    paired_right: NDArray[np.intp]  # (P,) their indices among the right camera's views
-    # (P, 5, 3) local: the target's centre, and points one rms extent from it along its two longest axes.
-    spread: Array
-    axes: Array  # (P, 3, 3) principal axes of the target as columns, the longest first
-    flat: NDArray[np.bool_]  # (P,)
+    unit: float  # of the rig's translations [world unit]
+    observations: tuple[Observations, ...]
+    cameras: tuple[CameraState, ...]  # as calibrated alone, with the poses of the views
+    own_normal: tuple[Array, ...]  # (V_c, 12 + K, 12 + K) whitened `normal_blocks` in each camera alone
+    # Of the points of each frame's first camera: principal axes as columns, the longest first, (V, 3, 3), rms
+    # extents along them (V, 3), and whether the target is flat (V,).
+    basis: Array
+    extent: Array
+    is_flat: NDArray[np.bool_]
+    motion: Motion | None = None  # of the target, if the times of the views are known
+
+    @cached_property
+    def together(self) -> NDArray[np.bool_]:
+        """(V,) frames of several cameras, which have their pose in the first camera of the rig."""
+        views = np.concatenate([observed.view for observed in self.observations])
+        return np.bincount(views, minlength=len(self.scale)) > 1
 
     @property
-    def estimated(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """`estimated_parameters` of the left and of the right camera."""
-        left, right = self.calibrations
-        return estimated_parameters(left), estimated_parameters(right)
+    def estimated(self) -> tuple[NDArray[np.bool_], ...]:
+        """`estimated_parameters` of each camera."""
+        return tuple(estimated_parameters(calibration) for calibration in self.calibrations)
+
+    @property
+    def n_rig(self) -> int:
+        """Number of unknowns of the rig itself."""
+        return (6 if self.motion is None else 7) * (len(self.cameras) - 1)
 
     @property
     def estimated_shared(self) -> NDArray[np.bool_]:
-        """(n_shared,) which unknowns that all views share are estimated; the six of the rig always are."""
-        return np.concatenate([*self.estimated, np.ones(6, dtype=bool)])
+        """(n_shared,) which unknowns that all views share are estimated; those of the rig always are."""
+        return np.concatenate([*self.estimated, np.ones(self.n_rig, dtype=bool)])
+
+    @cached_property
+    def paired_right(self) -> NDArray[np.intp]:
+        """(P,) of two cameras: the views of the right one that are paired, by index."""
+        return np.flatnonzero(self.together[self.observations[1].view])
+
+    @cached_property
+    def paired(self) -> NDArray[np.intp]:
+        """(P,) their frames."""
+        return self.observations[1].view[self.paired_right]
+
+    @cached_property
+    def paired_left(self) -> NDArray[np.intp]:
+        """(P,) their partners among the views of the left camera, by index."""
+        of_frame = np.zeros(len(self.scale), dtype=np.intp)
+        of_frame[self.observations[0].view] = np.arange(len(self.names[0]))
+        return of_frame[self.paired]
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Left and right names of the paired views."""
+        """Left and right names of the paired views of two cameras."""
         left, right = self.names
-        return [(left[a], right[b]) for a, b in zip(self.paired, self.paired_right, strict=True)]
+        return [(left[a], right[b]) for a, b in zip(self.paired_left, self.paired_right, strict=True)]
 
-    def start(self, rig: Pose) -> RigState:
-        """The calibrated cameras with the left one's poses, and the right one's for its single views."""
-        left, right = self.cameras
-        R = np.concatenate([left.R, np.zeros((len(self.scale) - len(left.R), 3, 3))])
-        t = np.concatenate([left.t, np.zeros((len(R) - len(left.t), 3))])
-        view = self.observations[1].view
-        alone = view >= len(left.R)
-        R[view[alone]], t[view[alone]] = right.R[alone], right.t[alone]
-        return RigState(self.cameras, rig.R.copy(), rig.t / self.unit, R, t)
+    @cached_property
+    def spread(self) -> Array:
+        """(P, 5, 3) local: the centre of each pair's target, and points on its two longest axes.
+
+        They are one rms extent from the centre.
+        """
+        along = self.basis[self.paired] * self.extent[self.paired][:, None, :]  # (P, 3, axis)
+        long, across = along[:, :, 0], along[:, :, 1]
+        return np.stack([np.zeros_like(long), long, -long, across, -across], axis=1)
+
+    def of_two(self, first: int, second: int) -> RigProblem:
+        """The problem of two of the cameras."""
+        sides = first, second
+        seen = [self.observations[side] for side in sides]
+        kept = np.zeros(len(self.scale), dtype=bool)
+        for observed in seen:
+            kept[observed.view] = True
+        place = np.cumsum(kept) - 1
+        return replace(
+            self.of_frames(np.flatnonzero(kept)),
+            calibrations=tuple(self.calibrations[side] for side in sides),
+            names=tuple(self.names[side] for side in sides),
+            observations=tuple(replace(observed, view=place[observed.view]) for observed in seen),
+            cameras=tuple(self.cameras[side] for side in sides),
+            own_normal=tuple(self.own_normal[side] for side in sides),
+            motion=None,
+        )
+
+    def of_frames(self, frames: NDArray[np.intp]) -> RigProblem:
+        """With other frames, by their index (V,) among the present ones; the views keep theirs."""
+        return replace(
+            self,
+            centre=self.centre[frames],
+            scale=self.scale[frames],
+            basis=self.basis[frames],
+            extent=self.extent[frames],
+            is_flat=self.is_flat[frames],
+            motion=None if self.motion is None else self.motion.of(frames),
+        )
+
+    def detached(self, views: Sequence[NDArray[np.bool_]]) -> RigProblem:
+        """With frames of their own for some views of each camera, (V_c,); these do not determine the rig."""
+        frames, observations = np.arange(len(self.scale)), []
+        for observed, apart in zip(self.observations, views, strict=True):
+            view = observed.view.copy()
+            frames = np.concatenate([frames, view[apart]])
+            view[apart] = np.arange(len(frames) - int(apart.sum()), len(frames))
+            observations.append(replace(observed, view=view))
+        kept = np.zeros(len(frames), dtype=bool)
+        for observed in observations:
+            kept[observed.view] = True
+        place = np.cumsum(kept) - 1
+        seen = tuple(replace(observed, view=place[observed.view]) for observed in observations)
+        return replace(self.of_frames(frames[kept]), observations=seen)
+
+    def start(self, others: Sequence[Pose]) -> RigState:
+        """The calibrated cameras, and the poses of the first camera that saw each frame.
+
+        `others` are the poses X_c = R_c X_first + t_c of all cameras but the first.
+        """
+        rig = [Pose(np.eye(3), np.zeros(3)), *others]
+        R, t = np.stack([pose.R for pose in rig]), np.stack([pose.t for pose in rig]) / self.unit
+        view_R, view_t = np.empty((len(self.scale), 3, 3)), np.empty((len(self.scale), 3))
+        for c in reversed(range(len(rig))):
+            camera, view = self.cameras[c], self.observations[c].view
+            through = self.together[view][:, None]
+            back = (camera.t - t[c] * (self.unit / self.scale[view])[:, None]) @ R[c]
+            view_R[view] = np.where(through[..., None], R[c].T @ camera.R, camera.R)
+            view_t[view] = np.where(through, back, camera.t)
+        delay = np.zeros(len(rig))
+        return RigState(self.cameras, R, t, view_R, view_t, delay, self.motion is not None)
 
     def camera(self, state: RigState, side: int) -> CameraState:
         """One camera with the poses of its own views."""
         view = self.observations[side].view
-        R, t = state.view_R[view], state.view_t[view]
-        if side == 1:
-            both = (view < len(self.names[0]))[:, None]
-            baseline = state.t * (self.unit / self.scale[view])[:, None]
-            R, t = np.where(both[..., None], state.R @ R, R), np.where(both, t @ state.R.T + baseline, t)
+        R, t = self._at_its_time(state, side)
+        if side:
+            both = self.together[view][:, None]
+            baseline = state.t[side] * (self.unit / self.scale[view])[:, None]
+            R = np.where(both[..., None], state.R[side] @ R, R)
+            t = np.where(both, t @ state.R[side].T + baseline, t)
         return replace(state.cameras[side], R=R, t=t)
+
+    def _at_its_time(self, state: RigState, side: int) -> tuple[Array, Array]:
+        """Poses of the frames when one camera took its views, (V_c, 3, 3) and (V_c, 3)."""
+        view = self.observations[side].view
+        R, t = state.view_R[view], state.view_t[view]
+        if self.motion is None:
+            return R, t
+        moved = self._elapsed(state, side)[:, None] * self.motion.velocity[view]
+        return rotation_step(moved[:, :3]) @ R, t + moved[:, 3:]
+
+    def _elapsed(self, state: RigState, side: int) -> Array:
+        """(V_c,) time between each frame and one camera's view of it; 0 if it saw the frame alone."""
+        assert self.motion is not None
+        view = self.observations[side].view
+        return np.asarray(np.where(self.together[view], self.motion.lag[side] + state.delay[side], 0.0))
 
     def world_poses(self, state: RigState, side: int) -> tuple[Array, Array]:
         """(V_c, 3, 3) and (V_c, 3) poses of one camera's views in this camera, in world units."""
@@ -190,38 +314,77 @@ class RigProblem:
         turned = (camera.R @ self.centre[view][..., None])[..., 0]
         return camera.R, camera.t * self.scale[view][:, None] - turned
 
-    def normal(self, state: RigState) -> tuple[Array, bool]:
-        """Products of derivatives and whitened residuals, summed over each view's points in both cameras.
+    def normal(self, state: RigState) -> tuple[Arrowhead, bool]:
+        """Normal equations of all unknowns with whitened residuals; the own ones are those of the frames.
 
-        Returns (V, D, D) matrices in the order of the columns, and whether all points are in front of their
-        cameras, where the distortions are monotonic.
+        Also returns whether all points are in front of their cameras, where the distortions are monotonic.
         """
-        D = state.columns.width
-        normal, sensible = np.zeros((len(self.scale), D, D)), True
-        for side, observed in enumerate(self.observations):
-            blocks, fine = normal_blocks(observed.batches, self.camera(state, side))
-            T = self.jacobian(state, side)
-            normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
-            sensible = sensible and bool(fine.all())
-        return normal, sensible
+        blocks, fine = zip(
+            *(
+                normal_blocks(observed.batches, self.camera(state, side))
+                for side, observed in enumerate(self.observations)
+            ),
+            strict=True,
+        )
+        return self.gathered(state, blocks), all(bool(one.all()) for one in fine)
 
-    def jacobian(self, state: RigState, side: int) -> Array:
-        """Derivatives of the columns of one camera by the columns of the rig, (V_c, 12 + K, D)."""
-        columns, views = state.columns, self.observations[side].view
-        place = columns.cameras[side]
-        own = camera_columns(len(place) - 5)
-        T = np.zeros((len(views), len(own) + 7, columns.width))
-        T[:, own, place] = 1.0
-        T[:, -1, -1] = 1.0
-        pose = np.arange(POSE.start, POSE.stop)
-        through = (views < len(self.names[0])) & (side == 1)
-        alone, which = np.flatnonzero(~through), np.flatnonzero(through)[:, None, None]
-        T[alone[:, None], pose, columns.pose] = 1.0
-        view = views[through]
-        by_rig, by_pose = steps_through(state.R, state.view_t[view] @ state.R.T, self.unit / self.scale[view])
-        T[which, pose[:, None], columns.rig] = by_rig
-        T[which, pose[:, None], columns.pose] = by_pose
-        return T
+    def gathered(self, state: RigState, blocks: Sequence[Array]) -> Arrowhead:
+        """Normal equations from those of each camera's views, (V_c, 12 + K + m, 12 + K + m).
+
+        The m further columns before the residual's are those of m further shared unknowns, the last ones.
+        """
+        columns, V = state.columns, len(self.scale)
+        m = blocks[0].shape[-1] - 12 - len(state.cameras[0].k)
+        s = columns.n_shared + m
+        shared, own, cross = np.zeros((s + 1, s + 1)), np.zeros((V, 6, 6)), np.zeros((V, 6, s + 1))
+        rows = np.arange(6)
+        for side, (observed, N) in enumerate(zip(self.observations, blocks, strict=True)):
+            K = len(state.cameras[side].k)
+            local = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[-1])])
+            place = np.concatenate([columns.cameras[side], np.arange(columns.n_shared, s + 1)])
+            pp, pc = N[:, POSE, POSE], N[:, POSE][:, :, local]
+            whole, view = observed.weight * N[:, local[:, None], local].sum(axis=0), observed.view
+            shared[np.ix_(place, place)] += whole
+            of_rig, by_rig, by_pose = self.pose_steps(state, side)
+            back = observed.weight * np.swapaxes(by_pose, -1, -2)
+            own[view] += back @ pp @ by_pose
+            cross[np.ix_(view, rows, place)] += back @ pc
+            if of_rig.size:
+                along, forth = pp @ by_rig, observed.weight * np.swapaxes(by_rig, 1, 2)
+                mixed = (forth @ pc).sum(axis=0)
+                shared[np.ix_(of_rig, place)] += mixed
+                shared[np.ix_(place, of_rig)] += mixed.T
+                shared[np.ix_(of_rig, of_rig)] += (forth @ along).sum(axis=0)
+                cross[np.ix_(view, rows, of_rig)] += back @ along
+        return Arrowhead(shared, own, cross)
+
+    def pose_steps(self, state: RigState, side: int) -> tuple[NDArray[np.intp], Array, Array]:
+        """Derivatives of the poses in one camera by the rig, with its columns (r,), and by the frames' poses.
+
+        They are (V_c, 6, r) and (V_c, 6, 6); the rig's are 0 for views of this camera alone.
+        """
+        columns, view = state.columns, self.observations[side].view
+        through = self.together[view]
+        of_rig = np.concatenate([columns.rigs[side], columns.delays[side]])
+        by_pose = np.zeros((len(view), 6, 6))
+        by_pose[:] = np.eye(6)
+        by_rig = np.zeros((len(view), 6, len(of_rig)))
+        if side == 0 and self.motion is None:
+            return of_rig, by_rig, by_pose
+        R, t = self._at_its_time(state, side)
+        turn = state.R[side]
+        step, of_frame = steps_through(turn, t[through] @ turn.T, self.unit / self.scale[view[through]])
+        by_pose[through] = of_frame
+        if self.motion is not None:
+            # The step of a rotation comes before the turn of the time between.
+            turned = R[through] @ np.swapaxes(state.view_R[view[through]], 1, 2)
+            by_pose[through, :3, :3] = turn @ turned
+        if of_rig.size:
+            by_rig[through, :, :6] = step
+        if of_rig.size > 6:
+            assert self.motion is not None
+            by_rig[through, :, 6] = (of_frame @ self.motion.velocity[view[through]][..., None])[..., 0]
+        return of_rig, by_rig, by_pose
 
 
 def steps_through(R: Array, centre: Array, unit: Array) -> tuple[Array, Array]:
@@ -237,47 +400,49 @@ def steps_through(R: Array, centre: Array, unit: Array) -> tuple[Array, Array]:
     return by_rig, by_pose
 
 
-def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
-    """Combine two calibrations with one world unit."""
-    cameras = left, right
+def rig_problem(calibrations: Sequence[Calibration], frames: Frames) -> RigProblem:
+    """Combine calibrations with one world unit; the frames are numbered from 0, without gaps."""
     # Covariances of the points count as far as the residuals confirm them.
-    arranged = [weighed(camera.points, evaluate_camera(camera).residuals) for camera in cameras]
-    names = arranged[0].names, arranged[1].names
-    place = {b: names[0].index(a) for a, b in views.both}
-    n_left = len(names[0])
-    frame = np.array([place.get(name, -1) for name in names[1]])
-    alone, paired_right = np.flatnonzero(frame < 0), np.flatnonzero(frame >= 0)
-    paired = frame[paired_right]
-    frame[alone] = n_left + np.arange(len(alone))
-    centre = np.concatenate([arranged[0].centre, arranged[1].centre[alone]])
-    scale = np.concatenate([arranged[0].scale, arranged[1].scale[alone]])
+    arranged = [weighed(camera.points, evaluate_camera(camera).residuals) for camera in calibrations]
+    V = 1 + max(int(frame.max()) for frame in frames)
+    centre, scale = np.empty((V, 3)), np.empty(V)
+    basis, extent, is_flat = np.empty((V, 3, 3)), np.empty((V, 3)), np.empty(V, dtype=bool)
+    for own, frame in reversed(list(zip(arranged, frames, strict=True))):
+        centre[frame], scale[frame] = own.centre, own.scale
+        basis[frame], extent[frame], is_flat[frame] = own.basis, own.extent, own.nearly_flat
     sides = [
         _side(camera, own, centre[which], scale[which], which)
-        for camera, own, which in zip(cameras, arranged, (np.arange(n_left), frame), strict=True)
+        for camera, own, which in zip(calibrations, arranged, frames, strict=True)
     ]
     seen, states, normals, noise = zip(*sides, strict=True)
     real = [observed.pixel_scale * s for observed, s in zip(seen, noise, strict=True)]
     weights = [
         1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2 for s, own in zip(noise, real, strict=True)
     ]
-    first = arranged[0]
-    along = first.basis[paired] * first.extent[paired][:, None, :]  # (P, 3, axis)
-    long, across = along[:, :, 0], along[:, :, 1]
     return RigProblem(
-        calibrations=cameras,
-        names=names,
+        calibrations=tuple(calibrations),
+        names=tuple(own.names for own in arranged),
         centre=centre,
         scale=scale,
         unit=float(median(scale)),
-        observations=(replace(seen[0], weight=weights[0]), replace(seen[1], weight=weights[1])),
-        cameras=(states[0], states[1]),
-        own_normal=(weights[0] * normals[0], weights[1] * normals[1]),
-        paired=paired,
-        paired_right=paired_right,
-        spread=np.stack([np.zeros_like(long), long, -long, across, -across], axis=1),
-        axes=first.basis[paired],
-        flat=first.nearly_flat[paired],
+        observations=tuple(replace(one, weight=weight) for one, weight in zip(seen, weights, strict=True)),
+        cameras=states,
+        own_normal=tuple(weight * normal for weight, normal in zip(weights, normals, strict=True)),
+        basis=basis,
+        extent=extent,
+        is_flat=is_flat,
     )
+
+
+def stereo_problem(left: Calibration, right: Calibration, pairs: Sequence[tuple[str, str]]) -> RigProblem:
+    """Combine two calibrations, of which some views are paired by their names."""
+    place = {name: k for k, name in enumerate(left.points.view_names)}
+    partner = {b: place[a] for a, b in pairs}
+    frame, end = [], len(place)
+    for name in right.points.view_names:
+        frame.append(partner.get(name, end))
+        end += name not in partner
+    return rig_problem((left, right), (np.arange(len(place)), np.array(frame)))
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
@@ -323,14 +488,14 @@ class RigFit:
     problem: RigProblem
     free: NDArray[np.bool_]  # (n_shared,) which parameters of the cameras and the rig moved
     state: RigState
-    normal: Array  # (V, D, D) from `RigProblem.normal`
+    normal: Arrowhead  # of all unknowns
     iterations: int
     converged: bool
 
     @property
     def cost(self) -> float:
         """Sum of squared whitened residuals."""
-        return float(self.normal[:, -1, -1].sum())
+        return self.normal.cost
 
     @property
     def variance(self) -> float:
@@ -348,19 +513,21 @@ def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) ->
     """
     shared, columns = np.flatnonzero(free), start.columns
 
+    def linearised(state: RigState) -> tuple[_Linearised, bool]:
+        normal, sensible = problem.normal(state)
+        return (state, normal, normal.only(shared)), sensible
+
     def moved(before: _Linearised, by_shared: Array, by_own: Array) -> tuple[_Linearised, bool]:
         # Valid if all points are in front of their cameras and the distortions are monotonic.
         step = np.zeros(columns.n_shared)
         step[shared] = by_shared
-        state = before[0].moved(step, by_own)
-        normal, sensible = problem.normal(state)
-        positive = all(camera.entries[0, [0, 2]].min() > 0 for camera in state.cameras)
-        return (state, normal), sensible and positive
+        after, sensible = linearised(before[0].moved(step, by_own))
+        positive = all(camera.entries[0, [0, 2]].min() > 0 for camera in after[0].cameras)
+        return after, sensible and positive
 
-    at_start = start, problem.normal(start)[0]
-    error = SharedAndOwn(at_start, lambda at: at[1], moved, shared, columns.pose)
+    error = SharedAndOwn(linearised(start)[0], lambda at: at[2], moved)
     floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in problem.observations)
     outcome = minimise(error, replace(OPTIONS, damping=_DAMPING), floor)
-    state, normal = error.state
+    state, normal, _ = error.state
     state = replace(state, R=orthonormalised(state.R), view_R=orthonormalised(state.view_R))
     return RigFit(problem, free, state, normal, int(outcome.iterations[0]), bool(outcome.settled[0]))

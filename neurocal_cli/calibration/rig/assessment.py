@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.leave_out import Quadratics, folds_of
 from neurocal_cli.adjustment.problem import intrinsic_matrix
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.adjust import rig_problem
+from neurocal_cli.calibration.rig.adjust import stereo_problem
 from neurocal_cli.calibration.rig.contradiction import FOCAL, Contradiction, contradiction
 from neurocal_cli.calibration.rig.covariance import covariance_by_given, rig_covariance
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points
@@ -110,7 +110,7 @@ def _evidence(rig: Rig) -> _Evidence:
         for side, camera in (("left", rig.left), ("right", rig.right))
         if (verdict := assess(camera)) is not None
     ]
-    poses = relative_poses(rig_problem(rig.left, rig.right, ViewPairs(pairs)), rig.pose)
+    poses = relative_poses(stereo_problem(rig.left, rig.right, pairs), rig.pose)
     if poses is None:
         return _Evidence(cameras, pairs, np.zeros(0))
     used = np.array([pair not in rig.left_out for pair in poses.names])
@@ -172,7 +172,7 @@ def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array
     points are evenly spaced over the pairs; nan for points that are behind a camera.
     """
     estimated = poses.problem.estimated_shared
-    state = poses.problem.start(rig.pose)
+    state = poses.problem.start([rig.pose])
     given = covariance_by_given(poses.problem, state, poses.problem.normal(state)[0], estimated)
     shared = np.zeros((len(estimated), len(estimated)))
     shared[np.ix_(estimated, estimated)] = covariance
@@ -185,7 +185,7 @@ def _depth_std(rig: Rig, poses: RelativePoses, covariance: Array) -> tuple[Array
 
     def depths(step: Array) -> Array:
         left, right = (_moved_camera(poses, side, step[columns.cameras[side]]) for side in (0, 1))
-        w, tau = np.split(step[columns.rig], 2)
+        w, tau = np.split(step[columns.rigs[1]], 2)
         pose = Pose(rotation_step(w) @ rig.R, rig.t + tau * poses.unit)
         found = triangulate(left, right, pose, *pixels)
         return np.where(found.behind, np.nan, found.points[:, 2])

@@ -17,7 +17,13 @@ import numpy as np
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import can_tell, common_target, on_one_target
-from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, free_parameters, rig_problem
+from neurocal_cli.calibration.rig.adjust import (
+    RigFit,
+    RigProblem,
+    adjust_rig,
+    free_parameters,
+    stereo_problem,
+)
 from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
 from neurocal_cli.calibration.rig.contradiction import contradiction
@@ -29,7 +35,7 @@ from neurocal_cli.calibration.rig.covariance import (
 )
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.rig.relative_poses import relative_poses
-from neurocal_cli.calibration.rig.result import assemble_rig, non_monotonic_sides
+from neurocal_cli.calibration.rig.result import assemble_stereo, non_monotonic_sides
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.sound_pairs import sound_pairs
 from neurocal_cli.camera.geometry import Array
@@ -225,8 +231,8 @@ def fit_rig(
     problem = sound.problem
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
-        problem = rig_problem(left, right, ViewPairs(kept))
-    fit, warnings = _adjusted(problem, sound.rig, refine_cameras)
+        problem = stereo_problem(left, right, kept)
+    fit, warnings = _adjusted(problem, [sound.rig], refine_cameras)
     least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:
         uncertain = with_target_uncertainty(left.target, fit)
@@ -237,25 +243,25 @@ def fit_rig(
     if target_kept and stretched is not None:
         left, right = (replace(camera, target_stretched=stretched[0]) for camera in (left, right))
         fit = replace(fit, problem=replace(problem, calibrations=(left, right)))
-    rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched[1])
+    rig = assemble_stereo(fit, sound.left_out, least, None if stretched is None else stretched[1])
     _refuse_one_place(rig)
     if sound.left_out:
         warnings.insert(0, sound.contradiction())
     return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
 
 
-def _adjusted(problem: RigProblem, start: Pose, refine_cameras: bool) -> tuple[RigFit, list[str]]:
+def _adjusted(problem: RigProblem, starts: Sequence[Pose], refine_cameras: bool) -> tuple[RigFit, list[str]]:
     """The common bundle adjustment, and its warnings."""
-    moving = [refine_cameras, refine_cameras]
+    moving = [refine_cameras] * len(problem.cameras)
     warnings = []
     while True:
         free = np.concatenate(
             [free_parameters(c) & moves for c, moves in zip(problem.calibrations, moving, strict=True)]
-            + [np.ones(6, dtype=bool)]
+            + [np.ones(problem.n_rig, dtype=bool)]
         )
-        fit = adjust_rig(problem, problem.start(start), free)
+        fit = adjust_rig(problem, problem.start(starts), free)
         if any(moving) and np.sqrt(fit.variance) > _SPOILS:
-            moving = [False, False]
+            moving = [False] * len(moving)
             warnings = [
                 "the pairs of views contradict each other, so both cameras keep the result of their own views"
             ]
@@ -278,7 +284,7 @@ def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
     held = bool((fit.free != estimated).any())
     if by_chance and not held:
         return None
-    poses = relative_poses(fit.problem, Pose(fit.state.R, fit.state.t * fit.problem.unit))
+    poses = relative_poses(fit.problem, Pose(fit.state.R[1], fit.state.t[1] * fit.problem.unit))
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
@@ -314,8 +320,8 @@ def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: Vie
 
     The cameras have the poses of the views in each camera alone.
     """
-    problem = rig_problem(*cameras, views)
-    start = problem.start(rig)
+    problem = stereo_problem(*cameras, views.both)
+    start = problem.start([rig])
     state = adjust_rig(problem, start, np.zeros(start.columns.n_shared, dtype=bool)).state
     R, t = problem.world_poses(state, side=0)
     return {name: Pose(R[k], t[k]) for k, name in enumerate(problem.names[0])}

@@ -33,14 +33,14 @@ from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance
 from neurocal_cli.adjustment.leave_out import Quadratics
-from neurocal_cli.adjustment.normal_equations import SchurCovariance, eliminate, solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import Arrowhead, SchurCovariance, solve_scaled, unit_diagonal
 from neurocal_cli.adjustment.open_coefficients import (
     OpenCoefficients,
     OpenPrior,
     open_at_points,
     spread_of_open,
 )
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
@@ -109,7 +109,7 @@ def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
 def _information(target: Target, fit: RigFit) -> Information:
     problem, state, n = fit.problem, fit.state, len(target.given)
     columns, shared = state.columns, np.flatnonzero(fit.free)
-    N, _ = problem.normal(state)
+    normal = fit.normal.only(shared)
     point, point_right = np.zeros((n, 3, 3)), np.zeros((n, 3))
     point_shared = np.zeros((n, 3, columns.n_shared))
     pose_point = np.zeros((len(problem.scale), 6, n, 3))
@@ -117,25 +117,23 @@ def _information(target: Target, fit: RigFit) -> Information:
         label, scale = _labels(target, problem, observed), problem.scale[observed.view]
         camera, shared_columns = problem.camera(state, side), camera_columns(len(own) - 5)
         terms = point_terms(observed.batches, camera, scale, label, shared_columns, n)
-        T, w = problem.jacobian(state, side)[:, POSE], observed.weight
+        w, (of_rig, by_rig, by_pose) = observed.weight, problem.pose_steps(state, side)
         point += w * terms.point
         point_right += w * terms.point_right
         point_shared[:, :, own] += w * terms.point_camera
-        point_shared[:, :, columns.rig] += w * np.einsum(
-            "vqnj,vqr->njr", terms.pose_point, T[:, :, columns.rig]
-        )
-        pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, T[:, :, columns.pose])
+        point_shared[:, :, of_rig] += w * np.einsum("vqnj,vqr->njr", terms.pose_point, by_rig)
+        pose_point[observed.view] += w * np.einsum("vqnj,vqr->vrnj", terms.pose_point, by_pose)
     return Information(
-        camera=N[:, shared[:, None], shared].sum(axis=0),
-        camera_right=N[:, shared, -1].sum(axis=0),
-        pose=N[:, columns.pose[:, None], columns.pose],
-        pose_camera=N[:, columns.pose[:, None], shared],
-        pose_right=N[:, columns.pose, -1],
+        camera=normal.shared[:-1, :-1],
+        camera_right=normal.shared[:-1, -1],
+        pose=normal.own,
+        pose_camera=normal.cross[:, :, :-1],
+        pose_right=normal.cross[:, :, -1],
         point=point,
         point_camera=point_shared[:, :, shared],
         point_right=point_right,
         pose_point=pose_point,
-        cost=float(N[:, -1, -1].sum()),
+        cost=normal.cost,
         equations=sum(observed.n_equations for observed in problem.observations),
     )
 
@@ -153,22 +151,22 @@ def covariance_of_choice(fit: RigFit) -> Array | None:
     """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
     problem, before = fit.problem, fit.state
     own = [fit.free[place] for place in before.columns.cameras]
-    opened: list[OpenCoefficients | None] = [None, None]
+    opened: list[OpenCoefficients | None] = [None] * len(own)
     for side, (calibration, free) in enumerate(zip(problem.calibrations, own, strict=True)):
         # A camera that the common bundle adjustment did not change has no open coefficients either.
         if free.any():
             points, choice = calibration.points, tuple(calibration.lens_choice)
             alone = replace(calibration.state(points.view_names), k=before.cameras[side].k)
             opened[side] = open_at_points(alone, points, free, choice)
-    if opened == [None, None]:
+    if not any(found is not None for found in opened):
         return None
-    left, right = (
+    cameras = tuple(
         camera if found is None else found.state(camera)
         for camera, found in zip(before.cameras, opened, strict=True)
     )
-    state = replace(before, cameras=(left, right))
+    state = replace(before, cameras=cameras)
     parts = []
-    for found, free in zip([*opened, None], [*own, fit.free[before.columns.rig]], strict=True):
+    for found, free in zip([*opened, None], [*own, fit.free[-problem.n_rig :]], strict=True):
         none = np.zeros(int(free.sum()), dtype=bool)
         if found is None:
             parts.append((free, none, none))
@@ -176,8 +174,7 @@ def covariance_of_choice(fit: RigFit) -> Array | None:
             parts.append((found.free, found.prior.is_open, found.prior.left_out))
     all_free, is_open, left_out = (np.concatenate(part) for part in zip(*parts, strict=True))
     prior = _joined(is_open, left_out, [found.prior for found in opened if found is not None])
-    kept = np.append(np.flatnonzero(all_free), state.columns.width - 1)
-    whole = eliminate(problem.normal(state)[0], kept, state.columns.pose)[0].sum(axis=0)
+    whole = problem.normal(state)[0].only(np.flatnonzero(all_free)).reduced()[0]
     spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], fit.variance, prior)
     follow = spread.follow[~prior.left_out]
     added = follow @ spread.E @ follow.T
@@ -185,7 +182,7 @@ def covariance_of_choice(fit: RigFit) -> Array | None:
 
 
 def _joined(is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], priors: list[OpenPrior]) -> OpenPrior:
-    """Both cameras' open coefficients, each with groups of its own."""
+    """The open coefficients of all cameras, each with groups of its own."""
     starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
     groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
     value, size = (np.concatenate(parts) for parts in zip(*((p.value, p.size) for p in priors), strict=True))
@@ -203,9 +200,13 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
     world = np.concatenate([calibration.points.world for calibration in fit.problem.calibrations])
     if not is_flat(world) or not fit.variance > 0:
         return None
-    estimated, columns = fit.problem.estimated_shared, fit.state.columns
-    kept = np.append(np.flatnonzero(estimated), np.arange(columns.width - 1, columns.width + 2))
-    whole = eliminate(_with_stretches(fit, stretches(world)), kept, columns.pose)[0].sum(axis=0)
+    estimated, n = fit.problem.estimated_shared, fit.state.columns.n_shared
+    blocks = [
+        stretched_blocks(observed.batches, fit.problem.camera(fit.state, side), stretches(world))
+        for side, observed in enumerate(fit.problem.observations)
+    ]
+    kept = np.append(np.flatnonzero(estimated), [n, n + 1])
+    whole = fit.problem.gathered(fit.state, blocks).only(kept).reduced()[0]
     found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)
     if found is None:
         return None
@@ -213,27 +214,13 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
     return found.probability, T @ found.E @ T.T
 
 
-def _with_stretches(fit: RigFit, by: Array) -> Array:
-    """(V, D + 2, D + 2) normal matrices with columns of two stretches before the residual's."""
-    problem, state, D = fit.problem, fit.state, fit.state.columns.width
-    normal = np.zeros((len(problem.scale), D + 2, D + 2))
-    for side, observed in enumerate(problem.observations):
-        blocks = stretched_blocks(observed.batches, problem.camera(state, side), by)
-        own = problem.jacobian(state, side)
-        T = np.zeros((len(own), own.shape[1] + 2, D + 2))
-        T[:, :-3, : D - 1] = own[:, :-1, :-1]
-        T[:, -3:, D - 1 :] = np.eye(3)
-        normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
-    return normal
-
-
 def covariance_by_given(
-    problem: RigProblem, state: RigState, normal: Array, free: NDArray[np.bool_]
+    problem: RigProblem, state: RigState, normal: Arrowhead, free: NDArray[np.bool_]
 ) -> SchurCovariance | None:
     """Covariance of all shared unknowns and of the poses that the given cameras cause, normalised.
 
-    `normal` (V, D, D) is that at the state, which is a minimum, and `free` (n_shared,) are the unknowns that
-    moved. None if no covariance is known.
+    `normal` is that at the state, which is a minimum, and `free` (n_shared,) are the unknowns that moved.
+    None if no covariance is known.
     """
     columns = state.columns
     given = np.zeros((columns.n_shared, columns.n_shared))
@@ -248,8 +235,8 @@ def covariance_by_given(
             )
     if not given.any():
         return None
-    whole, by_shared = eliminate(normal, np.arange(columns.n_shared), columns.pose)
-    whole = whole.sum(axis=0)
+    whole, by_shared = (part[..., :-1] for part in normal.reduced())
+    whole = whole[:-1]
     follow = np.eye(columns.n_shared)
     follow[free] = -solve_scaled(whole[np.ix_(free, free)], whole[free])
     follow[np.ix_(free, free)] = 0.0  # the free unknowns themselves have no error of their own here

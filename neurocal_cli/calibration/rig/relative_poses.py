@@ -1,4 +1,4 @@
-"""The relative pose of the two cameras, estimated from each pair of views separately.
+"""The relative pose of two cameras, estimated from each pair of views separately.
 
 Each camera alone gives the poses of its views. So every pair of views gives its own relative pose, with a
 covariance. All are equal up to noise if the cameras are fixed to each other and the images of each pair were
@@ -93,9 +93,10 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
     names = in_order(problem.pairs)
     place = {pair: k for k, pair in enumerate(problem.pairs)}
     order = np.array([place[pair] for pair in names], dtype=np.intp)
-    first, second = problem.paired[order], problem.paired_right[order]
+    first, second = problem.paired_left[order], problem.paired_right[order]
     left, right = problem.cameras
-    size = problem.scale[first]
+    frame = problem.paired[order]
+    size = problem.scale[frame]
     scale = size / problem.unit
     R = right.R[second] @ np.swapaxes(left.R[first], 1, 2)
     centre = (R @ left.t[first][..., None])[..., 0]
@@ -126,7 +127,7 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
         names=tuple(names),
         cameras=_both(problem, sides, places, len(columns)),
         pairs=pairs,
-        frame=first,
+        frame=frame,
         rig=rig,
         focal=(places[0][sides[0].focal], places[1][sides[1].focal]),
         reference=reference.t / problem.unit,

@@ -1,4 +1,4 @@
-"""Assembly of a `Rig` in pixels and world units from the adjusted, normalised one, with its covariance."""
+"""A rig in pixels and world units from the adjusted, normalised one, with its covariance."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.covariance import parameter_covariance, parameter_warnings, pose_std, with_scale
-from neurocal_cli.adjustment.normal_equations import SchurCovariance, schur_covariance, solve_scaled
+from neurocal_cli.adjustment.normal_equations import SchurCovariance, solve_scaled
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.adjustment.reprojection import POSE, residuals
+from neurocal_cli.adjustment.reprojection import residuals
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monotonic
 from neurocal_cli.calibration.rig.adjust import RigFit
@@ -28,32 +28,48 @@ from neurocal_cli.observations.target import scale_of
 _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 
 
-def assemble_rig(
+def assemble_stereo(
     fit: RigFit,
     left_out: Mapping[tuple[str, str], str],
     least: Array | None,
     stretched: Array | None,
 ) -> Rig:
-    """Convert an adjusted rig to the user's units.
+    """Convert the adjusted rig of two cameras to the user's units; see `RigAssembly`."""
+    found = RigAssembly(fit, least, stretched)
+    left, right = found.cameras
+    return Rig(
+        left,
+        right,
+        found.poses[0],
+        found.stds[0],
+        found.covariance,
+        tuple(fit.problem.pairs[k] for k in np.argsort(fit.problem.paired_left)),
+        dict(left_out),
+        rmse_px=found.rmse_px,
+        max_px=max(left.max_px, right.max_px),
+        converged=left.converged,
+        stop_reason=left.stop_reason,
+        iterations=fit.iterations,
+    )
+
+
+class RigAssembly:
+    """An adjusted rig in pixels and world units.
 
     `least` (f, f) is a lower bound of the covariance of the free shared parameters, normalised. `stretched`
     is the covariance to add to it because the print may be stretched. Points that do not determine the
     parameters are an error.
     """
-    return _RigAssembly(fit, least, stretched).rig(left_out)
 
-
-class _RigAssembly:
     def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
         self.fit, self.problem, self.state, self.columns = fit, fit.problem, fit.state, fit.state.columns
         self.scale_std = scale_of(self.problem.calibrations[0].points).std
         self.shared = np.flatnonzero(fit.free)
-        inverse = schur_covariance(fit.normal, self.shared, self.columns.pose)
+        inverse = fit.normal.only(self.shared).covariance()
         if not inverse.smallest > _SINGULAR:
             raise DegenerateGeometryError(
-                "the points do not determine the rig and both cameras (the normal matrix is singular); "
-                "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
-                "--right-intrinsics)"
+                "the points do not determine the rig and its cameras (the normal matrix is singular); "
+                "spread them in depth, or give known parameters (--no-skew, or known cameras)"
             )
         blocks = {name: fit.variance * getattr(inverse, name) for name in ("shared", "own", "cross")}
         covariance = replace(inverse, **blocks)
@@ -70,57 +86,62 @@ class _RigAssembly:
                 own=covariance.own + given.own,
                 cross=covariance.cross + given.cross[:, self.shared],
             )
-        self.covariance = covariance
+        self._normalised = covariance
+        self.poses = [
+            Pose(R, t * self.problem.unit) for R, t in zip(self.state.R[1:], self.state.t[1:], strict=True)
+        ]
+        self.covariance, self.stds = self._of_poses()
+        self._measure()
 
-    def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
-        """The rig in pixels and world units, with the pairs left out and why."""
-        problem, state = self.problem, self.state
-        sums, largest = [], []  # of the squared errors [px^2]
+    def _measure(self) -> None:
+        """The errors of all points, and the cameras."""
+        problem, sums, largest = self.problem, [], []  # of the squared errors [px^2]
         for side, observed in enumerate(problem.observations):
             batches = observed.batches
-            errors = residuals(batches, problem.camera(state, side))
+            errors = residuals(batches, problem.camera(self.state, side))
             squares = (errors**2).sum(axis=1) * observed.pixel_scale**2
             if batches.whitening is not None:  # those of padding are 0
                 squares = np.where(batches.whitening[:, 0] > 0, squares, 0.0)
             sums.append(batches.sum_by_view(squares.sum(axis=1)))
             largest.append(float(squares.max()))
-        left, right = (self._calibration(side, sums[side], largest[side]) for side in (0, 1))
-        pose = Pose(state.R, state.t * problem.unit)
-        covariance, std = self._rig_covariance(pose)
         n_points = sum(observed.batches.counts.sum() for observed in problem.observations)
-        return Rig(
-            left,
-            right,
-            pose,
-            std,
-            covariance,
-            tuple(problem.pairs[k] for k in np.argsort(problem.paired)),
-            dict(left_out),
-            rmse_px=float(np.sqrt(sum(part.sum() for part in sums) / n_points)),
-            max_px=max(left.max_px, right.max_px),
-            converged=left.converged,
-            stop_reason=left.stop_reason,
-            iterations=self.fit.iterations,
-        )
+        self.rmse_px = float(np.sqrt(sum(part.sum() for part in sums) / n_points))
+        self.cameras = [
+            self._calibration(side, *errors) for side, errors in enumerate(zip(sums, largest, strict=True))
+        ]
 
-    def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
-        """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
-        J, unit, baseline = np.zeros((7, 6)), self.problem.unit, np.linalg.norm(pose.t)
-        J[:3, :3] = euler_jacobian(pose.R)
-        J[3:6, 3:] = np.eye(3) * unit
-        J[6, 3:] = unit * (pose.t / baseline if baseline > 0 else 0.0)
-        block = J @ self._shared_block(self.columns.rig) @ J.T
-        followed = np.array([0.0, 0.0, 0.0, *pose.t, baseline])  # the scale of the target
+    def _of_poses(self) -> tuple[Array, list[dict[str, float]]]:
+        """Covariance of the angles and translations of all poses; their and the distances' std."""
+        n, unit = len(self.poses), self.problem.unit
+        J, followed = np.zeros((n, 7, n, 6)), np.zeros((n, 7))
+        for k, pose in enumerate(self.poses):
+            distance = np.linalg.norm(pose.t)
+            J[k, :3, k, :3] = euler_jacobian(pose.R)
+            J[k, 3:6, k, 3:] = np.eye(3) * unit
+            J[k, 6, k, 3:] = unit * (pose.t / distance if distance > 0 else 0.0)
+            followed[k, 3:] = *pose.t, distance  # the scale of the target
+        flat = J.reshape(7 * n, 6 * n)
+        block = flat @ self._shared_block(np.concatenate(self.columns.rigs)) @ flat.T
         block += self.scale_std**2 * np.outer(followed, followed)
-        std = np.sqrt(np.maximum(np.diagonal(block), 0.0)).tolist()
-        return block[:6, :6], dict(zip((*POSE_NAMES, "baseline"), std, strict=True))
+        std = np.sqrt(np.maximum(np.diagonal(block), 0.0)).reshape(n, 7).tolist()
+        angles = np.arange(7 * n).reshape(n, 7)[:, :6].ravel()
+        stds = [dict(zip((*POSE_NAMES, "baseline"), one, strict=True)) for one in std]
+        return block[np.ix_(angles, angles)], stds
+
+    @property
+    def delays(self) -> list[tuple[float, float]]:
+        """Delay of the images of each camera but the first, and its standard deviation; empty if unknown."""
+        if not self.state.timed:
+            return []
+        variances = np.diagonal(self._shared_block(np.concatenate(self.columns.delays)))
+        return list(zip(self.state.delay[1:].tolist(), np.sqrt(variances).tolist(), strict=True))
 
     def _shared_block(self, columns: NDArray[np.intp]) -> Array:
         """Covariance of some of the shared parameters, 0 for given ones."""
         free = np.flatnonzero(self.fit.free[columns])
         rows = np.searchsorted(self.shared, columns[free])
         block = np.zeros((len(columns), len(columns)))
-        block[np.ix_(free, free)] = self.covariance.shared[np.ix_(rows, rows)]
+        block[np.ix_(free, free)] = self._normalised.shared[np.ix_(rows, rows)]
         return block
 
     def _calibration(self, side: int, sums: Array, largest: float) -> Calibration:
@@ -184,12 +205,16 @@ class _RigAssembly:
 
     def _pose_stds(self, side: int, R: Array) -> Array:
         """Standard deviations of the angles and translations of the views, (V_c, 6)."""
-        view, T = self.problem.observations[side].view, self.problem.jacobian(self.state, side)[:, POSE]
-        by_rig, by_pose = T[:, :, self.columns.rig], T[:, :, self.columns.pose]
-        mixed = by_rig @ self.covariance.cross[view, -6:] @ np.swapaxes(by_pose, 1, 2)
-        covariance = by_pose @ self.covariance.own[view] @ np.swapaxes(by_pose, 1, 2)
-        covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
-        covariance += by_rig @ self._shared_block(self.columns.rig) @ np.swapaxes(by_rig, 1, 2)
+        view, (of_rig, by_rig, by_pose) = (
+            self.problem.observations[side].view,
+            self.problem.pose_steps(self.state, side),
+        )
+        covariance = by_pose @ self._normalised.own[view] @ np.swapaxes(by_pose, 1, 2)
+        if of_rig.size:
+            rows = np.searchsorted(self.shared, of_rig)  # the rig's unknowns always move
+            mixed = by_rig @ self._normalised.cross[view][:, rows] @ np.swapaxes(by_pose, 1, 2)
+            covariance = covariance + mixed + np.swapaxes(mixed, 1, 2)
+            covariance += by_rig @ self._shared_block(of_rig) @ np.swapaxes(by_rig, 1, 2)
         centre = (R @ self.problem.centre[view][..., None])[..., 0]
         return pose_std(R, centre, self.problem.scale[view], covariance)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigProblem, rig_problem
+from neurocal_cli.calibration.rig.adjust import RigProblem, stereo_problem
 from neurocal_cli.calibration.rig.contradiction import Contradiction, contradiction
 from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order, relative_poses
@@ -85,7 +85,7 @@ class SoundPairs:
 
 def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> SoundPairs:
     """Find the pairs that determine the rig; an error if half of them or more contradict each other."""
-    problem = rig_problem(left, right, views)
+    problem = stereo_problem(left, right, views.both)
     consensus = find_consensus(problem)
     reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))
     found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
@@ -142,7 +142,7 @@ def _with_shifted(left: Calibration, right: Calibration, found: SoundPairs) -> S
         moved = tuple(pair for pair in _neighbours(found.problem.pairs, word) if pair[0] in odd)
         if len(moved) < _LEAST_AGREED:
             continue
-        problem = rig_problem(left, right, ViewPairs(moved))
+        problem = stereo_problem(left, right, moved)
         fits = _distance(problem, _poses(problem), found.rig.R[None], found.rig.t[None])[0] < 1
         if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
             names = [a for (a, _), one in zip(problem.pairs, fits, strict=True) if one]
@@ -157,7 +157,7 @@ def _all_shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str
         return ""
     for word in SHIFTED:
         moved = _neighbours(views.both, word)
-        faults = find_consensus(rig_problem(left, right, ViewPairs(moved))).reasons
+        faults = find_consensus(stereo_problem(left, right, moved)).reasons
         if faults.count("") / len(faults) > _AGREED:
             return (
                 f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
@@ -286,8 +286,8 @@ def _poses(problem: RigProblem) -> _Poses:
     left, right = problem.cameras
     scale = problem.scale[problem.paired][:, None]
     return _Poses(
-        (left.R[problem.paired], right.R[problem.paired_right]),
-        (left.t[problem.paired] * scale, right.t[problem.paired_right] * scale),
+        (left.R[problem.paired_left], right.R[problem.paired_right]),
+        (left.t[problem.paired_left] * scale, right.t[problem.paired_right] * scale),
     )
 
 
@@ -313,12 +313,12 @@ def _common_fault(
     problem: RigProblem, poses: _Poses, found: tuple[Array, Array, NDArray[np.bool_]]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """The rig and the pairs that agree with it, if most pairs have one fault."""
-    most = int(found[2].sum())
+    most, flat = int(found[2].sum()), problem.is_flat[problem.paired]
     for _, of_target, of_image in _FAULTS:
         mended = _mended(problem, poses, of_target, of_image)
         R, t = mended.rigs()
         sound = _distance(problem, poses, R, t) < 1
-        faulty = (_distance(problem, mended, R, t) < 1) & problem.flat
+        faulty = (_distance(problem, mended, R, t) < 1) & flat
         counts = (sound | faulty).sum(axis=1)
         if counts.max() > most:
             best, most = int(np.argmax(counts)), int(counts.max())
@@ -333,6 +333,7 @@ def _reasons(
     plain = _distance(problem, poses, R[None], t[None])[0]
     exchanged = _Poses((poses.R[1], poses.R[0]), (poses.m[1], poses.m[0]))
     distance = _distance(problem, exchanged, R[None], t[None])[0]
+    flat = problem.is_flat[problem.paired]
     reasons = np.where(
         (distance < _EXCHANGED) & (distance < _NEARER * plain),
         "the left and the right image are exchanged",
@@ -340,14 +341,15 @@ def _reasons(
     )
     for reason, of_target, of_image in _FAULTS:
         mended = _mended(problem, poses, of_target, of_image)
-        fits = problem.flat & (_distance(problem, mended, R[None], t[None])[0] < 1)
+        fits = flat & (_distance(problem, mended, R[None], t[None])[0] < 1)
         reasons = np.where(fits, reason, reasons)
     return tuple(np.where(sound, "", reasons).tolist())
 
 
 def _mended(problem: RigProblem, poses: _Poses, of_target: Array, of_image: Array) -> _Poses:
     """The poses if the axes of the targets and of the image of the right camera were exchanged."""
-    turn = problem.axes @ of_target @ np.swapaxes(problem.axes, 1, 2)
+    axes = problem.basis[problem.paired]
+    turn = axes @ of_target @ np.swapaxes(axes, 1, 2)
     return _Poses((poses.R[0], of_image @ poses.R[1] @ turn), (poses.m[0], poses.m[1] @ of_image.T))
 
 

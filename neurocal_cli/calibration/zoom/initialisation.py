@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.adjustment.normal_equations import SharedAndOwn, schur_covariance
+from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.zoom.mlfn import Schedule
@@ -308,7 +308,7 @@ def common_tables(
 
     L, start = local.shape[1], _linearised(data, local, constants)
     shared = np.arange(L, L + (0 if fixed else data.n_shared))
-    problem = SharedAndOwn(start, lambda tables: tables.normal.blocks, moved, shared, np.arange(L))
+    problem = SharedAndOwn(start, lambda at: Arrowhead.of(at.normal.blocks, shared, np.arange(L)), moved)
     settled = minimise(problem, _OPTIONS).settled[0]
     return replace(problem.state, converged=bool(settled))
 
@@ -320,5 +320,5 @@ def _linearised(data: PixelData, local: Array, constants: Constants) -> Tables:
 
 def local_covariance(normal: Normal, L: int, variance: float) -> Array:
     """Covariance of each setting's local parameters (S, L, L)."""
-    found = schur_covariance(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
-    return variance * found.own
+    found = Arrowhead.of(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
+    return variance * found.covariance().own

@@ -11,7 +11,7 @@ from support.slow_cases import slow_but
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
 from neurocal_cli import Correspondences, calibrate, fit_rig
-from neurocal_cli.calibration.rig.adjust import RigProblem, adjust_rig, rig_problem
+from neurocal_cli.calibration.rig.adjust import RigProblem, adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.contradiction import Contradiction, contradiction, odd_pairs
 from neurocal_cli.calibration.rig.covariance import not_smaller
 from neurocal_cli.calibration.rig.pairing import pair_views
@@ -25,7 +25,7 @@ Points = tuple[Correspondences, Correspondences]
 
 def made(points: Points, distortion: str = "none", skew: bool = False) -> tuple[RigProblem, RelativePoses]:
     cameras = [calibrate(side, distortion=distortion, skew=skew) for side in points]
-    problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
+    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names).both)
     poses = relative_poses(problem, find_consensus(problem).rig)
     assert poses is not None
     return problem, poses
@@ -57,7 +57,7 @@ def test_names_count_numbers_as_numbers() -> None:
 def test_the_sum_of_squares_is_that_of_the_common_adjustment(degrees: float) -> None:
     problem, poses = made(in_parts(scene(), turned(scene(), degrees), 6))
     told = contradiction(poses)
-    start = problem.start(find_consensus(problem).rig)
+    start = problem.start([find_consensus(problem).rig])
     free = np.concatenate([[True, False, True, True, True] * 2, [True] * 6])
     adjusted = adjust_rig(problem, start, free.astype(bool))
     alone = sum(float(normal[:, -1, -1].sum()) for normal in problem.own_normal)

@@ -15,7 +15,7 @@ from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import Rig, calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.camera.geometry import Array
@@ -217,8 +217,8 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     scene = flat("wide", 4, 7)
     points = sides(scene, 1e-5)
     cameras = [calibrate(p, skew=False) for p in points]
-    problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
-    state = problem.start(scene.rig)
+    problem = stereo_problem(*cameras, pair_views(points[0].view_names, points[1].view_names).both)
+    state = problem.start([scene.rig])
     columns = state.columns
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, 6]] = False
@@ -237,7 +237,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     # Whitened residuals of variance 1 are 1e-5 px, up to what the sample says of it.
     weight = np.sqrt(np.mean([s.weight / s.pixel_scale**2 for s in problem.observations]))
     covariance = np.linalg.inv(J @ J.T) * weight**2
-    place = np.flatnonzero(np.flatnonzero(free) == columns.rig[3])[0]
+    place = np.flatnonzero(np.flatnonzero(free) == columns.rigs[1][3])[0]
     t_x = np.sqrt(covariance[place, place]) * problem.unit
     assert bound(scene)[11] == pytest.approx(t_x, rel=0.1)
 
