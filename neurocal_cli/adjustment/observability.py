@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,19 +50,31 @@ def check_points(problem: Problem) -> None:
 
 
 def _check_each_view(views: Views) -> None:
-    few = views.distinct < 4
-    line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
-    for bad, reason in (
-        (views.counts == 1, "there is only one point; give at least 4 (6 for a solid target of type 1)"),
-        (views.distinct < 2, "all points are the same world point; check the columns X,Y,Z"),
-        (line, "all points lie on one line; give points that spread over a plane or in space"),
-        (_on_one_line(views), "all pixels u,v lie on one line; check the columns"),
-        (few, "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)"),
-    ):
+    for reason, bad in _faults_of_views(views):
         if bad.any():
             which = int(np.argmax(bad))
             many = f" (and {int(bad.sum()) - 1} more views)" if bad.sum() > 1 else ""
             raise DegenerateGeometryError(f"view {views.names[which]!r}{many}: {reason}")
+
+
+def views_without_pose(views: Views) -> dict[str, str]:
+    """The views whose points determine no pose, each with the reason."""
+    found: dict[str, str] = {}
+    for reason, bad in _faults_of_views(views):
+        for which in np.flatnonzero(bad).tolist():
+            found.setdefault(views.names[which], reason)
+    return found
+
+
+def _faults_of_views(views: Views) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Why views (V,) determine no pose."""
+    few = views.distinct < 4
+    line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
+    yield "there is only one point; give at least 4 (6 for a solid target of type 1)", views.counts == 1
+    yield "all points are the same world point; check the columns X,Y,Z", views.distinct < 2
+    yield "all points lie on one line; give points that spread over a plane or in space", line
+    yield "all pixels u,v lie on one line; check the columns", _on_one_line(views)
+    yield "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)", few
 
 
 def _on_one_line(views: Views) -> NDArray[np.bool_]:

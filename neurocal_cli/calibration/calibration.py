@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from enum import Enum
 from functools import cached_property
 
@@ -167,6 +167,20 @@ class Calibration:
     def verdict(self) -> Verdict | None:
         """Verdict on this calibration, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    @property
+    def lean(self) -> Calibration:
+        """The camera with its uncertainty and verdict, without the data behind it."""
+        return replace(
+            self,
+            points=Correspondences.none(self.image_size, self.unit),
+            views={},
+            second_poses={},
+            network=None,
+            rejected=Rejected(),
+            target=None,
+            judgement=self.verdict,
+        )
 
     @property
     def n_rejected(self) -> int:

@@ -4,22 +4,25 @@ All views. Wrong stated sigmas and the rivals of the contest (`verdict.rivals`) 
 of another shape explains in part. The more probable one is the cause.
 
 One view of a flat target. Each hypothesis about why it contradicts the camera of the other views changes its
-pixels, its world points or its camera. Its pose is then estimated as in a problem of type 3 and adjusted. The
-first hypothesis whose rms error matches that of the other views is the explanation. If none does, the view
-keeps the reason for which it was left out.
+pixels, its world points or its camera. Its pose is then estimated as in a problem of type 3 and adjusted. A
+mistake in its rows, another zoom or another image centre is named if its error then matches that of the other
+views and its odds beat those of a bent target by the `LEVEL` of all causes: seen from afar, a turned image or
+one of another size looks nearly like the same target in another pose. If nothing matches, the view keeps the
+reason for which it was left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.board.find import Found, evidence_as_given, views_for_target
+from neurocal_cli.adjustment.normal_equations import ROUNDING, eliminate
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
-from neurocal_cli.adjustment.reprojection import predicted_pixels
+from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, displaced_blocks, predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
@@ -32,6 +35,7 @@ from neurocal_cli.calibration.verdict.findings import pixel_spread
 from neurocal_cli.calibration.verdict.noise import stated_noise
 from neurocal_cli.calibration.verdict.rival import LEVEL
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.errors import NeurocalError
@@ -51,6 +55,9 @@ _ALIKE = 0.01  # largest relative difference between the scale changes along u a
 _BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
 _BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
+# Prior standard deviations of one view's change of zoom, of its centre over the pixels' spread, and of its
+# target's bends over its size.
+_ZOOMS, _CROPS, _BENDS = 0.2, 0.3, 0.03
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
@@ -114,32 +121,104 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     """
     if not arrange(points).nearly_flat.all() or len(points) < 6:
         return otherwise
-    limit = _HOLDS * rmse_px
-    for reason, changed in _other_points(points):
-        if _fit(changed, _pose(changed, camera))[0] < limit:
+    limit, start = _HOLDS * rmse_px, _pose(points, camera)
+    plain = _fit(points, start)
+    if start is None or plain.rms == np.inf:
+        return next((why for why, other, _ in _mistakes(points, camera) if other < limit), otherwise)
+    zoomed, moved = (_fit(points, start, some) for some in (_FOCAL, _CENTRE))
+    free = _fit(points, start, (*_FOCAL, *_CENTRE)).rms
+    odds = _Odds.of(points, plain, rmse_px)
+    bent = max(odds.bent(), odds.of_error(plain.rms))
+    least = max(bent + LEVEL, odds.zoomed(zoomed.rms), odds.moved(moved.rms))
+    for reason, other, scale in _mistakes(points, camera):
+        if other < limit and odds.of_error(other / scale) > least:
             return reason
-    start = _pose(points, camera)
-    plain, _ = _fit(points, start)
-    if plain == np.inf:
-        return otherwise
-    zoomed, entries = _fit(points, start, _FOCAL)
-    if zoomed < limit:
-        scale = entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
+    if zoomed.rms < limit and odds.zoomed(zoomed.rms) > bent + LEVEL:
+        scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
-            how = f"it fits another zoom or focus: a focal length of {entries[0]:.5g} px"
+            how = f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
             return how + _or_bent(abs(scale[0] - 1))
-    moved, entries = _fit(points, start, _CENTRE)
-    if moved < limit:
+    if moved.rms < limit and odds.moved(moved.rms) > bent + LEVEL:
+        entries = moved.entries
         how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
         shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
         return how + _or_bent(shift / camera.entries[0])
-    free, _ = _fit(points, start, (*_FOCAL, *_CENTRE))
     if free > _BLURRED * pixel_spread(points):
         return otherwise
-    if plain < _HOLDS * free:
-        times = f"{plain / rmse_px:.2g} times that of the others"
-        return f"its rms error is {plain:.2g} px, {times}: blurred, or bent"
+    if plain.rms < _HOLDS * free:
+        times = f"{plain.rms / rmse_px:.2g} times that of the others"
+        return f"its rms error is {plain.rms:.2g} px, {times}: blurred, or bent"
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
+
+
+@frozen_dataclass(eq=False)
+class _Odds:
+    """Log odds of what is wrong with one view, its pose integrated out.
+
+    An unknown costs what the points tell of it beyond its prior, so that a turned image, which needs none, is
+    more probable than a crop that looks the same by chance. Errors below the other views' do not count.
+    """
+
+    N: Array  # (D, D) normal matrix at the view's pose, with three bends of the target before the residual
+    state: CameraState
+    n: int  # points
+    least: float  # rms error of the other views, normalised
+    scale: float  # px
+
+    @classmethod
+    def of(cls, points: Correspondences, plain: _Fitted, rmse_px: float) -> _Odds:
+        assert plain.state is not None
+        views = arrange(points)
+        batches, axes = views.batches, views.basis[0]
+
+        def displaced(chunk: slice) -> Array:
+            x, y = (np.einsum("tin,i->tn", batches.local[chunk], axes[:, k]) for k in (0, 1))
+            heights = np.stack([x * x, x * y, y * y], axis=1)
+            return np.asarray(heights[:, :, None] * axes[:, 2][:, None])
+
+        N = displaced_blocks(batches, plain.state, 3, displaced)[0]
+        scale = views.pixel_scale
+        return cls(N, plain.state, len(points), rmse_px / scale, scale)
+
+    def of_error(self, rms: float, columns: tuple[int, ...] = (), size: float = 1.0) -> float:
+        """Log odds of an rms error [px] with some unknowns, of a prior standard deviation."""
+        error = max(rms / self.scale, self.least)
+        odds = -max(2 * self.n - 6, 1) * float(np.log(error))
+        if not columns:
+            return odds
+        left, _ = eliminate(self.N, np.array(columns), POSE_COLUMNS, ROUNDING)
+        told = np.eye(len(columns)) + 2 * (size / error) ** 2 * left
+        return odds - 0.5 * float(np.linalg.slogdet(told)[1])
+
+    def zoomed(self, rms: float) -> float:
+        """Log odds of another focal length."""
+        return self.of_error(rms, _FOCAL, _ZOOMS * float(self.state.entries[0, 0]))
+
+    def moved(self, rms: float) -> float:
+        """Log odds of another image centre."""
+        return self.of_error(rms, _CENTRE, _CROPS)
+
+    def bent(self) -> float:
+        """Log odds of a target that is bent as a paraboloid, to first order."""
+        end = len(self.N) - 1
+        columns = np.append(POSE_COLUMNS, end - 3 + np.arange(3))
+        left, _ = eliminate(self.N, np.array([end]), columns, ROUNDING)
+        rms = float(np.sqrt(max(left[0, 0], 0.0) / self.n)) * self.scale
+        return self.of_error(rms, (end - 3, end - 2, end - 1), _BENDS)
+
+
+def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, float, float]]:
+    """Mistakes in a view's rows, the rms error without each, and the size of a given pixel in its pixels."""
+    for reason, changed in _other_points(points):
+        scale = float(np.sqrt(np.prod(np.ptp(changed.pixels, axis=0) / np.ptp(points.pixels, axis=0))))
+        scale = 1.0 if reason.startswith("its u and v") else scale
+        yield reason, _fit(changed, _pose(changed, camera)).rms, scale
+
+
+def error_of_view(points: Correspondences, camera: Camera) -> float:
+    """Rms error [px] of one view's points with their pose fitted; infinite if that fails."""
+    plain = replace(points, covariance=None, across=None)
+    return _fit(plain, _pose(plain, camera)).rms
 
 
 def may_be_bent(reason: str) -> bool:
@@ -184,22 +263,25 @@ def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
     return in_pixels(*problem.as_seen(state))
 
 
-def _fit(
-    points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()
-) -> tuple[float, Array]:
-    """Rms error and A's entries (5,) [px] after adjustment of a view's pose and the free entries.
+@frozen_dataclass(eq=False)
+class _Fitted:
+    """A view's pose and some of the entries, adjusted."""
 
-    The error is infinite without a start or if that fails.
-    """
-    failed = np.inf, np.full(5, np.nan)
+    rms: float = np.inf  # [px]; infinite if that fails
+    entries: Array = field(default_factory=lambda: np.full(5, np.nan))  # of A [px]
+    state: CameraState | None = None  # normalised
+
+
+def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()) -> _Fitted:
+    """Adjust a view's pose and the free entries."""
     if start is None:
-        return failed
+        return _Fitted()
     views = arrange(points)
     moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
     try:
         adjusted = adjust(views.batches, normalised(start, views), moving, True, _STEPS)
     except (np.linalg.LinAlgError, FloatingPointError):
-        return failed
+        return _Fitted()
     rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale
     entries = views.pixel_scale * adjusted.state.entries[0] + np.array([0, 0, 0, *views.pixel_centre])
-    return (rmse, entries) if np.isfinite(rmse) else failed
+    return _Fitted(rmse, entries, adjusted.state) if np.isfinite(rmse) else _Fitted()

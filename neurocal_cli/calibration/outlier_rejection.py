@@ -35,7 +35,7 @@ from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
-from neurocal_cli.calibration.other_causes import contradicts_sigma, why_odd
+from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, why_odd
 from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -59,6 +59,7 @@ _EXACT = 1e-9  # of the pixels' spread: rms errors below this are rounding
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
+_FITS = 4.0  # standard deviations of a view's squared error: one that fits so well is not wrong
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
@@ -120,7 +121,8 @@ def _searched(
     """The three steps; `first` is the fit of all points, or `failure` the reason why there is none."""
     kept, solution = _agreeing(problem, options, first, failure)
     kept, solution = _without_outlier_views(problem, options, kept, solution)
-    return _all_judged(problem.points, options, kept, solution)
+    kept, solution = _all_judged(problem.points, options, kept, solution)
+    return _with_fitting_views(problem, options, kept, solution)
 
 
 def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
@@ -341,6 +343,29 @@ def _all_judged(
             break
         known.add(kept.mask.tobytes())
     return kept, solution
+
+
+def _with_fitting_views(
+    problem: Problem, options: Options, kept: _Kept, solution: Solution
+) -> tuple[_Kept, Solution]:
+    """Take back the views that fit the final camera: their networks, or an earlier camera, knew less."""
+    points, usual, fitting = problem.points, rms(solution) ** 2, []
+    for name in kept.wrong_views:
+        one = points.select(_is_of(points, name))
+        chance = 1 + _FITS * np.sqrt(2.0 / max(2 * len(one) - 6, 1))
+        if error_of_view(one, solution.camera) ** 2 <= chance * usual:
+            fitting.append(name)
+    if not fitting:
+        return kept, solution
+    mask = kept.mask | np.isin(points.view_index, [points.view_names.index(name) for name in fitting])
+    wrong = {name: why for name, why in kept.wrong_views.items() if name not in fitting}
+    try:
+        more = _fitted(problem, mask, options)
+        found = _all_judged(points, options, _Kept(mask, wrong), more)
+    except DegenerateGeometryError:
+        return kept, solution
+    better = not found[1].refusal and rms(found[1]) <= NO_WORSE * rms(solution)
+    return found if better else (kept, solution)
 
 
 def _judged(points: Correspondences, kept: _Kept, solution: Solution) -> _Kept:

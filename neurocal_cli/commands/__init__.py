@@ -34,6 +34,7 @@ _SUMMARIES = {
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
+    "rig": "Calibrate a rig of any number of cameras, and their poses relative to the first.",
     "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board with its estimated shape.",

@@ -207,6 +207,59 @@ def stereo(
         show(stereo_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
 
 
+@evaluate.command(cls=options.Command)
+@options.argument("file", "RIG.yaml", "A rig that neurocal wrote; - is standard input.")
+@options.argument(
+    "points",
+    "[[NAME=]POINTS.csv]",
+    "Points of its cameras to evaluate it on, as for neurocal rig; without them, those it was calibrated "
+    "from.",
+    nargs=-1,
+    required=False,
+)
+@options.json
+def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
+    """Measure the errors of a rig of any number of cameras.
+
+    Every point that two cameras or more saw is triangulated from all of them and compared with its place on
+    the target, in the pose of its frame. The errors are in the frame of the first camera and in the unit of
+    the target. For each camera the command also tells how far its pixels are from those that the other
+    cameras predict.
+
+    Without POINTS.csv the points of the rig itself are used, and the errors are too optimistic. With
+    POINTS.csv the poses of the frames are fitted first, with the cameras fixed.
+
+    \b
+    Examples:
+      neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
+          sample_data/rig_cam2.csv -o rig.yaml
+      neurocal evaluate rig rig.yaml
+      neurocal evaluate rig rig.yaml sample_data/rig_cam0.csv \\
+          sample_data/rig_cam1.csv --json
+    """  # noqa: D301 - as in the group
+    from neurocal_cli.commands.rig import named_file
+
+    named = [named_file(word) for word in points]
+    preparation.check_one_stdin(file, *(name for _, name in named))
+    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_camera_rig
+    from neurocal_cli.commands.show.camera_rig_report import rig_evaluation_json, rig_evaluation_tables
+    from neurocal_cli.commands.show.terminal import show
+    from neurocal_cli.commands.show.text import verdict_lines
+    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
+    from neurocal_cli.files.rig_points import read_rig_points
+
+    found, notes = read_camera_rig(file), list[str]()
+    given = read_rig_points(named, notes) if named else None
+    note(*notes)
+    evaluation = evaluate_camera_rig(found, given)
+    if evaluation.n_behind:
+        warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
+    if as_json:
+        print_summary(rig_evaluation_json(evaluation))
+    else:
+        show(rig_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
+
+
 def _evaluate_stereo(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
 ) -> tuple[StereoEvaluation, Rig | None]:

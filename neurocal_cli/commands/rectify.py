@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rectification import RectifiedPair, RowError
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.camera.remapping import Remapping
+    from neurocal_cli.files.exchange.camera_set import CameraSet
     from neurocal_cli.observations.points import Correspondences
 
 _Paths = tuple[tuple[str, ...], tuple[str, ...]]  # of the left and of the right camera
@@ -42,6 +43,9 @@ _MISFIT, _NO_MISFIT = 3.0, 0.1
     "patterns or one folder each. Or CSV files of points.",
     nargs=-1,
 )
+@options.path(
+    "--cameras", "LEFT RIGHT", "Names of two cameras of a rig that has more.", without="left and right"
+)
 @options.alpha("not scaled")
 @options.interpolation
 @options.flag(
@@ -53,6 +57,7 @@ _MISFIT, _NO_MISFIT = 3.0, 0.1
 def rectify(
     rig: str,
     files: tuple[str, ...],
+    cameras: tuple[str, str] | None,
     alpha: float | None,
     interpolation: str,
     side_by_side: bool,
@@ -87,6 +92,9 @@ def rectify(
       neurocal rectify camchain.yaml "sample_data/board0[123].png" \\
           "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
           --side-by-side --json -o pairs
+      neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
+          sample_data/rig_cam2.csv -o three.yaml
+      neurocal rectify three.yaml --cameras rig_cam0 rig_cam2 --maps -o maps
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(rig, *files)
     options.check_alpha(alpha)
@@ -103,13 +111,9 @@ def rectify(
         if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
             raise UsageError(f"{folder} is the folder of the inputs; give another output")
     from neurocal_cli.calibration.rig.rectification import rectified_pair
-    from neurocal_cli.files.exchange.neurocal import as_rig
     from neurocal_cli.files.exchange.reading import read_cameras
 
-    cameras = read_cameras([rig])
-    if (count := len(cameras.cameras)) != 2:
-        raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig of two", rig)
-    found = as_rig(cameras)
+    found = _pair(read_cameras([rig]), rig, cameras)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
@@ -137,6 +141,21 @@ def _sides(files: Sequence[str]) -> _Paths:
     for paths in (left, right):
         view_names(paths)  # no name twice
     return left, right
+
+
+def _pair(cameras: CameraSet, file: str, names: tuple[str, str] | None) -> Rig:
+    """Two cameras of a file as a stereo rig."""
+    from neurocal_cli.files.exchange.neurocal import as_camera_rig, as_rig
+
+    count = len(cameras.cameras)
+    if names is not None and count > 1:
+        return as_camera_rig(cameras).pair(*names)
+    if count > 2:
+        told = ", ".join(camera.name for camera in cameras.cameras)
+        raise UsageError(f"{file} holds {count} cameras ({told}); choose two by --cameras LEFT RIGHT")
+    if count < 2:
+        raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig", file)
+    return as_rig(cameras)
 
 
 @dataclass

@@ -30,7 +30,8 @@ _MANY_OFF = 0.5  # share of the points that chance does not explain
     "inputs",
     "RIG.yaml MATCHES.csv",
     "A rig, or LEFT.yaml RIGHT.yaml, two calibrations with a view in common; then a CSV file of "
-    "pixels with the columns uL,vL,uR,vR and optionally point. - is standard input.",
+    "pixels with the columns uL,vL,uR,vR and optionally point, or, of a rig of any number of cameras, "
+    "point,camera,u,v. - is standard input.",
     nargs=-1,
     required=True,
 )
@@ -44,7 +45,8 @@ _MANY_OFF = 0.5  # share of the points that chance does not explain
 @options.number(
     "--epipolar-limit",
     "PX",
-    "Flag points whose pixels must be moved by more than this for their rays to meet.",
+    "Flag points whose pixels must be moved by more than this for their rays to meet; of any number of "
+    "cameras, those with a larger error.",
     without="5 sigma",
     positive=True,
 )
@@ -53,7 +55,7 @@ _MANY_OFF = 0.5  # share of the points that chance does not explain
 def triangulate(
     inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, as_json: bool, output: str
 ) -> None:
-    """Compute points in space from their pixels in the left and the right image.
+    """Compute points in space from their pixels in two images or more.
 
     Give the pixels of the original images, neither undistorted nor rectified. The command computes the
     point with the smallest squared reprojection error. It writes a row with these columns for each point:
@@ -67,6 +69,15 @@ def triangulate(
       flag        ok, or off: the pixels are too far from their epipolar lines,
                   or behind: the point is behind a camera or at infinity
 
+    With a rig of any number of cameras, each row of the pixels is a point in one camera: point,camera,u,v.
+    The output has a row for each point, in the frame of the first camera, with these columns instead of
+    epipolar:
+
+    \b
+      error       rms distance of its pixels from its images, per degree of freedom
+      cameras     number of cameras that were used
+      without     the camera that contradicts the others and was left out, if any
+
     If the rays of a row do not determine a point, its X, Y and Z are nan. No row is dropped. The rows are
     processed in batches, so the file may have any length.
 
@@ -78,6 +89,9 @@ def triangulate(
       neurocal triangulate rig.yaml sample_data/matches.csv --sigma 0.3 \\
           --epipolar-limit 2 --json -o xyz.csv
       cat sample_data/matches.csv | neurocal triangulate rig.yaml - > xyz.csv
+      neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
+          sample_data/rig_cam2.csv -o three.yaml
+      neurocal triangulate three.yaml sample_data/sightings.csv -o xyz.csv
     """  # noqa: D301 - as in the group
     if len(inputs) not in (2, 3):
         given = plural(len(inputs), "file")
@@ -87,6 +101,9 @@ def triangulate(
     preparation.check_one_stdin(*inputs)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), inputs)
+    if len(inputs) == 2 and _of_many(inputs[0], inputs[1]):
+        _triangulate_many(inputs[0], inputs[1], sigma, epipolar_limit, as_json, output)
+        return
     rig = _rig(inputs[:-1])
     for side, camera in (("left", rig.left), ("right", rig.right)):
         if camera.points.undistorted:
@@ -110,6 +127,54 @@ def triangulate(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
     tally.tell(as_json)
+
+
+def _of_many(rig: str, matches: str) -> bool:
+    """Whether the rig has other than two cameras, or the matches are those of named cameras."""
+    from neurocal_cli.files.camera_rig_yaml import has_cameras
+    from neurocal_cli.files.triangulation_csv import has_sightings
+
+    return (matches != "-" and has_sightings(matches)) or (rig != "-" and has_cameras(rig))
+
+
+def _triangulate_many(
+    file: str, matches: str, sigma: float | None, limit: float | None, as_json: bool, output: str
+) -> None:
+    """Triangulate points from any number of cameras."""
+    from neurocal_cli.calibration.rig.many_views import triangulate_many
+    from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
+    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
+    from neurocal_cli.files.triangulation_csv import format_many_points, read_sightings
+
+    rig = read_camera_rig(file)
+    preparation.warn_of_poor(rig, "; points in space may be far off")
+    notes: list[str] = []
+    seen = read_sightings(matches, notes)
+    note(*notes)
+    if sigma is None and math.isnan(rig.sigma):
+        note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
+    sigma = sigma or (_USUAL_SIGMA if math.isnan(rig.sigma) else rig.sigma)
+    limit = usual_limit(sigma) if limit is None else limit
+    found = triangulate_many(rig, seen.point, seen.camera, seen.pixels, limit=limit)
+    names = list(rig.cameras)
+    text = format_many_points(found, seen.names, names, unit=rig.unit, sigma=sigma, limit=limit)
+    write_chunks(output, iter([text]))
+    off = int((~found.behind & ~(found.error <= limit)).sum())
+    behind, without = int(found.behind.sum()), int((found.contradicts >= 0).sum())
+    if as_json:
+        counts = {"n_points": len(found.points), "n_off": off, "n_behind": behind, "n_without": without}
+        print_summary({**counts, "error_limit_px": limit})
+        return
+    parts = [plural(len(found.points), "point")]
+    parts += [f"{off} with an error above {limit:.3g} px"] if off else []
+    parts += [f"{behind} behind a camera, at infinity or seen by one camera only"] if behind else []
+    if without:
+        worst = max(range(len(names)), key=lambda k: int((found.contradicts == k).sum()))
+        count = int((found.contradicts == worst).sum())
+        parts.append(
+            f"{without} without a camera that contradicts the others, mostly {names[worst]} ({count})"
+        )
+    say(", ".join(parts))
 
 
 def _rig(names: tuple[str, ...]) -> Rig:

@@ -134,6 +134,8 @@ def neurocal_block(root: Field) -> Field:
     if "neurocal" not in root:
         if "stereo" in root and "left" in root:
             root.refuse("is a stereo rig", "give the file of one camera")
+        if "rig" in root and "cameras" in root:
+            root.refuse("is a rig of several cameras", "give the file of one camera")
         if "camera_matrix" in root:
             root.refuse(
                 "has no neurocal block, so the poses and points are missing",

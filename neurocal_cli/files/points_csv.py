@@ -22,7 +22,12 @@ from neurocal_cli.observations.points import Correspondences, first_moved
 
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
-OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ"), "across": ("nu", "nv")}
+OPTIONAL = {
+    "covariance": ("suu", "suv", "svv"),
+    "world_std": ("sX", "sY", "sZ"),
+    "across": ("nu", "nv"),
+    "time": ("time",),
+}
 """Names of the optional columns, by their attribute of `Correspondences`."""
 _SETTINGS = ("zoom", "focus")
 POINTS = Schema(
@@ -118,7 +123,7 @@ def value_columns(points: Correspondences) -> tuple[list[str], list[Array]]:
         values = getattr(points, attribute)
         if values is not None:
             names += columns
-            blocks.append(values)
+            blocks.append(values.reshape(len(values), -1))
     return names, blocks
 
 
@@ -149,6 +154,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         covariance=_covariance(tables),
         world_std=_where_known(tables, OPTIONAL["world_std"]),
         across=_where_known(tables, OPTIONAL["across"]),
+        time=_times(tables, notes),
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
         distances=_agreed("distances", tables) or () if points is not None or not several else (),
@@ -158,6 +164,14 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         lines=_joined([table.lines for table in tables]),
         sources=owners,
     )
+
+
+def _times(tables: list[Table], notes: list[str]) -> Array | None:
+    """Times of all rows, if all files have them."""
+    without = [table.source for table in tables if "time" not in table.numbers]
+    if without and len(without) < len(tables):
+        notes.append(f"{without[0]}: has no column time, so the times of the other files are not used")
+    return None if without else _joined([table.numbers["time"] for table in tables])
 
 
 def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:

@@ -13,12 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurocal_cli.calibration.calibration import Calibration, Rejected
+from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.observations.points import Correspondences
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
 
 
@@ -30,7 +30,7 @@ def write_calibration(cal: Calibration, path: str | Path) -> None:
     write_result(cal, path)
 
 
-def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
+def write_rig(rig: Rig | CameraRig, path: str | Path, alpha: float | None = None) -> None:
     """Write a rig file, whole or not at all; ``-`` is stdout.
 
     The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `write_result`.
@@ -39,7 +39,7 @@ def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
 
 
 def write_result(
-    result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
+    result: Calibration | Rig | CameraRig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:
     """Write a calibration or a rig, whole or not at all.
 
@@ -48,7 +48,7 @@ def write_result(
     the file cannot represent exactly, such as skew in XML.
     """
     if lean:
-        result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
+        result = result.lean
     ending = os.path.splitext(str(path))[1].lower()
     # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
@@ -63,9 +63,7 @@ def write_result(
     if isinstance(result, Calibration):
         text = format_calibration(result, by_rows)
     else:
-        from neurocal_cli.files.rig_yaml import format_rig
-
-        text = format_rig(result, alpha, by_rows)
+        text = _rig_text(result, alpha, by_rows)
     if by_rows:
         from neurocal_cli.files.yaml_text import parse_yaml
 
@@ -74,30 +72,15 @@ def write_result(
     return ()
 
 
-def lean_calibration(calibration: Calibration) -> Calibration:
-    """The camera with its uncertainty and verdict, without the data behind it."""
-    return replace(
-        calibration,
-        points=Correspondences.none(calibration.image_size, calibration.unit),
-        views={},
-        second_poses={},
-        network=None,
-        rejected=Rejected(),
-        target=None,
-        judgement=calibration.verdict,
-    )
+def _rig_text(rig: Rig | CameraRig, alpha: float | None, by_rows: bool) -> str:
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.files.rig_yaml import format_rig
 
+    if isinstance(rig, Rig):
+        return format_rig(rig, alpha, by_rows)
+    from neurocal_cli.files.camera_rig_yaml import format_camera_rig
 
-def lean_rig(rig: Rig) -> Rig:
-    """Both cameras and their relative pose, without the data behind them."""
-    return replace(
-        rig,
-        left=lean_calibration(rig.left),
-        right=lean_calibration(rig.right),
-        pairs=(),
-        left_out={},
-        judgement=rig.verdict,
-    )
+    return format_camera_rig(rig, alpha, by_rows)
 
 
 def _lines(value: Any, depth: int, indent: str = "") -> str:

@@ -43,14 +43,18 @@ _SAME = 1e-6
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
     """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
+    return "\n".join([*HEADER, *rig_lines(rig, alpha, by_rows), ""])
+
+
+def rig_lines(rig: Rig, alpha: float | None, by_rows: bool) -> Iterator[str]:
+    """Lines of the blocks left, right and stereo."""
     rectified = rectify(rig, alpha)
     pairs: tuple[tuple[Array, Array] | None, ...] = (None, None)
     if rectified is not None:
         pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
     cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
     parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
-    lines = chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
-    return "\n".join([*HEADER, *lines, ""])
+    yield from chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
 
 
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:

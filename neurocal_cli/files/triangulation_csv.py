@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.calibration.rig.many_views import SpacePoints
 from neurocal_cli.calibration.rig.triangulation import Triangulated
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.table import stream_table
+from neurocal_cli.files.reading import read_blocks
+from neurocal_cli.files.table import read_table, stream_table
 from neurocal_cli.files.table_header import Schema, quoted_field
 
 MATCHES = Schema(
@@ -23,6 +26,20 @@ MATCHES = Schema(
     labels=frozenset({"point"}),
     headerless=True,
 )
+SIGHTINGS = Schema(
+    kind="sightings",
+    required=("point", "camera", "u", "v"),
+    labels=frozenset({"point", "camera"}),
+)
+MANY_COLUMNS = (
+    "point",
+    *("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ"),
+    "error",
+    "cameras",
+    "without",
+    "flag",
+)
+_HEADER = 4096  # bytes in which the header is
 _LARGEST = 1e100  # squares of pixels beyond this overflow
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
 _FLAGS = np.array(["ok", "off", "behind"])
@@ -85,3 +102,65 @@ def format_space_points(
         if labels is not None:
             columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
         yield "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
+
+
+@frozen_dataclass(eq=False)
+class Sightings:
+    """Pixels (M, 2) of points in cameras, the number of the point and the name of the camera of each row."""
+
+    pixels: Array
+    point: NDArray[np.intp]
+    camera: NDArray[Any]
+    names: tuple[str, ...]  # of the points, by number
+
+
+def has_sightings(path: str | Path) -> bool:
+    """Whether the header of a file names a camera and one pixel in each row; not for standard input."""
+    if str(path) == "-":
+        return False
+    for data in read_blocks(path, _HEADER):
+        words = re.split(
+            rb"[,;\s]+", b" ".join(line for line in data.splitlines()[:40] if not line.startswith(b"#"))
+        )
+        return {b"camera", b"u", b"v"} <= set(words)
+    return False
+
+
+def read_sightings(path: str | Path, notes: list[str] | None = None) -> Sightings:
+    """Read a long table of pixels; remarks on columns that are not used are appended to `notes`."""
+    table = read_table(path, SIGHTINGS)
+    if notes is not None:
+        table.note_unknown(notes)
+    pixels = table.stack(("u", "v"))
+    sensible = np.abs(pixels).max(axis=1) <= _LARGEST
+    if not sensible.all():
+        row = int(np.argmin(sensible))
+        raise InputError(
+            f"{table.source}:{table.lines[row]}: u,v must be numbers of a sensible size; correct the row"
+        )
+    number: dict[str, int] = {}
+    point = np.array(
+        [number.setdefault(str(name), len(number)) for name in table.labels["point"]], dtype=np.intp
+    )
+    return Sightings(pixels, point, table.labels["camera"], tuple(number))
+
+
+def format_many_points(
+    found: SpacePoints, names: Sequence[str], cameras: Sequence[str], *, unit: str, sigma: float, limit: float
+) -> str:
+    """Text of a file of points that any number of cameras saw; see `format_space_points`."""
+    lines = [
+        f"# frame: camera {cameras[0]}; X right, Y down, Z forward, the centre of its lens at 0",
+        f"# unit: {unit}",
+        f"# sigma: {sigma:.6g}",
+        f"# error_limit: {limit:.6g}",
+        ",".join(MANY_COLUMNS),
+    ]
+    numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.error])
+    numbers[~np.isfinite(numbers)] = np.nan
+    flags = _FLAGS[np.where(found.behind, 2, (~(found.error <= limit)).astype(int))].tolist()
+    without = [quoted_field(cameras[k]) if k >= 0 else "" for k in found.contradicts]
+    row = "%s," + ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%d", "%s", "%s"])
+    columns = [list(map(quoted_field, names)), *numbers.T.tolist(), found.n_cameras.tolist(), without, flags]
+    lines += map(row.__mod__, zip(*columns, strict=True))
+    return "\n".join([*lines, ""])

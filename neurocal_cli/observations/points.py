@@ -55,6 +55,9 @@ class Correspondences:
     world_std : (N, 3) array, optional [world unit]
         Standard deviation of each world point's X, Y and Z, as a survey states it; 0 means exact. It must be
         the same for a world point in all views. All zero is None.
+    time : (N,) array, optional [s]
+        When the image of each row was taken; for cameras of one rig that do not take theirs at the same
+        moment.
     distances : tuple of Distance
         Distances measured on the points' board; they determine its scale.
     undistorted : str
@@ -88,6 +91,7 @@ class Correspondences:
     lines: NDArray[np.int64] | None = None
     sources: Mapping[str, str] | None = None
     world_std: Array | None = None
+    time: Array | None = None
     distances: tuple[Distance, ...] = ()
     undistorted: str = ""
     view_names: tuple[str, ...] = field(init=False)
@@ -134,6 +138,12 @@ class Correspondences:
             good = np.asarray(np.abs(across).max(axis=1) <= _LARGEST)  # False for nan as well
             problem = "the direction nu,nv in which the point was measured must be two finite numbers"
             self._set_rows("across", across, good, problem)
+        if self.time is not None:
+            time = _matrix("time", np.reshape(self.time, (-1, 1)), 1)
+            self._check_length("time", time)
+            good = np.asarray(np.abs(time[:, 0]) <= _LARGEST)
+            self._refuse_row(good, "the time must be a finite number of seconds")
+            self._set(time=_frozen(time[:, 0]))
         if self.image_size is not None:
             self._set(image_size=checked_size(self.image_size))
         if self.image_center is not None:
@@ -177,6 +187,14 @@ class Correspondences:
             return f"{source}:{int(self.lines[row])}"
         return f"{self.source}, row {row + 1}"
 
+    @property
+    def view_times(self) -> Array | None:
+        """(V,) mean time of each view [s], if it is known."""
+        if self.time is None:
+            return None
+        counts = np.bincount(self.view_index, minlength=self.n_views)
+        return np.asarray(np.bincount(self.view_index, self.time, self.n_views) / counts)
+
     def of_few_views(self, most: int) -> Correspondences:
         """The points of at most `most` views, evenly spaced among all."""
         if self.n_views <= most:
@@ -189,7 +207,7 @@ class Correspondences:
         def pick(values: Any) -> Any:
             return None if values is None else np.asarray(values)[rows]
 
-        by_row = ("world", "pixels", "view", "point", "covariance", "world_std", "across", "lines")
+        by_row = ("world", "pixels", "view", "point", "covariance", "world_std", "across", "time", "lines")
         return replace(self, **{name: pick(getattr(self, name)) for name in by_row})
 
     def _set(self, **values: Any) -> None:

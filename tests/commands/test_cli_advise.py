@@ -27,7 +27,6 @@ from neurocal_cli.calibration.advice import (
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.commands.show.advice import advice_lines
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.result_files import lean_calibration
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")
 
@@ -150,7 +149,7 @@ def test_what_cannot_be_advised_is_refused() -> None:
     calibration = made_calibration(2)
     nothing = replace(calibration.points, image_size=None)
     for given, message in (
-        (lean_calibration(calibration), "holds no points"),
+        (calibration.lean, "holds no points"),
         (replace(calibration, points=nothing), "the size of the images is unknown"),
         (replace(calibration, fixed=frozenset(calibration.std)), "all parameters of the camera are given"),
     ):

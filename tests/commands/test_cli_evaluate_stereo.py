@@ -17,7 +17,7 @@ from neurocal_cli import Calibration, calibrate, read_calibration, write_calibra
 from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
 from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
 from neurocal_cli.calibration.rig.space_error import SpaceError
-from neurocal_cli.files.result_files import lean_calibration, lean_rig, write_rig
+from neurocal_cli.files.result_files import write_rig
 
 
 def evaluate(*words: object, stdin: bytes | None = None) -> Result:
@@ -211,7 +211,7 @@ def test_lean_files_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> No
     words, points = [], []
     for side, camera in enumerate(calibrated(made)):
         words.append(tmp_path / f"{side}.yaml")
-        write_calibration(lean_calibration(camera), words[-1])
+        write_calibration(camera.lean, words[-1])
         points.append(tmp_path / f"{side}.csv")
         write_points(made.points(side, 0.2, rng), points[-1])
     result = evaluate(*words, "--points", *points, "--json")
@@ -220,7 +220,7 @@ def test_lean_files_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> No
     assert json.loads(result.stdout)["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)
     one_line_error(evaluate(*words), "the left camera has no points of its own")
     rig = tmp_path / "rig.yaml"
-    write_rig(lean_rig(fit_rig(*calibrated(made))), rig)
+    write_rig(fit_rig(*calibrated(made)).lean, rig)
     one_line_error(evaluate(rig), "the rig has no points of its own; give the points to evaluate it on")
     assert evaluate(rig, "--points", *points).exit_code == 0
 

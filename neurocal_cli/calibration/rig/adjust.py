@@ -9,10 +9,10 @@ in that camera and does not determine the rig. The derivatives of each camera ar
     R_c -> exp(w) R_c,  t_c -> t_c + tau,  R_k -> exp(w_k) R_k,  t_k -> t_k + tau_k   give
     w' = w + R_c w_k,  tau' = w x (R_c t_k) + R_c tau_k + tau
 
-Where the images of a frame were taken at different times, the target moved in between. With the velocity
-(omega_k, v_k) of the target, known from the frames before and after, and the time d between the frame and the
-view, the pose exp(d omega_k) R_k, t_k + d v_k takes the place of R_k, t_k; d is the difference of the stated
-times plus a delay of each camera, which can be estimated.
+Where the images of a frame were taken at different times, the target moved in between. With its path (omega,
+v) as a polynomial in time, known from the frames before and after, and the time d between the frame and the
+view, exp(omega(d)) R_k, t_k + v(d) take the place of R_k, t_k; d is the difference of the stated times plus a
+delay of each camera, which can be estimated.
 
 `rig_problem` makes one normalised problem of the calibrations, with common frames.
 """
@@ -79,14 +79,24 @@ class Observations:
 
 @frozen_dataclass(eq=False)
 class Motion:
-    """The velocity of the target in each frame, and when the views were taken."""
+    """The path of the target around each frame, and when the views were taken."""
 
-    velocity: Array  # (V, 6) rotation and translation by unit of time, normalised; 0 where it is not known
+    # (V, k, 6) turn and shift of the target, normalised: the coefficients of the powers of time from 1 to k.
+    path: Array
     lag: tuple[Array, ...]  # of each camera, (V_c,) stated time of the view less that of its frame
+    stated: bool = False  # whether the times are stated
 
     def of(self, frames: NDArray[np.intp]) -> Motion:
-        """With the velocities of other frames, (V,) of the present ones."""
-        return replace(self, velocity=self.velocity[frames])
+        """With the paths of other frames, (V,) of the present ones."""
+        return replace(self, path=self.path[frames])
+
+    def at(self, elapsed: Array, frames: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Turn and shift (n, 6) after some time (n,), and their derivatives by the time."""
+        powers = np.arange(1, self.path.shape[1] + 1)
+        path = self.path[frames]
+        moved = elapsed[:, None] ** powers
+        speed = powers * elapsed[:, None] ** (powers - 1)
+        return np.einsum("np,npi->ni", moved, path), np.einsum("np,npi->ni", speed, path)
 
 
 @frozen_dataclass(eq=False)
@@ -145,6 +155,15 @@ class RigState:
             delay,
             self.timed,
         )
+
+
+@frozen_dataclass(eq=False)
+class ViewEquations:
+    """Normal equations of one camera's views, in the shared unknowns that it has and the frames' poses."""
+
+    place: NDArray[np.intp]  # (m,) columns of the shared unknowns and the residual, the last one
+    frame: NDArray[np.intp]  # (V_c,) of each view
+    M: Array  # (V_c, m + 6, m + 6)
 
 
 @frozen_dataclass(eq=False)
@@ -299,7 +318,7 @@ class RigProblem:
         R, t = state.view_R[view], state.view_t[view]
         if self.motion is None:
             return R, t
-        moved = self._elapsed(state, side)[:, None] * self.motion.velocity[view]
+        moved, _ = self.motion.at(self._elapsed(state, side), view)
         return rotation_step(moved[:, :3]) @ R, t + moved[:, 3:]
 
     def _elapsed(self, state: RigState, side: int) -> Array:
@@ -319,43 +338,45 @@ class RigProblem:
 
         Also returns whether all points are in front of their cameras, where the distortions are monotonic.
         """
-        blocks, fine = zip(
-            *(
-                normal_blocks(observed.batches, self.camera(state, side))
-                for side, observed in enumerate(self.observations)
-            ),
-            strict=True,
-        )
-        return self.gathered(state, blocks), all(bool(one.all()) for one in fine)
+        found = [
+            normal_blocks(observed.batches, self.camera(state, side))
+            for side, observed in enumerate(self.observations)
+        ]
+        views = self.view_equations(state, [blocks for blocks, _ in found])
+        return self.gathered(views), all(bool(fine.all()) for _, fine in found)
 
-    def gathered(self, state: RigState, blocks: Sequence[Array]) -> Arrowhead:
-        """Normal equations from those of each camera's views, (V_c, 12 + K + m, 12 + K + m).
+    def view_equations(self, state: RigState, blocks: Sequence[Array]) -> list[ViewEquations]:
+        """Whitened normal equations of each camera's views, from its blocks (V_c, 12 + K + m, 12 + K + m).
 
-        The m further columns before the residual's are those of m further shared unknowns, the last ones.
+        The m columns before the residual's are those of m further unknowns that all views share, the last
+        ones.
         """
-        columns, V = state.columns, len(self.scale)
-        m = blocks[0].shape[-1] - 12 - len(state.cameras[0].k)
-        s = columns.n_shared + m
-        shared, own, cross = np.zeros((s + 1, s + 1)), np.zeros((V, 6, 6)), np.zeros((V, 6, s + 1))
-        rows = np.arange(6)
+        columns, found = state.columns, []
         for side, (observed, N) in enumerate(zip(self.observations, blocks, strict=True)):
             K = len(state.cameras[side].k)
-            local = np.concatenate([camera_columns(K), np.arange(11 + K, N.shape[-1])])
-            place = np.concatenate([columns.cameras[side], np.arange(columns.n_shared, s + 1)])
-            pp, pc = N[:, POSE, POSE], N[:, POSE][:, :, local]
-            whole, view = observed.weight * N[:, local[:, None], local].sum(axis=0), observed.view
-            shared[np.ix_(place, place)] += whole
+            more = np.arange(11 + K, N.shape[-1])  # and the residual
             of_rig, by_rig, by_pose = self.pose_steps(state, side)
-            back = observed.weight * np.swapaxes(by_pose, -1, -2)
-            own[view] += back @ pp @ by_pose
-            cross[np.ix_(view, rows, place)] += back @ pc
-            if of_rig.size:
-                along, forth = pp @ by_rig, observed.weight * np.swapaxes(by_rig, 1, 2)
-                mixed = (forth @ pc).sum(axis=0)
-                shared[np.ix_(of_rig, place)] += mixed
-                shared[np.ix_(place, of_rig)] += mixed.T
-                shared[np.ix_(of_rig, of_rig)] += (forth @ along).sum(axis=0)
-                cross[np.ix_(view, rows, of_rig)] += back @ along
+            further = columns.n_shared + np.arange(len(more))
+            place = np.concatenate([columns.cameras[side], of_rig, further])
+            at = 5 + K + len(of_rig)
+            T = np.zeros((len(N), N.shape[-1], len(place) + 6))
+            T[:, camera_columns(K), np.arange(5 + K)] = 1.0
+            T[:, POSE, 5 + K : at] = by_rig
+            T[:, more, at + np.arange(len(more))] = 1.0
+            T[:, POSE, -6:] = by_pose
+            M = observed.weight * (np.swapaxes(T, 1, 2) @ N @ T)
+            found.append(ViewEquations(place, observed.view, M))
+        return found
+
+    def gathered(self, views: Sequence[ViewEquations]) -> Arrowhead:
+        """The sum over all views."""
+        s, V = int(views[0].place[-1]), len(self.scale)
+        shared, own, cross = np.zeros((s + 1, s + 1)), np.zeros((V, 6, 6)), np.zeros((V, 6, s + 1))
+        for one in views:
+            place, m = one.place, len(one.place)
+            shared[np.ix_(place, place)] += one.M[:, :m, :m].sum(axis=0)
+            own[one.frame] += one.M[:, m:, m:]
+            cross[np.ix_(one.frame, np.arange(6), place)] += one.M[:, m:, :m]
         return Arrowhead(shared, own, cross)
 
     def pose_steps(self, state: RigState, side: int) -> tuple[NDArray[np.intp], Array, Array]:
@@ -383,7 +404,8 @@ class RigProblem:
             by_rig[through, :, :6] = step
         if of_rig.size > 6:
             assert self.motion is not None
-            by_rig[through, :, 6] = (of_frame @ self.motion.velocity[view[through]][..., None])[..., 0]
+            _, speed = self.motion.at(self._elapsed(state, side)[through], view[through])
+            by_rig[through, :, 6] = speed @ of_frame.T
         return of_rig, by_rig, by_pose
 
 

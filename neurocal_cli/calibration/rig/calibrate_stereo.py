@@ -6,22 +6,17 @@ most others, adjusts the rig together with the poses and, if wanted, the cameras
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from inspect import signature
 from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.common_target import can_tell, common_target, on_one_target
+from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.rig.adjust import (
     RigFit,
-    RigProblem,
     adjust_rig,
-    free_parameters,
     stereo_problem,
 )
 from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
@@ -34,24 +29,20 @@ from neurocal_cli.calibration.rig.covariance import (
     with_target_uncertainty,
 )
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
+from neurocal_cli.calibration.rig.refinement import adjusted
 from neurocal_cli.calibration.rig.relative_poses import relative_poses
-from neurocal_cli.calibration.rig.result import assemble_stereo, non_monotonic_sides
+from neurocal_cli.calibration.rig.result import assemble_stereo
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.several_cameras import cameras_on_one_target, check_options
 from neurocal_cli.calibration.rig.sound_pairs import sound_pairs
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import Target
 
-# Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
-# refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
-_SPOILS = 1.6
 _BASELINE_SIGMAS = 3.0  # a baseline below this number of standard deviations counts as 0
 _SIDES = ("left", "right")
-_ROUNDS = 2  # rounds of selecting lenses and target alternately
-_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
 def calibrate_stereo(
@@ -95,92 +86,26 @@ def calibrate_stereo(
         The points do not determine the rig; the message says why.
     """
     sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
-    unknown = set().union(*sides) - set(signature(calibrate).parameters)
-    if unknown:
-        raise UsageError(f"calibrate has no option {min(unknown)!r}; correct its name or leave it out")
-    if any(side.get("type", 1) == 4 for side in sides):
-        raise UsageError(
-            "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
-            "camera"
-        )
+    check_options(dict(zip(_SIDES, sides, strict=True)))
     # Errors of pairing are reported before the training.
     pair_points(left, right, pair_views(left.view_names, right.view_names))
-    cameras, kept = _cameras_on_one_target(left, right, sides, progress)
-    best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
+    points = dict(zip(_SIDES, (left, right), strict=True))
+    found = cameras_on_one_target(points, dict(zip(_SIDES, sides, strict=True)), progress)
+    cameras = tuple(found.cameras.values())
     outliers = options.get("outliers", "reject")
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=outliers, target_kept=kept)
+    rig = fit_rig(
+        cameras[0],
+        cameras[1],
+        refine_cameras=found.refinable,
+        outliers=outliers,
+        target_kept=found.target_kept,
+    )
     warnings = [
         f"{name}: {text}"
         for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
         for text in camera.warnings
     ]
     return replace(rig, warnings=(*rig.warnings, *warnings))
-
-
-def _cameras_on_one_target(
-    left: Correspondences,
-    right: Correspondences,
-    sides: Sequence[Mapping[str, Any]],
-    progress: Progress | None,
-) -> tuple[list[Calibration], bool]:
-    """Calibrate both cameras on one target, which is estimated from both if the points support that.
-
-    Also returns whether the given target was kept although it could have been estimated.
-    """
-    choice = sides[0].get("target", "auto")
-
-    def camera(side: int, target: str | Target, preferred: str = "") -> Calibration:
-        name, points = _SIDES[side], (left, right)[side]
-        options = {"camera_name": name, **sides[side], "target": target, "preferred": preferred}
-        return calibrate(points, **options, progress=_named(progress, name))
-
-    def calibrated(target: str | Target) -> list[Calibration]:
-        cameras = [camera(side, target) for side in (0, 1)]
-        for side in _others_model(cameras):
-            model = cameras[1 - side].distortion_model
-            alike = camera(side, target, model)
-            if alike.distortion_model == model:
-                cameras[side] = alike
-                break
-        return cameras
-
-    surveyed = left.world_std is not None or right.world_std is not None
-    cameras = calibrated(choice if surveyed else "given")
-    for _ in range(_ROUNDS):
-        target = common_target(cameras, choice)
-        if target is None:
-            break
-        before = [camera.distortion_model for camera in cameras]
-        cameras = calibrated(target)
-        if [camera.distortion_model for camera in cameras] == before:
-            break
-    kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
-    return cameras, kept
-
-
-def _others_model(cameras: Sequence[Calibration]) -> list[int]:
-    """Sides that could take the other camera's distortion model, first the one that loses less by it.
-
-    Both cameras of a rig are mostly of the same type, so their models differ only if the points require it.
-    """
-    models = [camera.distortion_model for camera in cameras]
-    choices = [camera.lens_choice for camera in cameras]
-    if models[0] == models[1] or not all(choices):
-        return []
-    cost = [
-        choices[side].get(models[1 - side], math.inf) / max(choices[side][models[side]], 1e-300)
-        for side in (0, 1)
-    ]
-    sides = [
-        side for side in (0, 1) if math.isfinite(cost[side]) and models[1 - side] in cameras[side].would_take
-    ]
-    return sorted(sides, key=lambda side: cost[side])
-
-
-def _named(progress: Progress | None, name: str) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda stage, share: progress(f"{name} camera: {stage}", share)
 
 
 def fit_rig(
@@ -232,7 +157,9 @@ def fit_rig(
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
         problem = stereo_problem(left, right, kept)
-    fit, warnings = _adjusted(problem, [sound.rig], refine_cameras)
+    fit, warnings = adjusted(
+        problem, problem.start([sound.rig]), refine_cameras, [f"{side} camera" for side in _SIDES]
+    )
     least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:
         uncertain = with_target_uncertainty(left.target, fit)
@@ -248,34 +175,6 @@ def fit_rig(
     if sound.left_out:
         warnings.insert(0, sound.contradiction())
     return replace(rig, warnings=(*warnings, *_swapped(rig)), judgement=assess_rig)
-
-
-def _adjusted(problem: RigProblem, starts: Sequence[Pose], refine_cameras: bool) -> tuple[RigFit, list[str]]:
-    """The common bundle adjustment, and its warnings."""
-    moving = [refine_cameras] * len(problem.cameras)
-    warnings = []
-    while True:
-        free = np.concatenate(
-            [free_parameters(c) & moves for c, moves in zip(problem.calibrations, moving, strict=True)]
-            + [np.ones(problem.n_rig, dtype=bool)]
-        )
-        fit = adjust_rig(problem, problem.start(starts), free)
-        if any(moving) and np.sqrt(fit.variance) > _SPOILS:
-            moving = [False] * len(moving)
-            warnings = [
-                "the pairs of views contradict each other, so both cameras keep the result of their own views"
-            ]
-            continue
-        if not (not_monotonic := non_monotonic_sides(fit)):
-            return fit, warnings
-        for side in not_monotonic:
-            moving[side] = False
-            warnings.append(
-                f"after the common bundle adjustment the distortion model of the {_SIDES[side]} camera "
-                "is not monotonic (maps two directions to one pixel) inside the image, where there "
-                "are no points; the result of its own views is kept; add views that show the board in the "
-                "image's corners"
-            )
 
 
 def _covariance(fit: RigFit, by_chance: bool) -> Array | None:

@@ -37,8 +37,8 @@ _LEAST_PAIRS = 2  # of each part; a single pair that differs is an odd one
 # median is 5.35. Real cameras deviate from their models, so the median distance of all pairs replaces it
 # where it is larger. The limit of 60 has the probability 5e-11;
 # test_a_pair_not_taken_at_the_same_moment_is_named has pairs on both sides.
-_MEDIAN = 5.35
-_SUSPECT = 60.0
+MEDIAN = 5.35
+SUSPECT = 60.0
 # The distance must also exceed this multiple of the pair's equations: the pair's rms error is twice as large
 # with the rig as without it.
 _OWN_SHARE = 3.0
@@ -275,7 +275,7 @@ def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_
             best, lowest = core, total
     for _ in range(_STEPS):
         distance = _predicted(poses, best)
-        limit = _SUSPECT * max(1.0, float(median(distance[places])) / _MEDIAN)
+        limit = SUSPECT * max(1.0, float(median(distance[places])) / MEDIAN)
         odd = used & (distance > limit) & (distance > _OWN_SHARE * poses.n_equations)
         if (best == (used & ~odd)).all():
             break

@@ -21,6 +21,7 @@ derivatives by the rig's unknowns follow from those of each camera by the chain 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,7 +41,7 @@ from neurocal_cli.adjustment.open_coefficients import (
     open_at_points,
     spread_of_open,
 )
-from neurocal_cli.adjustment.reprojection import camera_columns
+from neurocal_cli.adjustment.reprojection import camera_columns, normal_blocks
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
@@ -48,6 +49,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
+_ROUNDS = 20  # in which the moves without a frame converge, if it has less than 3/4 of the information
 _LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
 
 
@@ -69,6 +71,44 @@ def rig_covariance(poses: RelativePoses, used: NDArray[np.bool_], found: Contrad
     spread = moves - moves.mean(axis=0)
     by_pairs = (len(moves) - 1) / len(moves) * spread.T @ spread + 0.5 * found.shift.T @ found.shift
     return not_smaller(model, by_pairs)
+
+
+def covariance_over_frames(fit: RigFit) -> Array:
+    """(f, f) covariance of the free shared unknowns by the delete-one jackknife over the frames.
+
+    The move without frame k solves (S - S_k) x = -g_k with the frame's own part of the normal equations. The
+    matrices S_k are never formed: x = S^-1 (S_k x - g_k) is repeated.
+    """
+    problem, free = fit.problem, np.flatnonzero(fit.free)
+    blocks = [
+        normal_blocks(observed.batches, problem.camera(fit.state, side))[0]
+        for side, observed in enumerate(problem.observations)
+    ]
+    views = problem.view_equations(fit.state, blocks)
+    reduced, solved = fit.normal.reduced()
+    S = reduced[np.ix_(free, free)]
+    inverse = solve_scaled(S, np.eye(len(free)))
+    n, cross = len(fit.free), fit.normal.cross[:, :, :-1]
+
+    def of_frames(x: Array) -> Array:
+        """S_k x_k, or with the residual's column the right sides, of frames (V, n + 1)."""
+        out = -np.einsum("vps,vp->vs", cross, (solved @ x[..., None])[..., 0])
+        for one in views:
+            m = len(one.place)
+            part = one.M[:, :m, :m] @ x[one.frame[:, None], one.place][..., None]
+            out[one.frame[:, None], one.place[:-1]] += part[:, :-1, 0]
+        return out[:, free]
+
+    whole = np.zeros((len(cross), n + 1))
+    whole[:, -1] = 1.0
+    scores = of_frames(whole)
+    scores -= scores.mean(axis=0)  # at the minimum their sum is 0 up to rounding
+    moves = -scores @ inverse
+    for _ in range(_ROUNDS):
+        whole[:, free], whole[:, -1] = moves, 0.0
+        moves = (of_frames(whole) - scores) @ inverse
+    spread = moves - moves.mean(axis=0)
+    return np.asarray((len(moves) - 1) / len(moves) * spread.T @ spread)
 
 
 def not_smaller(least: Array, other: Array) -> Array:
@@ -148,11 +188,23 @@ def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDAr
 
 
 def covariance_of_choice(fit: RigFit) -> Array | None:
-    """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
+    """Covariance that the model selection adds to the free shared unknowns; None if it adds none.
+
+    The models of two cameras are weighed together, those of more cameras camera by camera.
+    """
+    sides = list(range(len(fit.problem.cameras)))
+    found = [_covariance_of(fit, some) for some in ([sides] if len(sides) == 2 else [[k] for k in sides])]
+    added = [one for one in found if one is not None]
+    return np.sum(added, axis=0) if added else None
+
+
+def _covariance_of(fit: RigFit, sides: Sequence[int]) -> Array | None:
+    """The same for the models of some of the cameras."""
     problem, before = fit.problem, fit.state
     own = [fit.free[place] for place in before.columns.cameras]
     opened: list[OpenCoefficients | None] = [None] * len(own)
-    for side, (calibration, free) in enumerate(zip(problem.calibrations, own, strict=True)):
+    for side in sides:
+        calibration, free = problem.calibrations[side], own[side]
         # A camera that the common bundle adjustment did not change has no open coefficients either.
         if free.any():
             points, choice = calibration.points, tuple(calibration.lens_choice)
@@ -206,7 +258,8 @@ def covariance_of_stretch(fit: RigFit) -> tuple[float, Array] | None:
         for side, observed in enumerate(fit.problem.observations)
     ]
     kept = np.append(np.flatnonzero(estimated), [n, n + 1])
-    whole = fit.problem.gathered(fit.state, blocks).only(kept).reduced()[0]
+    views = fit.problem.view_equations(fit.state, blocks)
+    whole = fit.problem.gathered(views).only(kept).reduced()[0]
     found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)
     if found is None:
         return None

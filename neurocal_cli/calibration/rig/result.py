@@ -221,9 +221,9 @@ class RigAssembly:
 
 def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
     """Replace the covariance of the shared unknowns, and propagate the change to the own ones."""
-    follow = solve_scaled(
-        np.broadcast_to(covariance.shared, (len(covariance.cross), *shared.shape)), covariance.cross
-    )
+    V, f, p = covariance.cross.shape
+    columns = covariance.cross.swapaxes(0, 1).reshape(f, V * p)
+    follow = solve_scaled(covariance.shared, columns).reshape(f, V, p).swapaxes(0, 1)
     more = np.swapaxes(follow, 1, 2) @ (shared - covariance.shared) @ follow
     return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
@@ -64,6 +64,18 @@ class Rig:
     def verdict(self) -> Verdict | None:
         """Verdict on this rig, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    @property
+    def lean(self) -> Rig:
+        """Both cameras and their relative pose, without the data behind them."""
+        return replace(
+            self,
+            left=self.left.lean,
+            right=self.right.lean,
+            pairs=(),
+            left_out={},
+            judgement=self.verdict,
+        )
 
     @property
     def R(self) -> Array:

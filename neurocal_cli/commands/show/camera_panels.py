@@ -226,9 +226,15 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
 
 
 def draw_poses(
-    axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
+    axes: Axes,
+    calibration: Calibration | None,
+    others: Sequence[tuple[Camera, Pose]] = (),
+    names: Sequence[str] = (),
 ) -> None:
-    """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs."""
+    """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs.
+
+    `names` are those of all cameras, if they are to be shown.
+    """
     space: Any = axes
     style(axes, "Poses")
     if calibration is None or not calibration.views or not len(calibration.points):
@@ -259,6 +265,8 @@ def draw_poses(
         corners = (_frustum(camera, size) - pose.t) @ pose.R
         extent.append(corners)
         centre, *ends = _turned(corners)
+        if names:
+            space.text(*centre, names[number].replace("$", r"\$"), fontsize=8, color=INK)
         for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
             space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
     everything = _turned(np.vstack(extent))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
@@ -62,6 +63,16 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
         f"{rig.baseline:.6g} {plain(rig.unit)}"
     )
     return _page(rows, (1,) * len(rows), panels, title, size, kind)
+
+
+def draw_camera_rig(rig: CameraRig, kind: str = "png", panel: str | None = None) -> bytes:
+    """Draw the cameras of a rig and the targets that its first camera saw, in space."""
+    others = [(rig.cameras[name].camera, pose) for name, pose in list(rig.poses.items())[1:]]
+
+    def draw(axes: Axes) -> None:
+        draw_poses(axes, rig.cameras[rig.first], others, tuple(rig.cameras))
+
+    return _alone("poses", draw, kind)
 
 
 def _with_side(side: str, draw: Draw) -> Draw:

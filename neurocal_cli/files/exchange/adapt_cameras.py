@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -30,6 +32,13 @@ class AdaptedCameras:
     losses: tuple[str, ...] = ()  # changes of the cameras and the shifts of pixels, for warnings
     remarks: tuple[str, ...] = ()  # data that are not in the file, for notes
     moved: tuple[Distance | None, ...] = ()  # shifts of the pixels of each camera
+
+
+def _parts(origin: Calibration | Rig | CameraRig) -> list[Calibration]:
+    """The calibrations in the contents of a neurocal file."""
+    if isinstance(origin, CameraRig):
+        return list(origin.cameras.values())
+    return [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
 
 
 def adapt_cameras(
@@ -62,8 +71,7 @@ def adapt_cameras(
     # Pixels of the points with which each camera was calibrated.
     seen: list[Array | None] = [None] * len(cameras.cameras)
     if origin is not None:
-        parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
-        seen = [part.points.pixels for part in parts]
+        seen = [part.points.pixels for part in _parts(origin)]
     for camera, points in zip(cameras.cameras, seen, strict=True):
         new, near, loss = _adapted(camera, target, model, force, points)
         adapted.append(new)

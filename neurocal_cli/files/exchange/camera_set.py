@@ -11,6 +11,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -29,7 +30,7 @@ class CameraSet:
     relative: tuple[Pose, ...] = ()  # from the first camera to each further one, X_k = R X_0 + t
     poses: Mapping[str, Pose] = field(default_factory=dict)  # of views, from the world to the first camera
     unit: str | None = None  # of the translations; None if the file does not state it
-    origin: Calibration | Rig | None = None  # the whole contents of a neurocal file
+    origin: Calibration | Rig | CameraRig | None = None  # the whole contents of a neurocal file
     program: str = "OpenCV"  # that wrote the file, for messages
 
     def __post_init__(self) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
@@ -20,6 +21,7 @@ from neurocal_cli.files.calibration_tree import (
     neurocal_block,
 )
 from neurocal_cli.files.calibration_yaml import format_calibration
+from neurocal_cli.files.camera_rig_yaml import camera_rig_from_field, format_camera_rig
 from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.failures import value_failures
@@ -34,7 +36,9 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
     """Read a calibration or a rig, with poses and points only if `whole`."""
     if "neurocal" not in root:
         if not whole:
-            root.refuse("is a stereo rig; give the file of one camera")
+            root.refuse("is a rig; give the file of one camera")
+        if "rig" in root and "stereo" not in root:
+            return camera_set(camera_rig_from_field(root))
         return camera_set(rig_from_field(root))
     if not whole:
         intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
@@ -56,8 +60,13 @@ def without_points(root: Field, camera: CameraSet) -> Calibration:
     return replace(calibration, covariance=covariance, covariance_names=names)
 
 
-def camera_set(result: Calibration | Rig) -> CameraSet:
+def camera_set(result: Calibration | Rig | CameraRig) -> CameraSet:
     """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
+    if isinstance(result, CameraRig):
+        unit = None if result.unit == _UNKNOWN else result.unit
+        cameras = tuple(replace(one.camera, name=name) for name, one in result.cameras.items())
+        poses = {name: view.pose for name, view in result.cameras[result.first].views.items()}
+        return CameraSet(cameras, tuple(result.poses.values())[1:], poses, unit, result, "neurocal")
     left = result if isinstance(result, Calibration) else result.left
     poses = {name: view.pose for name, view in left.views.items()}
     unit = None if result.unit == _UNKNOWN else result.unit
@@ -89,6 +98,25 @@ def as_rig(cameras: CameraSet) -> Rig:
     )
 
 
+def as_camera_rig(cameras: CameraSet) -> CameraRig:
+    """Convert several cameras to a rig; without points unless they come from a rig file of neurocal."""
+    if isinstance(cameras.origin, CameraRig) and cameras.program == "neurocal":
+        return cameras.origin
+    names = [camera.name for camera in cameras.cameras]
+    if len(set(names)) < len(names):
+        names = [f"cam{k}" for k in range(len(names))]
+    unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
+    n = 6 * len(cameras.relative)
+    return CameraRig(
+        {name: _calibration(cameras, k) for k, name in enumerate(names)},
+        dict(zip(names, cameras.mounted, strict=True)),
+        dict(zip(names, [dict.fromkeys(unknown, 0.0), *[unknown] * len(cameras.relative)], strict=True)),
+        np.full((n, n), np.nan),
+        {},
+        stop_reason=f"from a file of {cameras.program}",
+    )
+
+
 def _calibration(cameras: CameraSet, k: int) -> Calibration:
     camera = cameras.cameras[k]
     unit = cameras.unit or _UNKNOWN
@@ -115,10 +143,12 @@ def _calibration(cameras: CameraSet, k: int) -> Calibration:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    if len(cameras.cameras) > 2 or isinstance(cameras.origin, CameraRig):
+        return {"": format_camera_rig(as_camera_rig(cameras))}
     if len(cameras.cameras) == 2:
         return {"": format_rig(as_rig(cameras))}
     origin = cameras.origin
     return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
 
 
-FORMAT = Format("neurocal", tuple(MODELS), _text, skew=True, poses=True)
+FORMAT = Format("neurocal", tuple(MODELS), _text, skew=True, poses=True, most_cameras=99)

@@ -71,7 +71,7 @@ def _single(path: str | Path) -> tuple[CameraSet | Field, CameraSet]:
     opened = _opened(str(path))
     found = _cameras(opened, whole=False)
     if len(found.cameras) > 1:
-        raise FormatError("is a stereo rig; give the file of one camera", source_of(path))
+        raise FormatError("is a rig; give the file of one camera", source_of(path))
     return opened, found
 
 
@@ -102,7 +102,11 @@ def _cameras(opened: CameraSet | Field, whole: bool) -> CameraSet:
     with value_failures(root.source):
         if not isinstance(root.value, dict):
             raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
-        if "neurocal" in root or ("left" in root and "right" in root):
+        if (
+            "neurocal" in root
+            or ("left" in root and "right" in root)
+            or ("cameras" in root and "rig" in root)
+        ):
             return neurocal.from_tree(root, whole)
         if kalibr.is_tree(root):
             return kalibr.from_tree(root)

@@ -1,0 +1,184 @@
+"""A rig of any number of cameras, with their poses relative to the first: ``X_name = R X_first + t``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import field, replace
+from functools import cached_property
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
+from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
+from neurocal_cli.errors import InputError
+
+
+@frozen_dataclass(eq=False)
+class CameraRig:
+    """Calibrated cameras that are fixed to each other.
+
+    Attributes
+    ----------
+    cameras : dict of Calibration by name
+        A frame that several cameras saw has one pose: that in each camera follows from that in the first.
+    poses : dict of Pose by name
+        R and t, ``X_name = R X_first + t``; the first camera's is the identity.
+    std : dict of dict by name
+        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline, the distance from the first
+        camera [world unit]; 0 for the first.
+    covariance : (6 (C - 1), 6 (C - 1)) array
+        Of the angles and translations of all cameras but the first.
+    frames : dict of dict by frame
+        The views that determine the rig: of each frame that several cameras saw, the view of each camera.
+    left_out : dict of str by (camera, view)
+        Views that contradict the rig, with the reason; each contributes to its own camera.
+    delays : dict of (value, std) by name
+        By how much the images of a camera were taken later than its stated times, or than those of the first
+        camera, in seconds if the rig is `timed`, else in units of the time between frames. Empty where it is
+        not estimated.
+    timed : bool
+        Whether the stated times of the images were used.
+    rmse_px : float [px]
+        ``sqrt(mean(du^2 + dv^2))`` over all points of all cameras.
+    max_px : float [px]
+    converged : bool
+    stop_reason : str
+    iterations : int
+        Iterations of the common bundle adjustment.
+    warnings : tuple of str
+    judgement : Verdict or callable, optional
+        The verdict read from a file, or the function that computes it from this rig; see `verdict`.
+    stereo : Rig, optional
+        A rig of two cameras as it was calibrated.
+    """
+
+    cameras: Mapping[str, Calibration]
+    poses: Mapping[str, Pose]
+    std: Mapping[str, Mapping[str, float]]
+    covariance: Array
+    frames: Mapping[str, Mapping[str, str]]
+    left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    timed: bool = False
+    rmse_px: float = float("nan")
+    max_px: float = float("nan")
+    converged: bool = True
+    stop_reason: str = ""
+    iterations: int = 0
+    warnings: tuple[str, ...] = ()
+    judgement: Verdict | Callable[[CameraRig], Verdict | None] | None = None
+    stereo: Rig | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Verdict on this rig, computed when it is first read; None without points of its own."""
+        return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    @property
+    def lean(self) -> CameraRig:
+        """The cameras and their poses, without the data behind them."""
+        return replace(
+            self,
+            cameras={name: camera.lean for name, camera in self.cameras.items()},
+            frames={},
+            left_out={},
+            judgement=self.verdict,
+            stereo=None if self.stereo is None else self.stereo.lean,
+        )
+
+    @property
+    def first(self) -> str:
+        """Name of the camera whose frame of reference the rig has."""
+        return next(iter(self.cameras))
+
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.cameras[self.first].unit
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
+        return self.rmse_px / float(np.sqrt(2.0))
+
+    @property
+    def edges(self) -> dict[tuple[str, str], int]:
+        """Number of frames that determine the rig by pairs of cameras, as far as they have any in common."""
+        names = list(self.cameras)
+        place = {name: k for k, name in enumerate(names)}
+        seen = np.zeros((len(self.frames), len(names)), dtype=int)
+        for row, views in zip(seen, self.frames.values(), strict=True):
+            row[[place[name] for name in views]] = 1
+        common = seen.T @ seen
+        return {
+            (a, b): int(common[i, j])
+            for i, a in enumerate(names)
+            for j, b in enumerate(names)
+            if i < j and common[i, j]
+        }
+
+    def pair(self, left: str, right: str) -> Rig:
+        """Two of the cameras as a stereo rig, with the covariance of their relative pose.
+
+        Raises InputError for a name that no camera has, or one camera given twice.
+        """
+        for name in (left, right):
+            if name not in self.cameras:
+                raise InputError(f"the rig has no camera {name!r}; give two of {', '.join(self.cameras)}")
+        if self.stereo is not None and (left, right) == tuple(self.cameras):
+            return self.stereo
+        if left == right:
+            raise InputError(f"{left!r} is given twice; give two cameras")
+        a, b = self.poses[left], self.poses[right]
+        R = b.R @ a.R.T
+        t = b.t - R @ a.t
+        pose = Pose(R, t)
+        covariance = self._relative_covariance((left, right), pose)
+        distance = float(np.linalg.norm(t))
+        along = t / distance if distance > 0 else np.zeros(3)
+        std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        named = dict(zip(POSE_NAMES, std.tolist(), strict=True))
+        named["baseline"] = float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))
+        cameras = self.cameras[left], self.cameras[right]
+        counts = [len(camera.points) for camera in cameras]
+        squares = sum(n * float(c.rmse_px) ** 2 for n, c in zip(counts, cameras, strict=True) if n)
+        return Rig(
+            *cameras,
+            pose,
+            named,
+            covariance,
+            tuple(
+                (views[left], views[right]) for views in self.frames.values() if {left, right} <= set(views)
+            ),
+            rmse_px=(squares / sum(counts)) ** 0.5 if sum(counts) else self.rmse_px,
+            max_px=max(camera.max_px for camera in cameras),
+            converged=self.converged,
+            stop_reason=self.stop_reason,
+            iterations=self.iterations,
+            judgement=self.judgement if isinstance(self.judgement, Verdict) else None,
+        )
+
+    def _relative_covariance(self, names: tuple[str, str], pose: Pose) -> Array:
+        """(6, 6) covariance of the angles and the translation from one camera to another."""
+        places = {name: 6 * k + np.arange(6) for k, name in enumerate(list(self.poses)[1:])}
+        # Steps w, tau of a pose follow from its angles and translation.
+        J = np.zeros((6, len(self.covariance)))
+        R, turned = pose.R, pose.R @ self.poses[names[0]].t
+        for sign, name in zip((-1, 1), names, strict=True):
+            if name not in places:
+                continue
+            angles, shift = places[name][:3], places[name][3:]
+            turn = np.linalg.pinv(euler_jacobian(self.poses[name].R))
+            if sign > 0:  # exp(w) R_b, t_b + tau
+                J[:3, angles] = turn
+                J[3:, angles] = cross_matrix(turned) @ turn
+                J[3:, shift] = np.eye(3)
+            else:  # R_b R_a^T exp(-w), -R_b R_a^T (t_a + tau)
+                J[:3, angles] = -R @ turn
+                J[3:, angles] = -cross_matrix(turned) @ R @ turn
+                J[3:, shift] = -R
+        J[:3] = euler_jacobian(R) @ J[:3]
+        return np.asarray(J @ self.covariance @ J.T)

@@ -1,0 +1,275 @@
+"""The edges of a rig: pairs of cameras that saw common frames, and what these say about the rig.
+
+Each edge is a rig of two cameras: most of its frames agree on one relative pose, and the others have faults
+(`sound_pairs`). The best edges that reach all cameras give the poses of the rig. A view is left out if it has
+most of the faults of its frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.adjustment.reprojection import squared_errors
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.contradiction import MEDIAN, SUSPECT, Contradiction, contradiction
+from neurocal_cli.calibration.rig.frames import groups
+from neurocal_cli.calibration.rig.relative_poses import RelativePoses, relative_poses
+from neurocal_cli.calibration.rig.sound_pairs import (
+    UNSYNCHRONISED,
+    RigConsensus,
+    describe_faults,
+    find_consensus,
+)
+from neurocal_cli.calibration.verdict.findings import in_sequence
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import median, nearest_rotation
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import DegenerateGeometryError
+
+_PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
+_LEAST_FRAMES, _MOST = 4, 0.8  # that must agree once a mistake is undone, and their share
+_LEAST_AGREED = 1 / 3  # share of an edge's frames that must agree on one relative pose
+
+Pair = tuple[int, int]
+
+
+@frozen_dataclass(eq=False)
+class Edge:
+    """Two cameras, and what their common frames say."""
+
+    cameras: Pair  # by index
+    problem: RigProblem  # of these two
+    consensus: RigConsensus
+    poses: RelativePoses | None  # None if a view does not determine its pose
+    used: NDArray[np.bool_]  # (P,) pairs without a fault that has a name
+    found: Contradiction | None  # of these
+
+    @property
+    def n_agreed(self) -> int:
+        """Number of frames that agree."""
+        return self.consensus.reasons.count("")
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether so many of its frames agree on one relative pose that it is not by chance."""
+        return self.n_agreed > _LEAST_AGREED * len(self.consensus.reasons)
+
+    @property
+    def faults(self) -> dict[tuple[str, str], str]:
+        """The views of pairs that do not agree with the others, and why.
+
+        Only what the uncertainty of the poses does not explain counts, unless the fault has a name.
+        """
+        faults = dict(zip(self.problem.pairs, self.consensus.reasons, strict=True))
+        if self.poses is not None and self.found is not None:
+            odd = zip(self.poses.names, self.found.odd, strict=True)
+            faults = {pair: why for pair, why in faults.items() if why != UNSYNCHRONISED}
+            faults |= {pair: UNSYNCHRONISED for pair, is_odd in odd if is_odd}
+        return {pair: why for pair, why in faults.items() if why}
+
+
+def examined(problem: RigProblem, seen: NDArray[np.bool_]) -> list[Edge]:
+    """The edges that are worth a look, those with most frames first; `seen` (C, V) as in `FrameNames`."""
+    return [_edge(problem, pair) for pair in _chosen(seen)]
+
+
+def _chosen(seen: NDArray[np.bool_]) -> list[Pair]:
+    """Pairs of cameras: those that connect all, and of each camera those with most frames in common."""
+    common = seen.astype(int) @ seen.T.astype(int)
+    np.fill_diagonal(common, 0)
+    wanted = {pair for pair in _tree(common) if common[pair]}
+    for a, row in enumerate(common):
+        best = np.argsort(-row, kind="stable")[:_PARTNERS]
+        wanted |= {(min(a, int(b)), max(a, int(b))) for b in best if row[b]}
+    return sorted(wanted, key=lambda pair: (-common[pair], pair))
+
+
+def _tree(weight: NDArray[np.int_]) -> list[Pair]:
+    """Pairs of a largest spanning tree of a symmetric matrix, from the first camera on; 0 is no edge."""
+    inside, pairs = [0], []
+    while len(inside) < len(weight):
+        rows = weight[inside].copy()
+        rows[:, inside] = -1
+        a, b = np.unravel_index(int(np.argmax(rows)), rows.shape)
+        pairs.append((inside[int(a)], int(b)))
+        inside.append(int(b))
+    return pairs
+
+
+def _edge(problem: RigProblem, pair: Pair) -> Edge:
+    two = problem.of_two(*pair)
+    consensus = find_consensus(two)
+    poses = relative_poses(two, consensus.rig)
+    reasons = dict(zip(two.pairs, consensus.reasons, strict=True))
+    if poses is None:
+        return Edge(pair, two, consensus, None, np.zeros(0, dtype=bool), None)
+    used = np.array([reasons[name] in ("", UNSYNCHRONISED) for name in poses.names])
+    found = contradiction(poses, used) if used.any() else None
+    return Edge(pair, two, consensus, poses, used, found)
+
+
+def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
+    """Poses of all cameras but the first, through the edges on which most frames agree.
+
+    Raises DegenerateGeometryError if the sound edges do not reach a camera.
+    """
+    weight = np.zeros((len(names), len(names)), dtype=int)
+    rigs: dict[Pair, Pose] = {}
+    for edge in edges:
+        a, b = edge.cameras
+        if edge.is_sound:
+            weight[a, b] = weight[b, a] = edge.n_agreed
+            R, t = edge.consensus.rig.R, edge.consensus.rig.t
+            rigs[a, b], rigs[b, a] = edge.consensus.rig, Pose(R.T, -R.T @ t)
+    parts = groups(weight > 0)
+    if len(parts) > 1:
+        raise DegenerateGeometryError(_why_apart(edges, names, parts))
+    found = {0: Pose(np.eye(3), np.zeros(3))}
+    for a, b in _tree(weight):
+        before, step = found[a], rigs[a, b]
+        found[b] = Pose(step.R @ before.R, step.R @ before.t + step.t)
+    return [found[k] for k in range(1, len(names))]
+
+
+def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list[int]]) -> str:
+    """Message about a camera whose frames contradict those of all others."""
+    part = min(parts, key=len)
+    outer = [edge for edge in edges if (edge.cameras[0] in part) != (edge.cameras[1] in part)]
+    worst = max(outer, key=lambda edge: len(edge.consensus.reasons))
+    a, b = worst.cameras
+    alone, other = (names[a], names[b]) if a in part else (names[b], names[a])
+    views = tuple({name for edge in edges for own in edge.problem.names for name in own})
+    order = {views[k]: place for place, k in enumerate(in_sequence(views))}
+    for by, word in ((1, "next"), (-1, "previous")):
+        if _shifted_by(worst.problem, order, by if a in part else -by):
+            return (
+                f"the images of camera {alone} are shifted by one: they fit those of camera {other} in the "
+                f"{word} "
+                "frame; one image of one of them is missing or was taken twice, so name the views that "
+                "were taken "
+                "at the same moment alike"
+            )
+    larger = _size_of_right(worst.problem)
+    if larger is not None:
+        factor = larger if b in part else 1 / larger
+        return (
+            f"the target of camera {alone} is {factor:.3g} times as large as its X,Y,Z say, compared with "
+            "that of "
+            f"camera {other}; check the unit of X,Y,Z and the size of the squares in its points"
+        )
+    faults = dict(zip(worst.problem.pairs, worst.consensus.reasons, strict=True))
+    told = describe_faults({pair: why for pair, why in faults.items() if why}, len(faults))
+    return (
+        f"camera {', '.join(names[k] for k in part)}: most views contradict those of all other cameras. With "
+        f"{other}, {told}; check that the cameras took their images at the same moment, that each file is "
+        "of the "
+        "camera that its name says, and that X,Y,Z and the unit are the same"
+    )
+
+
+def _agree(problem: RigProblem) -> bool:
+    reasons = find_consensus(problem).reasons
+    return len(reasons) >= _LEAST_FRAMES and reasons.count("") > _MOST * len(reasons)
+
+
+def _shifted_by(problem: RigProblem, order: Mapping[str, int], by: int) -> bool:
+    """Whether the left views agree with the right ones of frames that are later by a number of places."""
+    left, right = problem.names
+    partner = {order[name]: name for name in right}
+    pairs = [(name, partner[order[name] + by]) for name in left if order[name] + by in partner]
+    return bool(pairs) and _agree(stereo_problem(*_two(problem), pairs))
+
+
+def _two(problem: RigProblem) -> tuple[Calibration, Calibration]:
+    left, right = problem.calibrations
+    return left, right
+
+
+def _size_of_right(problem: RigProblem) -> float | None:
+    """How much larger the right camera's target is than its points say, if the pairs agree with it.
+
+    The rotations of the pairs tell that of the rig. For a size s the positions of the target obey
+    s m_right = R m_left + t, which is linear in s and t.
+    """
+    left, right = problem.cameras
+    scale = problem.scale[problem.paired][:, None]
+    R = nearest_rotation(
+        (right.R[problem.paired_right] @ left.R[problem.paired_left].swapaxes(1, 2)).sum(axis=0)
+    )
+    first, second = left.t[problem.paired_left] * scale @ R.T, right.t[problem.paired_right] * scale
+    if len(first) < _LEAST_FRAMES:
+        return None
+    # Without t, by differences from the means.
+    apart, there = second - second.mean(axis=0), first - first.mean(axis=0)
+    size = float((apart * there).sum() / (apart * apart).sum())
+    if not size > 0:
+        return None
+    one, other = problem.observations
+    state = problem.cameras[1]
+    enlarged = replace(
+        problem, cameras=(problem.cameras[0], replace(state, t=size * state.t)), observations=(one, other)
+    )
+    return size if _agree(enlarged) else None
+
+
+def views_left_out(edges: Sequence[Edge], problem: RigProblem) -> dict[tuple[int, str], str]:
+    """Views with most of the faults of their frames, by the index of the camera, and why.
+
+    As long as two views of a frame contradict each other, the one that contradicts most others is left out.
+    """
+    by_frame: dict[int, list[tuple[tuple[int, str], tuple[int, str], str]]] = {}
+    agreed: dict[tuple[int, str], int] = {}
+    frame_of = [dict(zip(names, seen.view.tolist(), strict=True))
+                for names, seen in zip(problem.names, problem.observations, strict=True)]  # fmt: skip
+    for edge in edges:
+        if not edge.is_sound:
+            continue
+        a, b = edge.cameras
+        faults = edge.faults
+        for left, right in edge.problem.pairs:
+            one, other = (a, left), (b, right)
+            if why := faults.get((left, right)):
+                by_frame.setdefault(frame_of[a][left], []).append((one, other, why))
+            else:
+                agreed[one] = agreed.get(one, 0) + 1
+                agreed[other] = agreed.get(other, 0) + 1
+    found: dict[tuple[int, str], str] = {}
+    for bad in by_frame.values():
+        while bad:
+            views = [view for one, other, _ in bad for view in (one, other)]
+            worst = max(views, key=lambda view: (views.count(view), -agreed.get(view, 0)))
+            reasons = [why for one, other, why in bad if worst in (one, other)]
+            found[worst] = max(reasons, key=reasons.count)
+            bad = [entry for entry in bad if worst not in entry[:2]]
+    return found
+
+
+def is_suspect(why: str) -> bool:
+    """Whether a view is only far from where the others see it, without a fault that has a name."""
+    return why == UNSYNCHRONISED
+
+
+def fitting(problem: RigProblem, fit: RigFit) -> list[NDArray[np.bool_]]:
+    """Which views of each camera, (V_c,), fit the rig of a fit after all, with the frames' poses refined.
+
+    `problem` has frames with views that the fit left out. The linearised pose of a view of few points may
+    seem far off, although the points fit the rig.
+    """
+    state = problem.start(
+        [Pose(R, t * problem.unit) for R, t in zip(fit.state.R[1:], fit.state.t[1:], strict=True)]
+    )
+    state = replace(state, cameras=fit.state.cameras)
+    state = adjust_rig(problem, state, np.zeros(len(fit.free), dtype=bool)).state
+    more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
+    for side, observed in enumerate(problem.observations):
+        cost = observed.weight * squared_errors(observed.batches, problem.camera(state, side))
+        more[observed.view] += cost - problem.own_normal[side][:, -1, -1]
+        views[observed.view] += 1
+    apart = more / np.maximum(views - 1, 1)
+    limit = SUSPECT * max(1.0, float(median(apart[problem.together])) / MEDIAN)
+    return [apart[observed.view] < limit for observed in problem.observations]

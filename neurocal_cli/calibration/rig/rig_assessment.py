@@ -1,0 +1,267 @@
+"""The verdict on a rig of any number of cameras: good, usable or poor, with reasons and advice.
+
+Everything is computed from the rig and its points, so a file can be judged like a fresh result:
+
+* the verdict on each camera by its own points (`calibration.verdict.assessment`);
+* whether the frames agree on one rig, and if not, the cause (`rivals`);
+* the cross-validation error over frames;
+* the uncertainty of the cameras' positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.adjustment.leave_out import folds_of
+from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.adjustment.reprojection import normal_blocks
+from neurocal_cli.calibration.calibration import Verdict
+from neurocal_cli.calibration.rig.adjust import RigFit, ViewEquations, adjust_rig, rig_problem
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.motion import motion_of
+from neurocal_cli.calibration.rig.rivals import Named, named_cause, scatter
+from neurocal_cli.calibration.rig.sound_pairs import MOVED, UNSYNCHRONISED
+from neurocal_cli.calibration.verdict.assessment import assess
+from neurocal_cli.calibration.verdict.findings import WORDS, Finding, Limit, name_some, verdict_of
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.errors import plural
+
+# As for two cameras; repeated by test_camera_rig.py.
+_SCATTER = Limit(4.0, 10.0)
+_GROWTH = Limit(1.6, 2.3)
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DISTANCE = Limit(0.01, 0.05)  # std over the distance
+_LEFT_OUT = Limit(0.0, 0.34)  # share of the views
+_ONE_PLACE = 3.0  # standard deviations; cameras that are nearer are at one place
+_TOLD = 3.0  # standard deviations of a delay
+_FOLDS = 5
+
+
+@frozen_dataclass(eq=False)
+class _Evidence:
+    """Measures of a rig's quality."""
+
+    cameras: dict[str, Verdict]  # by their own points
+    cause: Named | None  # of the contradictions
+    scatter: float  # rms of the views' poses about one rig, over that of noise
+    rest: float  # the same after the cause
+    growth: float  # rms residual of the common fit over that of the cameras alone
+    held_out: float  # rms of frames left out over that of all; nan if none can be left out
+    distance: tuple[
+        str, float
+    ]  # the camera with the largest std of its distance from the nearest other, relative
+    one_place: tuple[str, str] | None  # cameras that are at one place
+
+
+def assess_camera_rig(rig: CameraRig) -> Verdict | None:
+    """Good, usable or poor, with reasons and advice; None for a rig without points of its own."""
+    if any(set(camera.points.view_names) != set(camera.views) for camera in rig.cameras.values()):
+        return None
+    if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
+        return None
+    evidence = _evidence(rig)
+    measures = {
+        "held_out_px": evidence.held_out * rig.rmse_px,
+        "alone_px": rig.rmse_px / evidence.growth,
+        "growth": evidence.growth,
+        "scatter": evidence.scatter,
+        "distance_share": evidence.distance[1],
+    }
+    return verdict_of(_findings(rig, evidence), measures)
+
+
+def _evidence(rig: CameraRig) -> _Evidence:
+    names = list(rig.cameras)
+    fit = _fit(rig)
+    squares, degrees = scatter(fit)
+    equations = sum(observed.n_equations for observed in fit.problem.observations)
+    spare = max(equations - 6 * sum(map(len, fit.problem.names)) - int(fit.free.sum()), 1.0)
+    alone = max(fit.cost - squares, 1e-300)
+    cause, rest = named_cause(fit, names)
+    verdicts = {name: assess(camera) for name, camera in rig.cameras.items()}
+    distance, one_place = _distances(rig)
+    return _Evidence(
+        cameras={name: verdict for name, verdict in verdicts.items() if verdict is not None},
+        cause=cause,
+        scatter=float(np.sqrt(squares / degrees)) if degrees else 0.0,
+        rest=rest,
+        growth=float(np.sqrt((alone + squares) / (spare + degrees) / (alone / spare))),
+        held_out=_held_out(fit),
+        distance=distance,
+        one_place=one_place,
+    )
+
+
+def _fit(rig: CameraRig) -> RigFit:
+    """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
+    frame_of: dict[tuple[str, str], int] = {
+        (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()
+    }
+    end, of_views = len(rig.frames), []
+    for name, camera in rig.cameras.items():
+        own = []
+        for view in camera.points.view_names:
+            frame = frame_of.get((name, view), -1)
+            if frame < 0:
+                frame, end = end, end + 1
+            own.append(frame)
+        of_views.append(np.array(own, dtype=np.intp))
+    problem = rig_problem(list(rig.cameras.values()), of_views)
+    state = problem.start(list(rig.poses.values())[1:])
+    if rig.delays:
+        motion = motion_of(problem, state, _times(rig)) or motion_of(problem, state, None)
+        if motion is not None:
+            delay = np.array([rig.delays.get(name, (0.0, 0.0))[0] for name in rig.cameras])
+            problem = replace(problem, motion=motion)
+            state = replace(state, delay=delay, timed=True)
+    return adjust_rig(problem, state, problem.estimated_shared)
+
+
+def _times(rig: CameraRig) -> list[Array] | None:
+    times = [camera.points.view_times for camera in rig.cameras.values()] if rig.timed else []
+    known = [one for one in times if one is not None]
+    return known if times and len(known) == len(times) else None
+
+
+def _held_out(fit: RigFit) -> float:
+    """Rms error of frames that are left out of the fit by turns, over that of all; their poses are fitted."""
+    problem, free = fit.problem, np.flatnonzero(fit.free)
+    blocks = [
+        normal_blocks(observed.batches, problem.camera(fit.state, side))[0]
+        for side, observed in enumerate(problem.observations)
+    ]
+    views = problem.view_equations(fit.state, blocks)
+    several = np.flatnonzero(problem.together)
+    fold = np.full(len(problem.scale), -1)
+    fold[several] = folds_of(len(several), _FOLDS)
+    whole, _ = fit.normal.only(free).reduced()
+    lost, cost = 0.0, 0.0
+    for k in range(int(fold.max()) + 1):
+        some = [
+            ViewEquations(one.place, one.frame[inside], one.M[inside])
+            for one in views
+            if (inside := fold[one.frame] == k).any()
+        ]
+        arrow = problem.gathered(some)
+        arrow = replace(arrow, own=arrow.own + np.eye(6) * ~(fold == k)[:, None, None])
+        part, _ = arrow.only(free).reduced()
+        rest = whole - part
+        step = solve_scaled(rest[:-1, :-1], rest[:-1, -1:], ROUNDING)[:, 0]
+        lost += float(part[-1, -1] - 2 * part[-1, :-1] @ step + step @ part[:-1, :-1] @ step)
+        cost += float(part[-1, -1])
+    return float(np.sqrt(lost / cost)) if cost > 0 and np.isfinite(lost) else np.nan
+
+
+def _distances(rig: CameraRig) -> tuple[tuple[str, float], tuple[str, str] | None]:
+    """The camera whose distance from the nearest other one is least certain, and cameras at one place."""
+    centres = np.stack([-pose.R.T @ pose.t for pose in rig.poses.values()])
+    names = list(rig.cameras)
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    usual = float(median(apart.min(axis=1)))
+    worst, together = (names[1], 0.0), None
+    for k, name in enumerate(names[1:], 1):
+        nearest = names[int(np.argmin(apart[k]))]
+        pair = rig.pair(nearest, name)
+        if pair.baseline < _ONE_PLACE * pair.std["baseline"]:
+            together = (nearest, name)
+        share = pair.std["baseline"] / max(pair.baseline, 1e-3 * usual)
+        worst = max(worst, (name, share), key=lambda one: one[1])
+    return worst, together
+
+
+def _findings(rig: CameraRig, e: _Evidence) -> Iterator[Finding]:
+    if not rig.converged:
+        yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
+    # A camera that is poor by itself, or was given wrong, spoils the frames, so it is named before them.
+    for name, verdict in e.cameras.items():
+        if verdict.reasons and (rig.cameras[name].type != 1 or verdict.word == "poor"):
+            advice = verdict.advice[0] if verdict.advice else ""
+            yield WORDS.index(verdict.word), f"{name}: {verdict.reasons[0]}", advice
+    yield from _frames(rig, e)
+    yield from _precision(rig, e)
+    for name, verdict in e.cameras.items():
+        for k, reason in enumerate(verdict.reasons):
+            yield (1 if k else WORDS.index(verdict.word)), f"{name}: {reason}", ""
+        for k, advice in enumerate(verdict.advice):
+            yield (1 if k else WORDS.index(verdict.word)), "", advice
+
+
+def _frames(rig: CameraRig, e: _Evidence) -> Iterator[Finding]:
+    """Findings about frames that do not agree on one rig."""
+    by_reason: dict[str, list[str]] = {}
+    for (camera, view), why in rig.left_out.items():
+        by_reason.setdefault(why, []).append(f"{camera}/{view}")
+    n_views = sum(map(len, rig.frames.values())) + len(rig.left_out)
+    for why, views in by_reason.items():
+        moved = why.startswith(MOVED)
+        yield (
+            2 if moved else _LEFT_OUT.grade(len(views) / n_views),
+            f"{plural(len(views), 'view')} ({name_some(views)}) left out: {why}",
+            "calibrate each part by itself, and fix the cameras to each other" if moved
+            else "trigger all cameras at the same moment, or hold the target still" if why == UNSYNCHRONISED
+            else "look at these views, and take them again",
+        )  # fmt: skip
+    late = {name: delay for name, (delay, std) in rig.delays.items() if abs(delay) > _TOLD * std}
+    if late:
+        unit = "s" if rig.timed else "of the time between frames"
+        told = name_some(f"{name} {delay:+.2g}" for name, delay in late.items())
+        yield (
+            1,
+            f"the images of a frame were not taken at the same moment: those of {told} {unit} later than "
+            "those of "
+            f"{rig.first}; the motion of the target between frames makes up for it",
+            "trigger all cameras at the same moment, or hold the target still",
+        )
+    if e.cause is not None:
+        yield (
+            max(1, _SCATTER.grade(e.scatter), _GROWTH.grade(e.growth), e.cause.grade),
+            e.cause.text,
+            e.cause.cause.advice,
+        )
+        return
+    yield (
+        max(_SCATTER.grade(e.rest), _GROWTH.grade(e.growth)),
+        f"the poses of the cameras differ from frame to frame, by {e.rest:.2g} times what noise explains "
+        "(rms "
+        f"{rig.rmse_px:.3g} px together, {rig.rmse_px / e.growth:.3g} px each camera alone), and no single "
+        "known "
+        "cause explains it: the images of a frame were not taken at the same moment, or the cameras are "
+        "not fixed "
+        "to each other",
+        "trigger all cameras at the same moment, or hold the target still; check that the cameras are fixed",
+    )
+
+
+def _precision(rig: CameraRig, e: _Evidence) -> Iterator[Finding]:
+    if e.one_place is not None:
+        first, second = e.one_place
+        yield (
+            2,
+            f"{first} and {second} are at the same place: their distance is less than {_ONE_PLACE:g} times "
+            "its std",
+            "check that each file is of a camera of its own",
+        )
+    seen = {name: sum(name in views for views in rig.frames.values()) for name in rig.cameras}
+    few = [name for name, count in seen.items() if count == 1]
+    if few:
+        yield (
+            1,
+            f"{name_some(few)}: the pose rests on one frame, and nothing checks it",
+            "add frames with this camera",
+        )
+    name, share = e.distance
+    more = f"add frames that {name} and its neighbours see, with the target near and tilted"
+    text = f"the std of the distance of {name} from its nearest neighbour is {100 * share:.2g} % of it"
+    yield _DISTANCE.grade(share), text, more
+    if np.isfinite(e.held_out):
+        yield (
+            _HELD_OUT.grade(e.held_out),
+            f"the cross-validation error is {e.held_out * rig.rmse_px:.3g} px, but the error on all data "
+            f"{rig.rmse_px:.3g} px",
+            "add frames",
+        )

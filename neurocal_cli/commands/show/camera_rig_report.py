@@ -1,0 +1,175 @@
+"""A rig of any number of cameras as text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
+from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
+from neurocal_cli.commands.show.text import (
+    Table,
+    align,
+    joined,
+    number,
+    number_or_none,
+    parameters,
+    printable,
+    rounded,
+    verdict_json,
+    verdict_lines,
+)
+from neurocal_cli.errors import plural
+
+_SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
+_MOST_EDGES = 20  # rows of a table that fit on a screen
+
+
+def camera_rig_report(rig: CameraRig) -> str:
+    """Summary of a calibrated rig: its cameras, their poses, the edges, the fit and the verdict."""
+    frames = plural(len(rig.frames), "frame")
+    headline = f"rig: {plural(len(rig.cameras), 'camera')} connected by {frames}"
+    return joined(
+        [headline],
+        *map(align, camera_rows(rig)),
+        *map(align, pose_rows(rig)),
+        _edge_lines(rig),
+        _fit_lines(rig),
+        verdict_lines(rig.verdict),
+    )
+
+
+def camera_rows(rig: CameraRig) -> tuple[Table, Table]:
+    """What each camera saw with its lens, and its main parameters: a row for each camera."""
+    seen = [["camera", "views", "points", "distortion", "rms [px]"]]
+    found = [["camera", *(f"{name} [px]" for name in _SHOWN)]]
+    for name, camera in rig.cameras.items():
+        counts = str(len(camera.views)), str(len(camera.points))
+        seen.append([printable(name), *counts, camera.distortion_model, number(camera.rmse_px, "#.4g")])
+        values = parameters(camera)
+        found.append(
+            [
+                printable(name),
+                *(
+                    f"{values[key]:.7g} fixed"
+                    if key in camera.fixed
+                    else _with_std(values[key], camera.std.get(key, math.nan))
+                    for key in _SHOWN
+                ),
+            ]
+        )
+    return seen, found
+
+
+def pose_rows(rig: CameraRig) -> tuple[Table, Table]:
+    """Angles and translations of each camera but the first."""
+    heading, length = f"X = R X_{printable(rig.first)} + t", printable(rig.unit)
+    turns = [[heading, *(f"{name} [rad]" for name in POSE_NAMES[:3])]]
+    shifts = [["", *(f"{name} [{length}]" for name in POSE_NAMES[3:]), f"distance [{length}]"]]
+    for name, pose in list(rig.poses.items())[1:]:
+        values = dict(zip(POSE_NAMES, [*pose.euler.tolist(), *pose.t.tolist()], strict=True))
+        std = rig.std[name]
+        cells = [_with_std(values[key], std[key]) for key in POSE_NAMES]
+        distance = math.sqrt(float(pose.t @ pose.t))
+        turns.append([printable(name), *cells[:3]])
+        shifts.append([printable(name), *cells[3:], _with_std(distance, std["baseline"])])
+    return turns, shifts
+
+
+def _with_std(value: float, std: float) -> str:
+    return " +- ".join(rounded(value, std))
+
+
+def _edge_lines(rig: CameraRig) -> list[str]:
+    """Pairs of cameras with their common frames, those with most frames first."""
+    edges = sorted(rig.edges.items(), key=lambda edge: -edge[1])
+    if not edges:
+        return []
+    told = [f"{printable(a)}-{printable(b)} {count}" for (a, b), count in edges[:_MOST_EDGES]]
+    more = f" and {len(edges) - _MOST_EDGES} more pairs" if len(edges) > _MOST_EDGES else ""
+    return [f"common frames: {', '.join(told)}{more}"]
+
+
+def _fit_lines(rig: CameraRig) -> list[str]:
+    lines = [
+        f"bundle adjustment: rms {number(rig.rmse_px, '#.4g')} px, maximum {number(rig.max_px, '#.4g')} "
+        "px, after "
+        f"{plural(rig.iterations, 'iteration')}"
+    ]
+    if rig.delays:
+        unit = "s" if rig.timed else "of the time between frames"
+        told = ", ".join(f"{printable(name)} {_with_std(*delay)}" for name, delay in rig.delays.items())
+        lines.append(f"images later than those of {printable(rig.first)}: {told} {unit}")
+    if rig.left_out:
+        lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
+    lines += target_lines(rig.cameras[rig.first].target, rig.unit)
+    return [*lines, rig.stop_reason]
+
+
+def camera_rig_json(rig: CameraRig) -> dict[str, Any]:
+    """The summary of a rig as JSON values; None for numbers that do not exist."""
+    return {
+        "cameras": {name: calibration_json(camera) for name, camera in rig.cameras.items()},
+        "unit": rig.unit,
+        "poses": {
+            name: {
+                "R": pose.R.tolist(),
+                "t": pose.t.tolist(),
+                "std": {key: number_or_none(value) for key, value in rig.std[name].items()},
+            }
+            for name, pose in rig.poses.items()
+        },
+        "edges": [{"cameras": list(pair), "views": count} for pair, count in rig.edges.items()],
+        "delays": {
+            name: {"value": value, "std": number_or_none(std)} for name, (value, std) in rig.delays.items()
+        },
+        "timed": rig.timed,
+        "rmse_px": number_or_none(rig.rmse_px),
+        "max_px": number_or_none(rig.max_px),
+        "left_out": [[*view, why] for view, why in rig.left_out.items()],
+        "converged": bool(rig.converged),
+        "stop_reason": str.__str__(rig.stop_reason),
+        "warnings": list(rig.warnings),
+        **verdict_json(rig.verdict),
+    }
+
+
+def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
+    """Rows of the tables of all points, of the cameras and of the frames, each with its heading."""
+    unit = printable(evaluation.unit)
+    x, y, z = evaluation.by_axis.tolist()
+    overall = [[f"[{unit}]", "all cameras"]]
+    for label, value in (("X rms", x), ("Y rms", y), ("Z rms", z), ("rms", evaluation.rmse)):
+        overall.append([label, number(value, "#.4g")])
+    overall += [["maximum", number(evaluation.largest, "#.4g")], ["points", str(len(evaluation.errors))]]
+    cameras = [["camera", "points", "rms from the other cameras' prediction [px]"]]
+    for name, (count, error) in evaluation.predicted.items():
+        cameras.append([printable(name), str(count), number(error, "#.4g")])
+    frames = [["frame", f"rms [{unit}]"]]
+    worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
+    frames += [[printable(name), number(error, "#.4g")] for name, error in worst]
+    return (overall, cameras, frames)
+
+
+def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
+    """An evaluation as JSON values; None for numbers that do not exist."""
+    x, y, z = evaluation.by_axis.tolist()
+    return {
+        "n_points": len(evaluation.errors),
+        "n_behind": evaluation.n_behind,
+        "unit": evaluation.unit,
+        "rmse": evaluation.rmse,
+        "rmse_x": x,
+        "rmse_y": y,
+        "rmse_z": z,
+        "max": evaluation.largest,
+        "fitted": evaluation.fitted,
+        "cameras": {
+            name: {"n_points": count, "predicted_rmse_px": number_or_none(error)}
+            for name, (count, error) in evaluation.predicted.items()
+        },
+        "frames": evaluation.frames,
+        **verdict_json(evaluation.verdict),
+    }

@@ -1,0 +1,72 @@
+"""Points of the cameras of a rig: a file for each, or one file with a column ``camera``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.points_csv import POINTS, correspondences
+from neurocal_cli.files.table import Table, read_table
+from neurocal_cli.observations.points import Correspondences
+
+
+def read_rig_points(
+    files: Sequence[tuple[str, str]], notes: list[str] | None = None
+) -> dict[str, Correspondences]:
+    """Read the points of each camera, by its name.
+
+    Parameters
+    ----------
+    files : sequence of (name, path)
+        The name is that of the camera; if it is empty, the column ``camera`` or the file names it. ``-`` is
+        standard input. Several files of one camera are read as one.
+    notes : list of str, optional
+        Remarks about ignored columns are appended.
+
+    Raises
+    ------
+    FormatError
+        A file cannot be read; the message begins with ``FILE:LINE:``.
+    InputError
+        A file holds several cameras, but a name is given for it.
+    """
+    schema = replace(POINTS, optional=(*POINTS.optional, "camera"), labels=POINTS.labels | {"camera"})
+    tables: dict[str, list[Table]] = {}
+    for name, path in files:
+        table = read_table(path, schema)
+        for camera, part in _by_camera(table, name):
+            tables.setdefault(camera, []).append(part)
+    remarks: list[str] = [] if notes is None else notes
+    return {camera: correspondences(parts, remarks) for camera, parts in tables.items()}
+
+
+def _by_camera(table: Table, name: str) -> list[tuple[str, Table]]:
+    labels = {key: values for key, values in table.labels.items() if key != "camera"}
+    whole = replace(table, labels=labels)
+    column = table.labels.get("camera")
+    if column is None:
+        stem = os.path.splitext(os.path.basename(table.source))[0]
+        return [(name or ("stdin" if table.source == "<stdin>" else stem), whole)]
+    cameras = list(dict.fromkeys(column.tolist()))
+    if name and len(cameras) > 1:
+        raise InputError(
+            f"{table.source}: the column camera names {len(cameras)} cameras, but the file is given as "
+            f"{name}; leave "
+            "out the name"
+        )
+    found = []
+    for camera in cameras:
+        rows = column == camera
+        numbers = {key: values[rows] for key, values in table.numbers.items()}
+        part = replace(
+            whole,
+            numbers=numbers,
+            labels={key: values[rows] for key, values in labels.items()},
+            lines=np.asarray(table.lines[rows]),
+        )
+        found.append((name or camera, part))
+    return found
