@@ -15,9 +15,13 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.calibrate import calibrate
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_rig
+    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_camera_rig
     from neurocal_cli.calibration.rig.triangulation import triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
@@ -29,11 +33,13 @@ if TYPE_CHECKING:
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
     from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
     from neurocal_cli.files.images import read_image
     from neurocal_cli.files.lens_points import read_lens_data, read_lens_points
     from neurocal_cli.files.lens_yaml import read_lens, write_lens
     from neurocal_cli.files.points_csv import read_points, write_points
     from neurocal_cli.files.result_files import write_calibration, write_rig
+    from neurocal_cli.files.rig_points import read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
@@ -46,6 +52,7 @@ _HOMES = {
     "Board": "observations.board",
     "Calibration": "calibration.calibration",
     "Camera": "camera.camera",
+    "CameraRig": "calibration.rig.camera_rig",
     "Correspondences": "observations.points",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
@@ -53,10 +60,12 @@ _HOMES = {
     "Rig": "calibration.rig.rig",
     "ZoomLens": "calibration.zoom.zoom_lens",
     "calibrate": "calibration.calibrate",
+    "calibrate_rig": "calibration.rig.calibrate_rig",
     "calibrate_stereo": "calibration.rig.calibrate_stereo",
     "camera_at": "calibration.zoom.zoom_lens",
     "detect_points": "detection.detect",
     "evaluate_camera": "calibration.evaluation",
+    "evaluate_camera_rig": "calibration.rig.rig_evaluation",
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
@@ -65,13 +74,16 @@ _HOMES = {
     "fit_rig": "calibration.rig.calibrate_stereo",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_tree",
+    "read_camera_rig": "files.camera_rig_yaml",
     "read_image": "files.images",
     "read_lens": "files.lens_yaml",
     "read_lens_data": "files.lens_points",
     "read_lens_points": "files.lens_points",
     "read_points": "files.points_csv",
     "read_rig": "files.rig_yaml",
+    "read_rig_points": "files.rig_points",
     "triangulate": "calibration.rig.triangulation",
+    "triangulate_many": "calibration.rig.many_views",
     "undistort_image": "camera.remapping",
     "undistort_points": "observations.undistorted_points",
     "write_calibration": "files.result_files",
@@ -84,6 +96,7 @@ __all__ = [
     "Board",
     "Calibration",
     "Camera",
+    "CameraRig",
     "Correspondences",
     "Intrinsics",
     "NeurocalError",
@@ -91,10 +104,12 @@ __all__ = [
     "Rig",
     "ZoomLens",
     "calibrate",
+    "calibrate_rig",
     "calibrate_stereo",
     "camera_at",
     "detect_points",
     "evaluate_camera",
+    "evaluate_camera_rig",
     "evaluate_lens",
     "evaluate_rig",
     "evaluate_stereo",
@@ -103,13 +118,16 @@ __all__ = [
     "fit_rig",
     "read_board",
     "read_calibration",
+    "read_camera_rig",
     "read_image",
     "read_lens",
     "read_lens_data",
     "read_lens_points",
     "read_points",
     "read_rig",
+    "read_rig_points",
     "triangulate",
+    "triangulate_many",
     "undistort_image",
     "undistort_points",
     "write_calibration",

@@ -21,13 +21,15 @@ MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
 # The names of the package by topic. A name that is in none of them goes to the last.
 TOPICS = {
     "Calibrating": ["calibrate", "Calibration", "Correspondences", "Camera", "Intrinsics", "Pose"],
-    "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_lens"],
+    "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_camera_rig", "evaluate_lens"],
     "Points from images": ["detect_points", "Board", "read_board", "read_image"],
     "Removing distortion": ["undistort_points", "undistort_image"],
     "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate"],
+    "Many cameras": ["calibrate_rig", "CameraRig", "triangulate_many"],
     "Zoom lenses": ["fit_lens", "fit_lens_cameras", "camera_at", "ZoomLens"],
     "Files": ["read_points", "write_points", "read_calibration", "write_calibration", "read_rig", "write_rig",
-              "read_lens", "write_lens", "read_lens_points", "read_lens_data"],
+              "read_camera_rig", "read_rig_points", "read_lens", "write_lens", "read_lens_points",
+              "read_lens_data"],
     "Errors": ["NeurocalError"],
     "More": [],
 }  # fmt: skip

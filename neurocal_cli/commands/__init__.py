@@ -38,7 +38,7 @@ _SUMMARIES = {
     "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board with its estimated shape.",
-    "triangulate": "Compute points in space from their pixels in the left and the right image.",
+    "triangulate": "Compute points in space from their pixels in two images or more.",
     "undistort": "Remove the lens distortion from images and points.",
     "man": None,
 }

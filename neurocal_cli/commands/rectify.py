@@ -154,7 +154,7 @@ def _pair(cameras: CameraSet, file: str, names: tuple[str, str] | None) -> Rig:
         told = ", ".join(camera.name for camera in cameras.cameras)
         raise UsageError(f"{file} holds {count} cameras ({told}); choose two by --cameras LEFT RIGHT")
     if count < 2:
-        raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig", file)
+        raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig of two or more", file)
     return as_rig(cameras)
 
 

@@ -69,7 +69,8 @@ class _Command(options.Command):
     metavar="NAME=MODEL",
     multiple=True,
     callback=_pairs,
-    hidden=True,
+    show_default="as --distortion",
+    help="The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
 )
 @estimation_options(files=False)
 @plot_option("the cameras and the boards in space")
@@ -97,8 +98,6 @@ def rig(
     has to see all frames, and two cameras need none in common if others connect them. A view of one camera
     alone helps that camera.
 
-    --distortion NAME=MODEL sets the distortion model of one camera, and can be repeated.
-
     Views that contradict the others are left out with the likely reason. A camera that moved, another focal
     length from some frame on, another size of the board in one camera and images that were taken later are
     told apart. Where the board moves and one camera's images are late, the motion of the board between frames
@@ -114,7 +113,7 @@ def rig(
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
           sample_data/rig_cam2.csv -o rig.yaml --plot rig.png
       neurocal rig left=sample_data/stereo_left.csv right=sample_data/stereo_right.csv \\
-          --distortion left=k1k2 --no-skew --json -o rig.json
+          --distortion-of left=k1k2 --no-skew --json -o rig.json
       neurocal calibrate sample_data/rig_cam0.csv -o known.yaml
       neurocal rig a=sample_data/rig_cam0.csv b=sample_data/rig_cam1.csv \\
           c=sample_data/rig_cam2.csv --intrinsics a=known.yaml --lean -o rig.yaml

@@ -242,7 +242,7 @@ def test_a_rig_needs_two_cameras_of_one_size(tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text(str(FORMATS["neurocal"].text(one, "")[""]))
     result = run("rectify", tmp_path / "one.yaml", "--maps", "-o", tmp_path / "out")
     assert result.exit_code == 1
-    assert "holds 1 camera; give the file of a rig of two" in result.stderr
+    assert "holds 1 camera; give the file of a rig of two or more" in result.stderr
     left, right = camera_set(BENT).cameras
     two = replace(camera_set(BENT), cameras=(left, replace(right, image_size=(640, 480))))
     (tmp_path / "two.yaml").write_text(str(FORMATS["neurocal"].text(two, "")[""]))

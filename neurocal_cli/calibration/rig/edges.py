@@ -33,7 +33,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 
 _PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
 _LEAST_FRAMES, _MOST = 4, 0.8  # that must agree once a mistake is undone, and their share
-_LEAST_AGREED = 1 / 3  # share of an edge's frames that must agree on one relative pose
+# Frames of an edge that must agree on one relative pose, and their share: where the target moves between late
+# images, only those in which it is slow agree.
+_FEWEST, _LEAST_AGREED = 3, 0.1
 
 Pair = tuple[int, int]
 
@@ -57,7 +59,8 @@ class Edge:
     @property
     def is_sound(self) -> bool:
         """Whether so many of its frames agree on one relative pose that it is not by chance."""
-        return self.n_agreed > _LEAST_AGREED * len(self.consensus.reasons)
+        n = len(self.consensus.reasons)
+        return self.n_agreed >= min(max(_LEAST_AGREED * n, _FEWEST), n)
 
     @property
     def faults(self) -> dict[tuple[str, str], str]:
@@ -140,35 +143,37 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
     """Message about a camera whose frames contradict those of all others."""
     part = min(parts, key=len)
     outer = [edge for edge in edges if (edge.cameras[0] in part) != (edge.cameras[1] in part)]
-    worst = max(outer, key=lambda edge: len(edge.consensus.reasons))
-    a, b = worst.cameras
-    alone, other = (names[a], names[b]) if a in part else (names[b], names[a])
+    outer.sort(key=lambda edge: -len(edge.consensus.reasons))
     views = tuple({name for edge in edges for own in edge.problem.names for name in own})
     order = {views[k]: place for place, k in enumerate(in_sequence(views))}
-    for by, word in ((1, "next"), (-1, "previous")):
-        if _shifted_by(worst.problem, order, by if a in part else -by):
+    for edge in outer:
+        a, b = edge.cameras
+        alone, other = (names[a], names[b]) if a in part else (names[b], names[a])
+        for by, word in ((1, "next"), (-1, "previous")):
+            if _shifted_by(edge.problem, order, by if a in part else -by):
+                return (
+                    f"the images of camera {alone} are shifted by one: they fit those of camera {other} in "
+                    "the "
+                    f"{word} frame; one image of one of them is missing or was taken twice, so name the "
+                    "views that "
+                    "were taken at the same moment alike"
+                )
+        larger = _size_of_right(edge.problem)
+        if larger is not None:
+            factor = larger if b in part else 1 / larger
             return (
-                f"the images of camera {alone} are shifted by one: they fit those of camera {other} in the "
-                f"{word} "
-                "frame; one image of one of them is missing or was taken twice, so name the views that "
-                "were taken "
-                "at the same moment alike"
+                f"the target of camera {alone} is {factor:.3g} times as large as its X,Y,Z say, compared "
+                "with that "
+                f"of camera {other}; check the unit of X,Y,Z and the size of the squares in its points"
             )
-    larger = _size_of_right(worst.problem)
-    if larger is not None:
-        factor = larger if b in part else 1 / larger
-        return (
-            f"the target of camera {alone} is {factor:.3g} times as large as its X,Y,Z say, compared with "
-            "that of "
-            f"camera {other}; check the unit of X,Y,Z and the size of the squares in its points"
-        )
+    worst = outer[0]
+    other = names[worst.cameras[worst.cameras[0] in part]]
     faults = dict(zip(worst.problem.pairs, worst.consensus.reasons, strict=True))
     told = describe_faults({pair: why for pair, why in faults.items() if why}, len(faults))
     return (
         f"camera {', '.join(names[k] for k in part)}: most views contradict those of all other cameras. With "
-        f"{other}, {told}; check that the cameras took their images at the same moment, that each file is "
-        "of the "
-        "camera that its name says, and that X,Y,Z and the unit are the same"
+        f"{other}, {told}; check that the cameras took their images at the same moment, that each file is of "
+        "the camera that its name says, and that X,Y,Z and the unit are the same"
     )
 
 

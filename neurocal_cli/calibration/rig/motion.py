@@ -1,8 +1,8 @@
 """The target's motion in a rig whose cameras do not take their images at the same moment.
 
-Around each frame the motion of the target is the polynomial in time through its poses in up to two frames
-before and two after. With the stated times of the images, or a delay of each camera, the pose in which a
-camera saw the target is not that of the frame but a little further on this path.
+Around each frame the motion of the target is the polynomial in time through its poses in five frames in a
+row, that one in the middle. With the stated times of the images, or a delay of each camera, the pose in which
+a camera saw the target is not that of the frame but a little further on this path.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.rig.adjust import Motion, RigFit, RigProblem, RigState, adjust_rig
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 
-_ROUNDS = 3  # of paths and adjustment alternately
+_ROUNDS, _SETTLED = 25, 1e-3  # of paths and adjustment alternately, most of them; relative change of the cost
 _GAP = 2.5  # a longer pause, over the median one between frames, interrupts the motion
-_NEIGHBOURS = (-2, -1, 1, 2)
-ORDER = len(_NEIGHBOURS)
+ORDER = 4
 """Highest power of the time in a path."""
 
 
@@ -31,16 +29,20 @@ def timed(fit: RigFit, times: Sequence[Array] | None) -> RigFit | None:
     `times` are those of each camera's views; without them, frames are one unit of time apart. None if the
     frames have no sequence, or if no two of them follow each other.
     """
-    problem = replace(fit.problem, motion=None)
+    problem, found, path = replace(fit.problem, motion=None), fit, None
     n_shared = len(fit.free) - (fit.problem.n_rig - problem.n_rig)
-    found: RigFit | None = None
     for _ in range(_ROUNDS):
-        motion = motion_of(problem, (found or fit).state, times)
+        motion = motion_of(problem, found.state, times)
         if motion is None:
             return None
-        moving = replace(problem, motion=motion)
+        # At the ends of a sequence the paths overshoot by turns, so they go half of the way.
+        path = motion.path if path is None else 0.5 * (path + motion.path)
+        moving = replace(problem, motion=replace(motion, path=path))
         free = np.concatenate([fit.free[:n_shared], np.ones(moving.n_rig - problem.n_rig, dtype=bool)])
-        found = adjust_rig(moving, replace((found or fit).state, timed=True), free)
+        cost = found.cost
+        found = adjust_rig(moving, replace(found.state, timed=True), free)
+        if abs(cost - found.cost) < _SETTLED * found.cost:
+            break
     return found
 
 
@@ -96,23 +98,20 @@ def _paths(problem: RigProblem, state: RigState, times: Array) -> Array:
     t = times[order]
     pauses = np.diff(t)
     run = np.concatenate([[0], np.cumsum(pauses > _GAP * float(median(pauses)))])  # frames without a gap
-    here = np.arange(len(order))
-    there = here + np.array(_NEIGHBOURS)[:, None]  # (4, F)
-    inside = (there >= 0) & (there < len(order))
-    there = np.clip(there, 0, len(order) - 1)
-    inside &= run[there] == run
-    for n in range(1, ORDER + 1):
-        for some in combinations(range(ORDER), n):
-            pattern = np.zeros(ORDER, dtype=bool)
-            pattern[list(some)] = True
-            which = np.flatnonzero((inside == pattern[:, None]).all(axis=0))
-            if not which.size:
-                continue
-            others = there[list(some)][:, which]  # (n, k)
-            moved = np.stack([_moved(problem, state, order[which], order[row]) for row in others], axis=1)
-            elapsed = (t[others] - t[which]).T  # (k, n)
-            powers = elapsed[:, :, None] ** np.arange(1, n + 1)
-            path[order[which], :n] = np.linalg.solve(powers, moved)
+    start = np.searchsorted(run, run)
+    n_run = np.searchsorted(run, run, side="right") - start
+    here, n = np.arange(len(order)), np.minimum(n_run - 1, ORDER)
+    # The nearest frames of the run, as many before as after where there are so many.
+    first = np.clip(here - ORDER // 2, start, start + n_run - 1 - n)
+    for k in range(1, ORDER + 1):
+        which = np.flatnonzero(n == k)
+        if not which.size:
+            continue
+        window = first[which, None] + np.arange(k + 1)
+        others = window[window != which[:, None]].reshape(-1, k).T  # (k, F)
+        moved = np.stack([_moved(problem, state, order[which], order[row]) for row in others], axis=1)
+        elapsed = (t[others] - t[which]).T  # (F, k)
+        path[order[which], :k] = np.linalg.solve(elapsed[:, :, None] ** np.arange(1, k + 1), moved)
     return path
 
 
@@ -123,4 +122,6 @@ def _moved(problem: RigProblem, state: RigState, of: NDArray[np.intp], to: NDArr
     placed = (state.view_R[to] @ local[..., None])[..., 0] + state.view_t[to]
     shift = placed * (problem.scale[to] / problem.scale[of])[:, None] - state.view_t[of]
     turn = rotation_vector(state.view_R[to] @ np.swapaxes(state.view_R[of], 1, 2))
-    return np.concatenate([turn, shift], axis=1)
+    angle = np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-12)
+    # The vector of which `rotation_step` makes this rotation.
+    return np.concatenate([turn * (2 * np.tan(angle / 2) / angle), shift], axis=1)

@@ -36,7 +36,8 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
     """Read a calibration or a rig, with poses and points only if `whole`."""
     if "neurocal" not in root:
         if not whole:
-            root.refuse("is a rig; give the file of one camera")
+            kind = "rig" if "rig" in root else "stereo rig"
+            root.refuse(f"is a {kind}; give the file of one camera")
         if "rig" in root and "stereo" not in root:
             return camera_set(camera_rig_from_field(root))
         return camera_set(rig_from_field(root))
