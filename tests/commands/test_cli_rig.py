@@ -1,0 +1,122 @@
+"""``neurocal rig``, and the commands that take its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from support.command_line import run
+
+from neurocal_cli import read_camera_rig
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLES = [ROOT / "sample_data" / f"rig_cam{k}.csv" for k in range(3)]
+FAST = ("--no-skew", "--distortion", "k1k2", "--target", "given")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """The sample rig, and what the command said."""
+    path = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    return path, run("rig", *SAMPLES, *FAST, "-o", path)
+
+
+def test_the_summary_has_all_cameras_poses_and_a_verdict(made: tuple[Path, Result]) -> None:
+    path, said = made
+    assert said.exit_code == 0, said.stderr
+    assert said.stdout == ""
+    assert "rig: 3 cameras connected by 15 frames" in said.stderr
+    for words in ("rig_cam2", "X = R X_rig_cam0 + t", "t_z [mm]", "common frames", "verdict: "):
+        assert words in said.stderr
+    assert max(map(len, said.stderr.splitlines())) < 110
+    rig = read_camera_rig(path)
+    # The truth is in sample_data/README.md.
+    assert rig.poses["rig_cam1"].t == pytest.approx([-295.18, 49.51, -20.50], abs=3)
+    assert rig.poses["rig_cam2"].t == pytest.approx([-529.32, 26.35, 14.64], abs=4)
+
+
+def test_names_known_cameras_and_models_of_single_cameras(tmp_path: Path) -> None:
+    known = tmp_path / "known.yaml"
+    assert run("calibrate", SAMPLES[0], *FAST, "-o", known).exit_code == 0
+    words = [f"{name}={path}" for name, path in zip("abc", SAMPLES, strict=True)]
+    said = run(
+        "rig", *words, "--intrinsics", f"a={known}", "--distortion", "b=k1", "--distortion-of", "c=k1k2",
+        "--no-skew", "--target", "given", "--json", "-o", tmp_path / "rig.json",
+    )  # fmt: skip
+    assert said.exit_code == 0, said.stderr
+    found = json.loads(said.stdout)
+    assert list(found["cameras"]) == ["a", "b", "c"]
+    assert found["edges"][0] == {"cameras": ["a", "b"], "views": 15}
+    rig = read_camera_rig(tmp_path / "rig.json")
+    assert [camera.distortion_model for camera in rig.cameras.values()] == ["k1k2", "k1", "k1k2"]
+    assert rig.cameras["a"].type == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((SAMPLES[0],), "two cameras or more"),
+        ((*SAMPLES, "--type", "3"), "--intrinsics NAME=CAMERA.yaml"),
+        ((*SAMPLES, "--intrinsics", "x=y.yaml"), "there is no camera 'x'"),
+        ((*SAMPLES, "--intrinsics", "y.yaml"), "is not NAME=VALUE"),
+        ((*SAMPLES, "--distortion", "rig_cam0=k7"), "k7"),
+        (("-", "-"), "standard input (-) can be read only once"),
+        ((*SAMPLES, "--plot", "rig.txt"), "not a picture file"),
+    ],
+)
+def test_wrong_words_are_refused_in_one_line(words: tuple[object, ...], said: str) -> None:
+    found = run("rig", *words)
+    assert found.exit_code in (1, 2)
+    assert said in found.stderr
+    assert "internal error" not in found.stderr
+
+
+def test_the_rig_is_evaluated(made: tuple[Path, Result]) -> None:
+    own = run("evaluate", "rig", made[0])
+    assert own.exit_code == 0, own.stderr
+    assert "rms from the other cameras' prediction [px]" in own.stdout
+    assert "verdict: " in own.stdout
+    new = run("evaluate", "rig", made[0], *SAMPLES, "--json")
+    found = json.loads(new.stdout)
+    assert found["fitted"]
+    assert found["rmse"] < 4
+    assert set(found["cameras"]) == {"rig_cam0", "rig_cam1", "rig_cam2"}
+
+
+def test_points_that_many_cameras_saw_are_triangulated(made: tuple[Path, Result], tmp_path: Path) -> None:
+    said = run("triangulate", made[0], ROOT / "sample_data" / "sightings.csv", "-o", tmp_path / "xyz.csv")
+    assert said.exit_code == 0, said.stderr
+    assert "1 without a camera that contradicts the others, mostly rig_cam1 (1)" in said.stderr
+    lines = [line for line in (tmp_path / "xyz.csv").read_text().splitlines() if not line.startswith("#")]
+    rows = list(csv.DictReader(lines))
+    assert [row["without"] for row in rows] == ["", "", "", "rig_cam1"]
+    for row, truth in zip(
+        rows, ([0, 0, 2400], [300, -200, 2500], [-250, 150, 2200], [100, 120, 2600]), strict=True
+    ):
+        assert [float(row[name]) for name in "XYZ"] == pytest.approx(truth, abs=12)
+        assert row["flag"] == "ok"
+    summary = run(
+        "triangulate", made[0], ROOT / "sample_data" / "sightings.csv", "--json", "-o", tmp_path / "x.csv"
+    )
+    assert json.loads(summary.stdout)["n_without"] == 1
+    unknown = tmp_path / "unknown.csv"
+    unknown.write_text("point,camera,u,v\na,top,1,2\n")
+    assert "there is no camera 'top'" in run("triangulate", made[0], unknown).stderr
+
+
+def test_two_of_the_cameras_are_rectified(made: tuple[Path, Result], tmp_path: Path) -> None:
+    words = "rectify", made[0], SAMPLES[0], SAMPLES[2], "-o", tmp_path / "out"
+    assert "choose two by --cameras LEFT RIGHT" in run(*words).stderr
+    said = run(*words, "--cameras", "rig_cam0", "rig_cam2", "--json")
+    assert said.exit_code == 0, said.stderr
+    assert (tmp_path / "out" / "left" / "rig_cam0.csv").exists()
+
+
+def test_the_cameras_and_the_boards_are_drawn(tmp_path: Path) -> None:
+    said = run("rig", *SAMPLES, *FAST, "-o", tmp_path / "rig.yaml", "--plot", tmp_path / "rig.svg")
+    assert said.exit_code == 0, said.stderr
+    text = (tmp_path / "rig.svg").read_text()
+    assert all(f"<!-- rig_cam{k} -->" in text for k in range(3))
