@@ -338,12 +338,16 @@ class RigProblem:
 
         Also returns whether all points are in front of their cameras, where the distortions are monotonic.
         """
-        found = [
+        found = self.blocks(state)
+        views = self.view_equations(state, [blocks for blocks, _ in found])
+        return self.gathered(views), all(bool(fine.all()) for _, fine in found)
+
+    def blocks(self, state: RigState) -> list[tuple[Array, NDArray[np.bool_]]]:
+        """`normal_blocks` of each camera."""
+        return [
             normal_blocks(observed.batches, self.camera(state, side))
             for side, observed in enumerate(self.observations)
         ]
-        views = self.view_equations(state, [blocks for blocks, _ in found])
-        return self.gathered(views), all(bool(fine.all()) for _, fine in found)
 
     def view_equations(self, state: RigState, blocks: Sequence[Array]) -> list[ViewEquations]:
         """Whitened normal equations of each camera's views, from its blocks (V_c, 12 + K + m, 12 + K + m).

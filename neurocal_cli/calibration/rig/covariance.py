@@ -41,7 +41,7 @@ from neurocal_cli.adjustment.open_coefficients import (
     open_at_points,
     spread_of_open,
 )
-from neurocal_cli.adjustment.reprojection import camera_columns, normal_blocks
+from neurocal_cli.adjustment.reprojection import camera_columns
 from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
 from neurocal_cli.calibration.rig.contradiction import Contradiction
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses
@@ -80,11 +80,7 @@ def covariance_over_frames(fit: RigFit) -> Array:
     matrices S_k are never formed: x = S^-1 (S_k x - g_k) is repeated.
     """
     problem, free = fit.problem, np.flatnonzero(fit.free)
-    blocks = [
-        normal_blocks(observed.batches, problem.camera(fit.state, side))[0]
-        for side, observed in enumerate(problem.observations)
-    ]
-    views = problem.view_equations(fit.state, blocks)
+    views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
     reduced, solved = fit.normal.reduced()
     S = reduced[np.ix_(free, free)]
     inverse = solve_scaled(S, np.eye(len(free)))

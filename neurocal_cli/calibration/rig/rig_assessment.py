@@ -17,7 +17,6 @@ import numpy as np
 
 from neurocal_cli.adjustment.leave_out import folds_of
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.adjustment.reprojection import normal_blocks
 from neurocal_cli.calibration.calibration import Verdict
 from neurocal_cli.calibration.rig.adjust import RigFit, ViewEquations, adjust_rig, rig_problem
 from neurocal_cli.calibration.rig.camera_rig import CameraRig
@@ -130,11 +129,7 @@ def _times(rig: CameraRig) -> list[Array] | None:
 def _held_out(fit: RigFit) -> float:
     """Rms error of frames that are left out of the fit by turns, over that of all; their poses are fitted."""
     problem, free = fit.problem, np.flatnonzero(fit.free)
-    blocks = [
-        normal_blocks(observed.batches, problem.camera(fit.state, side))[0]
-        for side, observed in enumerate(problem.observations)
-    ]
-    views = problem.view_equations(fit.state, blocks)
+    views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
     several = np.flatnonzero(problem.together)
     fold = np.full(len(problem.scale), -1)
     fold[several] = folds_of(len(several), _FOLDS)
