@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import click
@@ -19,9 +20,37 @@ if TYPE_CHECKING:
     from neurocal_cli.observations.points import Correspondences
 
 
-@click.group()
+class _Group(click.Group):
+    """A group that also takes a file, and judges it as what it is."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in self.commands and os.path.isfile(args[0]):
+            args = [_kind_of(args[0]), *args]
+        return super().resolve_command(ctx, args)
+
+
+def _kind_of(file: str) -> str:
+    """The command that judges a file, by the keys of its first lines."""
+    from neurocal_cli.files.file_storage import read_tree
+
+    root = read_tree(file)
+    if "neurocal_lens" in root:
+        raise UsageError(
+            f"{file} is a zoom lens; judge it by neurocal lens evaluate {file} POINTS.csv, on points that it "
+            "was not fitted to"
+        )
+    if "rig" in root and "stereo" not in root:
+        return "rig"
+    return "stereo" if "stereo" in root else "camera"
+
+
+@click.group(cls=_Group)
 def evaluate() -> None:
-    """Measure the error of a calibrated camera or stereo rig.
+    """Measure the error of a calibrated camera or rig.
+
+    Instead of the kind, a file may be given: `neurocal evaluate FILE` judges whatever the file is.
 
     \b
     Examples:
@@ -30,6 +59,7 @@ def evaluate() -> None:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
       neurocal evaluate stereo rig.yaml
+      neurocal evaluate rig.yaml
     """  # noqa: D301 - as in the group
 
 

@@ -19,6 +19,7 @@ from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
 
 _PICTURES = (".png", ".pdf", ".svg")
@@ -95,16 +96,17 @@ html_option = options.path(
 )
 
 
-def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None) -> None:
+def write_page(html: str | None, result: Calibration | Rig | CameraRig, *inputs: str | None) -> None:
     """Write the page about a result from these input files; does nothing without a name."""
     if html is None:
         return
     import hashlib
     import shlex
 
+    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.commands.show.html_page import Origin, versions
-    from neurocal_cli.commands.show.html_reports import calibration_page, rig_page
+    from neurocal_cli.commands.show.html_reports import calibration_page, camera_rig_page, rig_page
 
     files = {}
     for name in inputs:
@@ -113,6 +115,8 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
             files[source] = hashlib.sha256(data).hexdigest()
     typed = click.get_current_context().meta.get(TYPED, ())
     origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
-    write_whole(
-        html, rig_page(result, origin) if isinstance(result, Rig) else calibration_page(result, origin)
-    )
+    if isinstance(result, CameraRig):
+        text = camera_rig_page(result, origin)
+    else:
+        text = rig_page(result, origin) if isinstance(result, Rig) else calibration_page(result, origin)
+    write_whole(html, text)

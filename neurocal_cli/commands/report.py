@@ -90,6 +90,14 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
         ]
         origin = Origin(files, versions=_versions(root["left"]))
         return rig_page(rig, origin, (shown[0], shown[1]) if shown else None)
+    if "rig" in root and "cameras" in root:
+        from neurocal_cli.commands.show.html_reports import camera_rig_page
+        from neurocal_cli.files.camera_rig_yaml import camera_rig_from_field
+
+        if images:
+            raise UsageError("the page of a rig of named cameras shows no photographs; leave out --images")
+        found = camera_rig_from_field(root)
+        return camera_rig_page(found, Origin(files, versions=_versions(root["cameras"][found.first])))
     from neurocal_cli.files.calibration_tree import calibration_from_field
 
     calibration = calibration_from_field(root)

@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
+from neurocal_cli.commands.pages import check_plot, html_option, plot_option, write_page, write_plot
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
 
@@ -74,6 +74,7 @@ class _Command(options.Command):
 )
 @estimation_options(files=False)
 @plot_option("the cameras and the boards in space")
+@html_option
 @options.lean
 @options.summary
 @options.output("RIG.yaml", "Write the rig to this file.")
@@ -83,6 +84,7 @@ def rig(
     models: Named,
     estimation: Estimation,
     plot: str | None,
+    html: str | None,
     lean: bool,
     as_json: bool,
     output: str,
@@ -111,7 +113,7 @@ def rig(
     \b
     Examples:
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
-          sample_data/rig_cam2.csv -o rig.yaml --plot rig.png
+          sample_data/rig_cam2.csv -o rig.yaml --plot rig.png --html rig.html
       neurocal rig left=sample_data/stereo_left.csv right=sample_data/stereo_right.csv \\
           --distortion-of left=k1k2 --no-skew --json -o rig.json
       neurocal calibrate sample_data/rig_cam0.csv -o known.yaml
@@ -127,7 +129,7 @@ def rig(
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    preparation.check_summary(as_json, output)
+    preparation.check_summary(as_json, output, html)
     if estimation.type in ("3", "4"):
         raise UsageError(
             f"--type {estimation.type} is for one camera; give known cameras by --intrinsics NAME=CAMERA.yaml"
@@ -137,7 +139,7 @@ def rig(
     named = [named_file(file) for file in files]
     inputs = [file for _, file in named]
     preparation.check_one_stdin(*inputs, *(file for _, file in known))
-    preparation.check_outputs((output, plot), (*inputs, *(file for _, file in known)))
+    preparation.check_outputs((output, plot, html), (*inputs, *(file for _, file in known)))
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.commands.show.camera_rig_report import camera_rig_json, camera_rig_report
     from neurocal_cli.files.result_files import write_result
@@ -173,6 +175,7 @@ def rig(
 
         write_plot(plot, draw_camera_rig, found)
     warn(*write_result(found, output, lean=lean))
+    write_page(html, found, *inputs)
     conclude(found, as_json, camera_rig_json, camera_rig_report)
 
 

@@ -120,3 +120,19 @@ def test_the_cameras_and_the_boards_are_drawn(tmp_path: Path) -> None:
     assert said.exit_code == 0, said.stderr
     text = (tmp_path / "rig.svg").read_text()
     assert all(f"<!-- rig_cam{k} -->" in text for k in range(3))
+
+
+def test_a_file_is_judged_as_what_it_is(made: tuple[Path, Result], tmp_path: Path) -> None:
+    assert run("evaluate", made[0]).stdout == run("evaluate", "rig", made[0]).stdout
+    camera = tmp_path / "camera.yaml"
+    assert run("calibrate", SAMPLES[0], *FAST, "-o", camera).exit_code == 0
+    assert run("evaluate", camera).stdout == run("evaluate", "camera", camera).stdout
+    assert "No such command" in run("evaluate", "nothing.yaml").stderr
+
+
+def test_the_rig_has_a_page(made: tuple[Path, Result], tmp_path: Path) -> None:
+    said = run("report", made[0], "-o", tmp_path / "page.html")
+    assert said.exit_code == 0, said.stderr
+    text = (tmp_path / "page.html").read_text()
+    for words in ("Calibration of 3 cameras", "Camera rig_cam2", "common frames", "relative to rig_cam0"):
+        assert words in text

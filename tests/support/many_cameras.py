@@ -74,7 +74,8 @@ def errors_over_std(rig: CameraRig, truth: SimulatedRig) -> Array:
     found = []
     for name in list(rig.cameras)[1:]:
         true, pose = truth.relative[name], rig.poses[name]
-        error = np.concatenate([pose.euler - true.euler, pose.t - true.t])
+        turned = (pose.euler - true.euler + np.pi) % (2 * np.pi) - np.pi
+        error = np.concatenate([turned, pose.t - true.t])
         found += [e / rig.std[name][key] for e, key in zip(error, POSE, strict=True)]
     for name, camera in rig.cameras.items():
         K = truth.cameras[name].intrinsics

@@ -225,15 +225,33 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     axes.grid(False)
 
 
+Outline = tuple[str, Array, float, bool]
+"""Name of a view, outline of its target in the first camera's frame, rms error [px], whether it is flat."""
+
+
+def targets_of(calibration: Calibration, mounted: Pose | None = None) -> list[Outline]:
+    """The targets of a camera's views, in its frame or in that of the first camera, X = R X_first + t."""
+    points, found = calibration.points, []
+    for k, name in enumerate(points.view_names):
+        world = points.world[points.view_index == k]
+        outline = calibration.views[name].pose.to_camera(flat := _outline(world))
+        if mounted is not None:
+            outline = (outline - mounted.t) @ mounted.R
+        found.append((name, outline, calibration.views[name].rmse_px, len(flat) < len(world)))
+    return found
+
+
 def draw_poses(
     axes: Axes,
     calibration: Calibration | None,
     others: Sequence[tuple[Camera, Pose]] = (),
     names: Sequence[str] = (),
+    targets: Sequence[Outline] | None = None,
 ) -> None:
     """Draw targets and cameras in the first one's frame, in 3-D; `others` have poses from it to theirs.
 
-    `names` are those of all cameras, if they are to be shown.
+    `names` are those of all cameras, if they are to be shown, and `targets` by default those of the first
+    one.
     """
     space: Any = axes
     style(axes, "Poses")
@@ -245,20 +263,17 @@ def draw_poses(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    points = calibration.points
-    errors = np.array([calibration.views[name].rmse_px for name in points.view_names])
+    shown = targets_of(calibration) if targets is None else targets
+    errors = np.array([error for _, _, error, _ in shown])
     known = errors[np.isfinite(errors)]
     colour = ScalarMappable(Normalize(0, float(known.max()) if known.size else 1.0), colormaps["viridis"])
     extent = [np.zeros((1, 3))]
-    for k, name in enumerate(points.view_names):
-        world = points.world[points.view_index == k]
-        outline = calibration.views[name].pose.to_camera(_outline(world))
+    for name, outline, error, flat in shown:
         extent.append(outline)
-        shade = colour.to_rgba(errors[k])
-        flat = len(outline) < len(world)
+        shade = colour.to_rgba(np.asarray(error))
         closed = np.vstack([outline, outline[:1]]) if flat else outline
         space.plot(*_turned(closed).T, "-" if flat else ".", color=shade, linewidth=1.3, markersize=2)
-        if len(points.view_names) <= _MOST_NAMES:
+        if len(shown) <= _MOST_NAMES:
             space.text(*_turned(outline[:1])[0], name[-12:].replace("$", r"\$"), fontsize=7, color="0.3")
     size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
     for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):

@@ -9,12 +9,15 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import predict
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_report import parameter_rows
+from neurocal_cli.commands.show.camera_rig_report import camera_rows as named_camera_rows
+from neurocal_cli.commands.show.camera_rig_report import pose_rows
 from neurocal_cli.commands.show.html_page import (
     Origin,
     definitions,
@@ -30,7 +33,7 @@ from neurocal_cli.commands.show.html_page import (
     verdict_block,
 )
 from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, rig_rows
-from neurocal_cli.commands.show.text import printable
+from neurocal_cli.commands.show.text import printable, rounded
 from neurocal_cli.commands.show.zoom_report import lens_report
 from neurocal_cli.errors import InputError
 
@@ -84,6 +87,41 @@ def rig_page(
         parts += _camera_parts(camera, images)
     parts.append(_repeat("neurocal stereo LEFT.csv RIGHT.csv", rig.left, origin))
     return page("Calibration of two cameras", parts)
+
+
+def camera_rig_page(rig: CameraRig, origin: Origin) -> str:
+    """Make the page of a rig of any number of cameras; see `calibration_page`."""
+    cameras, first = list(rig.cameras), printable(rig.first)
+    head = f"{len(cameras)} cameras connected by {len(rig.frames)} frames, rms {rig.rmse_px:.4g} px"
+    frames = [["frame", *(f"{printable(name)} rms [px]" for name in cameras)]]
+    for name, views in rig.frames.items():
+        errors = [
+            f"{rig.cameras[camera].views[views[camera]].rmse_px:.4f}" if camera in views else ""
+            for camera in cameras
+        ]
+        frames.append([printable(name), *errors])
+    edges = [["cameras", "common frames", f"distance [{printable(rig.unit)}]"]]
+    for (a, b), count in rig.edges.items():
+        pair = rig.pair(a, b)
+        distance = " +- ".join(rounded(pair.baseline, pair.std["baseline"]))
+        edges.append([f"{printable(a)} - {printable(b)}", str(count), distance])
+    left_out = [["view", "reason"]]
+    left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    parts = [
+        f'<p class="soft">{escape(head)}</p>',
+        verdict_block(rig.verdict),
+        section(f"The poses of the cameras, relative to {first}", "".join(map(table, pose_rows(rig)))),
+        section("The cameras", "".join(map(table, named_camera_rows(rig)))),
+        section("Pairs of cameras", table(edges, sortable=True)),
+        section("Frames", table(frames, sortable=True)),
+        section("Views left out of the rig", table(left_out)),
+        _warnings(rig.warnings),
+    ]
+    for name, camera in rig.cameras.items():
+        parts.append(section(f"Camera {printable(name)}", " "))
+        parts += _camera_parts(camera, {})
+    parts.append(_repeat("neurocal rig POINTS.csv...", rig.cameras[rig.first], origin))
+    return page(f"Calibration of {len(cameras)} cameras", parts)
 
 
 def lens_page(lens: ZoomLens, origin: Origin) -> str:

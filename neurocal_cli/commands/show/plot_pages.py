@@ -12,7 +12,7 @@ from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of
+from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of, targets_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
 from neurocal_cli.errors import plural
 
@@ -66,11 +66,18 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
 
 
 def draw_camera_rig(rig: CameraRig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw the cameras of a rig and the targets that its first camera saw, in space."""
+    """Draw the cameras of a rig, and the targets of all frames as one of the cameras saw them, in space."""
+    of_frames = {next(iter(views.items())) for views in rig.frames.values()}
+    targets = [
+        target
+        for name, camera in rig.cameras.items()
+        for target in targets_of(camera, rig.poses[name])
+        if (name, target[0]) in of_frames
+    ]
     others = [(rig.cameras[name].camera, pose) for name, pose in list(rig.poses.items())[1:]]
 
     def draw(axes: Axes) -> None:
-        draw_poses(axes, rig.cameras[rig.first], others, tuple(rig.cameras))
+        draw_poses(axes, rig.cameras[rig.first], others, tuple(rig.cameras), targets)
 
     return _alone("poses", draw, kind)
 

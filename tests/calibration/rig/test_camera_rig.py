@@ -115,7 +115,7 @@ def test_a_rig_is_found_from_random_weights(layout: str, n: int, frames: int) ->
 def test_errors_are_as_large_as_their_std_says() -> None:
     errors = []
     for seed in range(40):
-        truth, points = scene(("ring", "line", "star")[seed % 3], 4, 40, seed=100 + seed)
+        truth, points = scene(("ring", "line", "star")[seed % 3], 6, 60, seed=100 + seed)
         rig = calibrate_rig(points, skew=False, distortion="k1k2", target="given")
         errors.append(errors_over_std(rig, truth))
     rms = np.sqrt((np.concatenate(errors) ** 2).mean())
@@ -126,7 +126,7 @@ def test_errors_are_as_large_as_their_std_says() -> None:
 def test_few_clean_rigs_are_accused() -> None:
     accused = 0
     for seed in range(60):
-        _, points = scene(("ring", "line", "star")[seed % 3], 3 + seed % 4, 30, seed=400 + seed)
+        _, points = scene(("ring", "line", "star")[seed % 3], 6 + seed % 3, 60, seed=400 + seed)
         rig = calibrate_rig(points, skew=False)
         verdict = rig.verdict
         assert verdict is not None
