@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,18 +81,20 @@ def triangulate_many(
     if poses is None or set(poses) != set(cameras):
         raise InputError("the poses are not those of the cameras; give the pose of each camera")
     names = list(cameras)
-    place = {name: k for k, name in enumerate(names)}
-    unknown = sorted(set(map(str, camera)) - set(names))
-    if unknown:
-        raise InputError(f"there is no camera {unknown[0]!r}; the cameras are {', '.join(names)}")
-    rows = np.array([place[str(name)] for name in camera], dtype=np.intp)
+    labels = np.asarray(camera, dtype=str)
+    rows = np.full(len(labels), -1, dtype=np.intp)
+    for k, name in enumerate(names):
+        rows[labels == name] = k
+    if (rows < 0).any():
+        unknown = str(labels[rows < 0][0])
+        raise InputError(f"there is no camera {unknown!r}; the cameras are {', '.join(names)}")
     point, pixels = np.asarray(point, dtype=np.intp), real_array("pixels", pixels)
     if not (point.shape == rows.shape and pixels.shape == (len(rows), 2)):
         raise InputError("point, camera and pixels must have one entry for each row")
-    key = point * len(names) + rows
-    if len(np.unique(key)) < len(key):
-        order = np.sort(key)
-        twice = int(order[1:][order[1:] == order[:-1]][0])
+    key = np.sort(point * len(names) + rows)
+    repeated = key[1:][key[1:] == key[:-1]]
+    if repeated.size:
+        twice = int(repeated[0])
         raise InputError(
             f"point {twice // len(names)} is twice in camera {names[twice % len(names)]}; a camera sees a "
             "point once"
@@ -119,8 +122,25 @@ class _Views:
     def summed(self, values: Array) -> Array:
         """Sums over the rows of each point, (M, ...) -> (n, ...)."""
         out = np.zeros((self.n, *values.shape[1:]))
-        np.add.at(out, self.point, values)
+        order, starts = self.sorted
+        if len(starts):
+            out[self.point[order[starts]]] = np.add.reduceat(values[order], starts, axis=0)
         return out
+
+    @cached_property
+    def rays(self) -> Array:
+        """(M, 3) viewing directions in the cameras' frames."""
+        rays = np.empty((len(self.point), 3))
+        for k, (camera, _) in enumerate(self.cameras):
+            mine = self.camera == k
+            rays[mine] = camera.unproject(self.pixels[mine])
+        return rays
+
+    @cached_property
+    def sorted(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The rows in the order of their points, and where each point begins."""
+        order = np.argsort(self.point, kind="stable")
+        return order, np.flatnonzero(np.diff(self.point[order], prepend=-1))
 
     def only(self, rows: NDArray[np.bool_]) -> _Views:
         return replace(self, point=self.point[rows], camera=self.camera[rows], pixels=self.pixels[rows])
@@ -128,9 +148,9 @@ class _Views:
     def nearest(self) -> Array:
         """(n, 3) the points with the smallest sum of squared distances from their rays."""
         normal, right = np.zeros((len(self.point), 3, 3)), np.zeros((len(self.point), 3))
-        for k, (camera, pose) in enumerate(self.cameras):
+        for k, (_, pose) in enumerate(self.cameras):
             mine = self.camera == k
-            rays = camera.unproject(self.pixels[mine]) @ pose.R
+            rays = self.rays[mine] @ pose.R
             across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
             normal[mine] = across
             right[mine] = across @ (-pose.R.T @ pose.t)
@@ -153,7 +173,7 @@ class _Views:
             inside = X[self.point[mine]] @ pose.R.T + pose.t
             projected, fine = camera.project(inside)
             # A pixel's ray has one side only.
-            fine = fine & ((inside * camera.unproject(self.pixels[mine])).sum(axis=1) > 0)
+            fine = fine & ((inside * self.rays[mine]).sum(axis=1) > 0)
             J[mine] = camera.project_jacobian(inside)[1] @ pose.R
             r[mine], seen[mine] = self.pixels[mine] - projected, fine
         Jt = np.swapaxes(J, 1, 2)
@@ -178,13 +198,14 @@ class _Views:
                 break
             for _ in range(_HALVINGS):
                 trial = self.linearised(X + step)
-                worse = ~(trial[2] <= cost * _RISE + _ROUNDING)
+                worse = ~(trial[2] <= cost * _RISE + _ROUNDING) & np.isfinite(cost)
                 if not worse.any():
                     break
                 step[worse] *= 0.5
-            step[worse] = 0.0
-            X = X + step
-            N, g, cost, seen = self.linearised(X)
+            else:
+                step[worse] = 0.0
+                trial = self.linearised(X + step)
+            X, (N, g, cost, seen) = X + step, trial
         count = np.bincount(self.point, minlength=self.n)
         few = count < 2
         inverse = _inverse(N)
