@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 _SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
 _FLAT_VIEWS = 10
+_RIG_FRAMES, _MOST_CAMERAS = 60, 64
 _STARTS_SIGMA = 0.5  # px
 
 
@@ -84,6 +86,14 @@ def _is_number(word: str) -> bool:
     default=50,
     least=0,
 )
+@options.path(
+    "--rig",
+    "LAYOUT:N",
+    "Simulate a rig of N cameras instead, in a line, a ring, a star or in two groups (facing), which see a "
+    "board of "
+    "6 x 5 corners in --views frames.",
+    without="one camera",
+)
 @options.flag(
     "--rates",
     "Study the two learning rates of backprop instead, on many data sets.",
@@ -115,6 +125,7 @@ def simulate(
     trials: int,
     methods: tuple[str, ...],
     random_starts: int,
+    rig: str | None,
     rates: bool,
     data_sets: int,
     seed: int,
@@ -135,6 +146,10 @@ def simulate(
     A method that needs given parameters gets the true ones: tsai the image centre and zero skew, opencv
     zero skew. Its bound is then that with fewer unknowns. Pose parameters are averaged over all views.
 
+    With --rig, a rig of many cameras is calibrated by `neurocal rig` in each trial, and the command prints
+    the errors of the cameras' places and rotations. With --save it writes the true poses and the points of
+    each camera.
+
     With --rates, the paper's trainer is run from one random start on each of many data sets, with each pair
     of a grid of learning rates.
 
@@ -148,6 +163,7 @@ def simulate(
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
       neurocal simulate --camera camera.yaml --board board.yaml --views 4 \\
           --sigma 0.2 --trials 2 --random-starts 2 --save simulated --images --jobs 1
+      neurocal simulate --rig ring:8 --views 80 --sigma 0.3 --trials 2 --save ring
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(camera, board)
@@ -164,6 +180,15 @@ def simulate(
     check_plot(plot)
     preparation.check_outputs((plot,), (camera, board))
     preparation.compute_in_one_thread()
+    if rig is not None:
+        if rates or (camera, board, plot) != (None,) * 3 or images:
+            raise UsageError(
+                "--rig makes its own cameras and board; leave out --camera, --board, --images, --plot, "
+                "--rates"
+            )
+        options.note_unused("with --rig", "methods", "random_starts", "jobs")
+        _rig(rig, views, sorted(set(sigma)), trials, seed, save, as_json)
+        return
 
     from neurocal_cli.files.processes import usable_cores
 
@@ -251,6 +276,45 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
         print_summary(rates_json(study))
     else:
         click.echo(text_of(*rates_tables(study)))
+
+
+def _rig(
+    words: str,
+    views: int | None,
+    levels: list[float],
+    trials: int,
+    seed: int,
+    save: str | None,
+    as_json: bool,
+) -> None:
+    """Study a rig of many cameras, and write its points, those of the first trial, and its poses."""
+    layout, _, count = words.partition(":")
+    if not count.isdecimal() or not 2 <= int(count) <= _MOST_CAMERAS:
+        raise UsageError(f"--rig {words}: give the layout and the number of cameras, such as ring:8")
+    import numpy as np
+
+    from neurocal_cli.commands.show.camera_rig_report import rig_study_json, rig_study_table
+    from neurocal_cli.commands.show.methods_report import text_of
+    from neurocal_cli.simulation.rigs import study_rig
+
+    with ProgressBar() as progress:
+        study = study_rig(layout, int(count), views or _RIG_FRAMES, levels, trials, seed, progress)
+    if save is not None:
+        from neurocal_cli.files.points_csv import write_points
+
+        make_folder(save)
+        poses = rig_study_json(study)["poses"]
+        write_whole(
+            os.path.join(save, "truth.json"), json.dumps({"unit": "mm", "poses": poses}, indent=2) + "\n"
+        )
+        for k, level in enumerate(levels):
+            for name, points in study.rig.points(level, np.random.default_rng((seed, k, 0))).items():
+                file = f"sigma_{str(level).removesuffix('.0')}_{name}.csv"
+                write_points(points, os.path.join(save, file))
+    if as_json:
+        print_summary(rig_study_json(study))
+    else:
+        click.echo(text_of(*rig_study_table(study)))
 
 
 def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:

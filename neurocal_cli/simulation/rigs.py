@@ -5,17 +5,20 @@ A flat board is held at random places before them; each camera sees what is in i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, rotation_step
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.geometry import Array, rotation_step, rotation_vector
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError, check_choice
+from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 
 LAYOUTS = ("line", "ring", "star", "facing")
@@ -171,3 +174,59 @@ def _placed(rig: SimulatedRig, layout: str, rng: np.random.Generator) -> Pose:
             back = pose.R.T
             return Pose(back @ R, back @ (at - R @ middle - pose.t))
     raise InputError("no camera sees the board; use a smaller one")
+
+
+@frozen_dataclass(eq=False)
+class RigStudy:
+    """Errors of rigs that were calibrated from simulated points, by the noise of the pixels."""
+
+    rig: SimulatedRig
+    sigma: tuple[float, ...]  # [px]
+    trials: int
+    rmse_px: tuple[float, ...]  # rms reprojection error [px]
+    centre: tuple[float, ...]  # rms error of the cameras' places relative to the first [mm]
+    rotation: tuple[float, ...]  # rms angle of the error of their rotations [rad]
+    over_std: tuple[float, ...]  # rms error of angles and translations over their reported std
+
+
+def study_rig(
+    layout: str,
+    n_cameras: int,
+    n_frames: int,
+    sigma: Sequence[float],
+    trials: int,
+    seed: int,
+    progress: Progress | None = None,
+) -> RigStudy:
+    """Calibrate a simulated rig from random weights, in several trials at each noise level.
+
+    Raises InputError if too few frames connect the cameras.
+    """
+    rig = random_rig(layout, n_cameras, n_frames, np.random.default_rng((seed, 2)))
+    found: list[tuple[float, ...]] = []
+    for level, noise in enumerate(sigma):
+        errors = []
+        for trial in range(trials):
+            points = rig.points(noise, np.random.default_rng((seed, level, trial)))
+            made = calibrate_rig(points, skew=False, seed=seed)
+            errors.append(_errors(made, rig))
+            if progress is not None:
+                done = level * trials + trial + 1
+                progress(f"rigs, {noise:g} px", done / (len(sigma) * trials))
+        found.append(tuple(np.sqrt((np.array(errors) ** 2).mean(axis=0)).tolist()))
+    rmse_px, centre, rotation, over_std = zip(*found, strict=True)
+    return RigStudy(rig, tuple(sigma), trials, rmse_px, centre, rotation, over_std)
+
+
+def _errors(found: CameraRig, truth: SimulatedRig) -> tuple[float, float, float, float]:
+    """Rms reprojection error, and rms errors of places, rotations, and of all over their std."""
+    places, angles, ratios = [], [], []
+    for name in list(found.cameras)[1:]:
+        pose, true = found.poses[name], truth.relative[name]
+        places.append(np.linalg.norm(pose.R.T @ pose.t - true.R.T @ true.t))
+        angles.append(np.linalg.norm(rotation_vector(pose.R @ true.R.T)))
+        turned = (pose.euler - true.euler + np.pi) % (2 * np.pi) - np.pi
+        error = np.concatenate([turned, pose.t - true.t])
+        ratios += [e / found.std[name][key] for e, key in zip(error, POSE_NAMES, strict=True)]
+    centre, rotation, over_std = (float(np.sqrt(np.mean(np.square(x)))) for x in (places, angles, ratios))
+    return found.rmse_px, centre, rotation, over_std

@@ -136,3 +136,30 @@ def test_the_rig_has_a_page(made: tuple[Path, Result], tmp_path: Path) -> None:
     text = (tmp_path / "page.html").read_text()
     for words in ("Calibration of 3 cameras", "Camera rig_cam2", "common frames", "relative to rig_cam0"):
         assert words in text
+
+
+def test_a_simulated_rig_has_the_errors_that_its_std_say(tmp_path: Path) -> None:
+    words = (
+        "simulate",
+        "--rig",
+        "line:3",
+        "--views",
+        12,
+        "--sigma",
+        0.2,
+        "--trials",
+        2,
+        "--save",
+        tmp_path / "rig",
+    )
+    said = run(*words, "--json")
+    assert said.exit_code == 0, said.stderr
+    found = json.loads(said.stdout)
+    assert found["rmse_px"][0] == pytest.approx(0.28, abs=0.03)
+    assert 0.3 < found["error_over_std"][0] < 2
+    assert {path.name for path in (tmp_path / "rig").iterdir()} == {
+        "truth.json", "sigma_0.2_cam0.csv", "sigma_0.2_cam1.csv", "sigma_0.2_cam2.csv",
+    }  # fmt: skip
+    assert "rms errors of 3 cameras in 2 trials, 12 frames" in run(*words).stdout
+    assert "such as ring:8" in run("simulate", "--rig", "ring").stderr
+    assert "layout must be" in run("simulate", "--rig", "heap:3", "--trials", 1).stderr

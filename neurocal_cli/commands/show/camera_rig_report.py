@@ -22,6 +22,7 @@ from neurocal_cli.commands.show.text import (
     verdict_lines,
 )
 from neurocal_cli.errors import plural
+from neurocal_cli.simulation.rigs import RigStudy
 
 _SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_EDGES = 20  # rows of a table that fit on a screen
@@ -172,4 +173,31 @@ def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
         },
         "frames": evaluation.frames,
         **verdict_json(evaluation.verdict),
+    }
+
+
+def rig_study_table(study: RigStudy) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Titles and rows of the table of a simulated rig, and a line below it."""
+    rows = [["sigma [px]", "rms [px]", "place [mm]", "rotation [rad]", "error / std"]]
+    columns = study.sigma, study.rmse_px, study.centre, study.rotation, study.over_std
+    for noise, rmse, centre, rotation, ratio in zip(*columns, strict=True):
+        rows.append([f"{noise:g}", f"{rmse:.4g}", f"{centre:.4g}", f"{rotation:.3g}", f"{ratio:.2f}"])
+    n, frames = len(study.rig.cameras), len(study.rig.frames)
+    title = f"rms errors of {n} cameras in {plural(study.trials, 'trial')}, {frames} frames"
+    return [(title, rows)], ["error / std is 1 where the reported standard deviations are right"]
+
+
+def rig_study_json(study: RigStudy) -> dict[str, Any]:
+    """The study of a simulated rig as JSON values."""
+    return {
+        "trials": study.trials,
+        "frames": len(study.rig.frames),
+        "sigma_px": list(study.sigma),
+        "rmse_px": list(study.rmse_px),
+        "place_mm": list(study.centre),
+        "rotation_rad": list(study.rotation),
+        "error_over_std": list(study.over_std),
+        "poses": {
+            name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
+        },
     }
