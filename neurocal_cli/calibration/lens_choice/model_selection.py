@@ -35,7 +35,7 @@ from neurocal_cli.adjustment.open_coefficients import log_prior, radius
 from neurocal_cli.adjustment.problem import Problem
 from neurocal_cli.adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.adjustment.reprojection import camera_columns, normal_blocks
-from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.adjustment.residual_correlation import point_residuals
 from neurocal_cli.adjustment.solution import Solution, is_elsewhere, of_few_views
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.lens_choice.candidate_models import (
@@ -63,8 +63,7 @@ _DECIDEDLY = 1.03
 _FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
 _WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
 _MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
-_CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
-_BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
+_BETTER = 0.999  # ratio of squared errors below which another start is better
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
 # Nested models: each has the coefficients of the previous one and more.
@@ -148,16 +147,12 @@ def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
     """Squared error below which the result of another start is accepted; 0: no other start is needed.
 
     It is infinite if free networks fit far better or no model is sound. If a focal length is poorly
-    determined, another start must be better; if neighbouring residuals are correlated (as also on a board
-    that is not flat), much better.
+    determined, another start must be better.
     """
     if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
         return np.inf
     closest = min(fitted.values(), key=lambda c: c.cost)
-    if closest.weak:
-        return _BETTER * closest.cost
-    alike = correlation(views, point_residuals(views, closest.adjusted.state)) > _CORRELATED
-    return _MUCH_BETTER * closest.cost if alike else 0.0
+    return _BETTER * closest.cost if closest.weak else 0.0
 
 
 def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
