@@ -15,6 +15,7 @@ from neurocal_cli.adjustment.problem import Problem, problem_for
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.calibration import Calibration, Rejected, undistorted_before
 from neurocal_cli.calibration.fit import fit
+from neurocal_cli.calibration.lens_choice.skew import shows_skew
 from neurocal_cli.calibration.result import calibration_of, with_given_covariance
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
@@ -36,6 +37,7 @@ METHODS = ("neuro", "linear", "nonlinear", "tsai")
 TRAINERS = ("lm", "backprop")
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = ("reject", "keep")
+SKEWS = ("free", "fixed", "auto")
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
@@ -55,7 +57,7 @@ def calibrate(
     method: str = "neuro",
     trainer: str = "lm",
     distortion: str = "auto",
-    skew: bool = True,
+    skew: bool | str = True,
     outliers: str = "reject",
     seed: int = 0,
     *,
@@ -91,8 +93,8 @@ def calibrate(
         simplest model that the points support (`lens_choice`); with the methods linear and nonlinear it is
         none, with tsai k1. "plumb-line", the paper's way, estimates k1, k2, p1 and p2 from the images of
         straight lines alone, then the pinhole camera. Type 3 uses the distortion of the given camera.
-    skew : bool
-        False fixes theta at pi/2.
+    skew : bool or {"free", "fixed", "auto"}
+        False or "fixed" holds theta at pi/2; "auto" does so unless the points show that it is another angle.
     outliers : {"reject", "keep"}
         Whether points and whole views that contradict the others are left out (`outlier_rejection`).
     seed : int
@@ -130,8 +132,10 @@ def calibrate(
     _check_options(method, trainer, distortion, outliers, choice, starts, seed)
     if preferred:
         check_choice("preferred", preferred, tuple(MODELS))
-    if skew not in (True, False):
-        raise UsageError(f"skew must be True or False, not {skew!r}")
+    if skew not in (True, False, *SKEWS):
+        raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
+    if skew == "auto" and method != "neuro":
+        raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
     if backprop is not None and trainer != "backprop":
         raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
     if known_target is not None:
@@ -154,7 +158,7 @@ def calibrate(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
     )
     try:
-        problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
+        problem = problem_for(points, type, image_center, known, extrinsics, skew in (True, "free"), model)
         if method != "neuro":
             from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
 
@@ -163,6 +167,9 @@ def calibrate(
             warnings = _unused(points, f"the method is {method}")
         else:
             solution, rejected = _solved(problem, options, outliers, choice)
+            if skew == "auto" and not type_3 and shows_skew(solution):
+                skewed = problem_for(points, type, image_center, known, extrinsics, True, model)
+                solution, rejected = _solved(skewed, options, outliers, choice)
             if known_target is not None:
                 solution = replace(solution, target=known_target)
             if solution.refusal:

@@ -40,6 +40,7 @@ class Estimation:
     rate_gamma: float | None
     distortion: str
     no_skew: bool
+    skew: str
     outliers: str
     target: str
 
@@ -52,6 +53,14 @@ class Estimation:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
+        if self.no_skew and self.skew != "free":
+            raise UsageError(f"--no-skew is --skew fixed, but --skew is {self.skew}; give one of them")
+        if self.skew == "auto" and self.method != "neuro":
+            raise UsageError(
+                f"--skew auto needs --method neuro, but the method is {self.method}; leave it out"
+            )
+        if self.type == "3" and self.skew != "free":
+            raise UsageError("--type 3 does not change the given camera; leave out --skew")
         if self.type == "3" and self.no_skew:
             raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
         if self.type == "3" and self.distortion not in ("auto", "none"):
@@ -81,7 +90,7 @@ class Estimation:
                 note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {name: getattr(self, name) for name in _SAME}
-        arguments |= {"type": int(self.type), "skew": not self.no_skew}
+        arguments |= {"type": int(self.type), "skew": "fixed" if self.no_skew else self.skew}
         values = {to: getattr(self, name) for name, to in _BACKPROP.items()}
         if given := {to: value for to, value in values.items() if value is not None}:
             from neurocal_cli.network.backprop import BackpropOptions
@@ -211,6 +220,7 @@ _OPTIONS = [
         default="auto",
     ),
     options.no_skew,
+    options.skew,
     options.choice(
         "--outliers",
         "reject keep",

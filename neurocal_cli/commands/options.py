@@ -315,6 +315,14 @@ no_skew = flag(
     "--no-skew", "Fix the angle between the image axes at 90 degrees.", without="estimate the angle"
 )
 
+skew = choice(
+    "--skew",
+    "free fixed auto",
+    "Angle between the image axes: free estimates it, fixed holds it at 90 degrees as --no-skew does, auto "
+    "estimates it only where the points show that it is another angle.",
+    default="free",
+)
+
 interpolation = choice(
     "--interpolation",
     "nearest linear cubic lanczos",

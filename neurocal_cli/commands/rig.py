@@ -124,7 +124,7 @@ def rig(
           --image-size 1280 960 --distortion k1k2 --method neuro --starts 40 \\
           --seed 1 > rig.yaml
       neurocal rig sample_data/rig_cam*.csv --type 2 --image-center 639.5 479.5 \\
-          -o rig.yaml
+          --skew auto -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --trainer backprop --epochs 20000 --rate 0.05 \\
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
@@ -165,6 +165,7 @@ def rig(
                 intrinsics=given_cameras[name],
                 image_center=None,
                 no_skew=False,
+                skew="free",
                 distortion="none",
             )
         points[name], camera_options[name] = own.prepare(one)

@@ -94,7 +94,8 @@ def stereo(
           --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          --type 2 --image-center 319.5 239.5 --json -o rig.yaml
+          --type 2 --image-center 319.5 239.5 --skew auto --json \\
+          -o rig.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
@@ -106,7 +107,13 @@ def stereo(
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     if left_intrinsics is not None and right_intrinsics is not None:
-        known = ("no_skew", "distortion", "image_center", *(["type"] if estimation.type == "2" else []))
+        known = (
+            "no_skew",
+            "skew",
+            "distortion",
+            "image_center",
+            *(["type"] if estimation.type == "2" else []),
+        )
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
     preparation.check_one_stdin(*inputs)
@@ -155,5 +162,11 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
             )
         return estimation
     return replace(
-        estimation, type="3", intrinsics=intrinsics, image_center=None, no_skew=False, distortion="none"
+        estimation,
+        type="3",
+        intrinsics=intrinsics,
+        image_center=None,
+        no_skew=False,
+        skew="free",
+        distortion="none",
     )
