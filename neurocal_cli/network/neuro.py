@@ -117,6 +117,12 @@ def _camera_and_poses(problem: Problem, options: Options, rng: np.random.Generat
                 record = replace(record, starts=record.starts + found.starts)
                 best = try_start(problem, best, found.state)
     refuse_mirrored(problem, best, groups)
+    late = record.agreed < 2
+    if late.any() and 2 * late.sum() < len(late):
+        # Noise in few points can have a product that puts some of them behind the camera; the camera of the
+        # other views then finds the pose.
+        state, record = _with_random_poses(problem.views, best.state, record, late, rng, options.starts)
+        best = try_start(problem, best, state)
     return best, record
 
 

@@ -38,17 +38,25 @@ _ENOUGH = 3  # starts at the same, lowest loss with which training ends
 # Repeated by test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
 # which depths keep all points in front of the first camera.
 _MOST_CANDIDATES = 4
+_LEAST_VIEWS = 3  # whose products determine W without those of views that have no spare point
 _NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
 
 
 def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
-    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
+    """Candidates for W's entries, the minima of the views' orthogonality conditions; best first (C, 1, 5).
+
+    The product of a view without a spare point takes in all of its noise, so it is used only if few others
+    are there.
+    """
+    spare = [problem.views.distinct[group.views] > (4 if group.flat else 6) for group in groups]
+    enough = sum(int(some.sum()) for some in spare) >= max(_LEAST_VIEWS, problem.views.n_views / 2)
     flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
-    for group in groups:
+    for group, some in zip(groups, spare, strict=True):
+        product = group.product[some] if enough else group.product
         if group.flat:
-            flat = group.product[:, :, :2]
+            flat = product[:, :, :2]
         else:
-            solid = group.product[:, :, :3]
+            solid = product[:, :, :3]
     shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
     return shared.entries[:_MOST_CANDIDATES, None]
 

@@ -274,6 +274,20 @@ def test_views_of_all_sizes(seed: int, skew: bool) -> None:
     close(pinhole(scene.points(), skew=skew, seed=seed), scene)
 
 
+@pytest.mark.parametrize("seed", slow_but((0, 5), range(12)))
+def test_a_view_whose_product_is_noise_does_not_spoil_the_camera(seed: int) -> None:
+    # Three of four points are nearly on a line: noise decides which product they have.
+    true = BOARD[[0, 1, 2, 11]] - [[0, 0, 0], [0, 0.1, 0], [0, 0, 0], [0, 0, 0]]
+    scene = several([*[BOARD] * 6, true], 0.1, seed)
+    given = scene.world.copy()
+    given[-3, 1] += 0.2
+    cal = pinhole(replace(scene, world=given).points(), skew=False, seed=seed)
+    assert cal.converged
+    for name in INTRINSIC_NAMES:
+        error = abs(getattr(cal.intrinsics, name) - getattr(scene.intrinsics, name))
+        assert error <= 6 * cal.std[name] + 1e-9, name
+
+
 @pytest.mark.parametrize("type", [1, 2])
 @pytest.mark.parametrize("seed", slow_but((0,), range(3)))
 def test_flat_and_folded_views_together(seed: int, type: int) -> None:
