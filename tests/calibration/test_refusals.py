@@ -317,7 +317,7 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
         ({"trainer": "adam"}, "trainer must be one of lm, backprop, not 'adam'"),
         ({"distortion": "round"}, "distortion must be one of auto"),
         ({"outliers": "eat"}, "outliers must be one of reject"),
-        ({"skew": "no"}, "skew must be True or False, not 'no'"),
+        ({"skew": "no"}, "skew must be True, False or one of free, fixed, auto, not 'no'"),
         ({"preferred": "round"}, "preferred must be one of none, k1"),
         ({"backprop": BackpropOptions()}, "backprop needs the trainer backprop, but the trainer is lm"),
         ({"type": 7}, "type must be 1, 2, 3 or 4"),

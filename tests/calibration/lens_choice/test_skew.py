@@ -43,9 +43,9 @@ def test_another_angle_is_estimated() -> None:
 def test_the_words_are_those_of_true_and_false() -> None:
     points = flat(1)
     for word, value in (("free", True), ("fixed", False)):
-        assert pytest.approx(
-            calibrate(points, skew=value, **KNOWN).K
-        ) == calibrate(points, skew=word, **KNOWN).K
+        assert (
+            pytest.approx(calibrate(points, skew=value, **KNOWN).K) == calibrate(points, skew=word, **KNOWN).K
+        )
     with pytest.raises(UsageError, match="skew must be True, False or one of free, fixed, auto"):
         calibrate(points, skew="maybe")
     with pytest.raises(UsageError, match="skew auto needs the method neuro"):
