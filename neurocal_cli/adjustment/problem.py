@@ -6,8 +6,8 @@ Type 4: the extrinsics, V. Adjustments work in normalised units; `in_pixels` and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ _LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's m
 _LARGEST = 1e9  # px; no image is larger
 # Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
 _RIM, _HALVINGS = 0.02, 30
+_PLACES = {"alpha_u": 0, "alpha_v": 2, "u0": 3, "v0": 4}  # among A's entries, if theta is a right angle
+_HOLDING = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")  # models whose coefficients can be fixed
 
 
 @frozen_dataclass(eq=False)
@@ -51,6 +53,8 @@ class Problem:
     # Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's prior,
     # which holds for any points.
     penalty: Penalty | None = None
+    # Values of the distortion coefficients that are given one by one.
+    held: Mapping[str, float] = field(default_factory=dict)
     # If a given wide lens is removed, each view has a pinhole that looks at its target: rotations (V, 3, 3)
     # from the camera's frame to that pinhole's. None after `with_seen_pixels`.
     turned: Array | None = None
@@ -85,7 +89,7 @@ class Problem:
     @property
     def given_centre(self) -> Array | None:
         """(2,) the image centre [px] if it is given, else None."""
-        return None if self.free[3] else self.entries[3:]
+        return None if self.free[3:].any() else self.entries[3:]
 
     @property
     def normalised_entries(self) -> Array:
@@ -113,10 +117,12 @@ class Problem:
     def with_model(self, model: str) -> Problem:
         """The same points with another distortion model to estimate."""
         # Fixed coefficients belong to the previous model.
-        fixed = self.fixed & set(INTRINSIC_NAMES)
+        held = self.held if model == self.distortion.model else {}
+        fixed = self.fixed & {*INTRINSIC_NAMES, *held}
         return replace(
-            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, penalty=None
-        )
+            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, penalty=None,
+            held=held,
+        )  # fmt: skip
 
     def with_seen_pixels(self) -> Problem:
         """The same problem with the observed (distorted) pixels, normalised as before."""
@@ -149,6 +155,10 @@ class Problem:
         if self.free_distortion and state.model == "none":
             model = self.distortion.model
             state = replace(state, model=model, k=pinhole_coefficients(model))
+        if self.held and state.model == self.distortion.model:
+            names = coefficient_names(state.model)
+            k = [self.held.get(name, value) for name, value in zip(names, state.k.tolist(), strict=True)]
+            state = replace(state, k=np.array(k))
         free = self.free if state.model == "none" else self.free_camera
         adjusted = adjust(
             self.views.batches, state, free, self.free_poses, max_iterations, self.penalty, damping
@@ -164,11 +174,12 @@ def problem_for(
     extrinsics: Mapping[str, Pose] | None = None,
     skew: bool = True,
     distortion: Distortion | None = None,
+    fix: Mapping[str, float] | None = None,
 ) -> Problem:
     """State a problem; check that the given parameters are those of its type.
 
-    `image_center`, `intrinsics`, `extrinsics` and `skew` are as for `calibrate`. `distortion` is the given
-    one with type 3, else the model to be estimated.
+    `image_center`, `intrinsics`, `extrinsics`, `skew` and `fix` are as for `calibrate`. `distortion` is the
+    given one with type 3, else the model to be estimated.
 
     Raises UsageError if the type does not exist, a parameter that it needs is missing, or one that it does
     not use is given. Raises InputError if there are no points, a value is not finite, the extrinsics lack a
@@ -210,12 +221,45 @@ def problem_for(
     elif type == 4:
         poses = _poses(points, extrinsics)
     distortion = distortion or Distortion()
+    held: dict[str, float] = {}
+    for name, number in (fix or {}).items():
+        _check_fixed(name, number, fixed, type, skew, distortion.model)
+        fixed.add(name)
+        if name in _PLACES:
+            entries[_PLACES[name]], free[_PLACES[name]] = number, False
+        else:
+            held[name] = float(number)
     free_distortion = type != 3 and distortion.model != "none"
     if type == 3:
         fixed |= set(coefficient_names(distortion.model))
     views, turned = _views_of(points, distortion, entries, free_distortion)
     given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
-    return Problem(points, views, *given, turned=turned)
+    return Problem(points, views, *given, held=held, turned=turned)
+
+
+def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, skew: bool, model: str) -> None:
+    """Refuse a parameter that cannot be given by itself."""
+    if name == "theta":
+        raise UsageError("theta is fixed at a right angle only; give skew=False (--skew fixed) for it")
+    if name in fixed or type == 3:
+        raise UsageError(f"type {type} gives {name} already; leave out one of them")
+    if name == "alpha_v" and skew:
+        raise UsageError(
+            "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
+        )
+    if name not in _PLACES and not (model in _HOLDING and name in coefficient_names(model)):
+        names = ", ".join((*_PLACES, *(coefficient_names(model) if model in _HOLDING else ())))
+        raise UsageError(
+            f"{name} cannot be fixed with the distortion model {model}, but {names} can; for coefficients "
+            f"name one of the models {', '.join(_HOLDING)}"
+        )
+    least = 1 / _LARGEST if name.startswith("alpha") else -_LARGEST
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float, np.number))
+        or not least < value < _LARGEST
+    ):
+        raise InputError(f"{name} is fixed at {value!r}, which no camera has; correct it")
 
 
 def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:

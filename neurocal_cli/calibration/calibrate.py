@@ -63,6 +63,7 @@ def calibrate(
     *,
     target: str | Target = "auto",
     preferred: str = "",
+    fix: Mapping[str, float] | None = None,
     starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
@@ -107,6 +108,9 @@ def calibrate(
     preferred : str
         With ``distortion="auto"``, a model to select unless another predicts decidedly better, such as that
         of the other camera of a rig.
+    fix : dict of float by name, optional
+        Parameters that are known, and stay as they are: alpha_u, alpha_v, u0, v0 [px], and coefficients of a
+        named distortion model.
     starts : int
         Most random starts for each network, at least 2.
     backprop : BackpropOptions, optional
@@ -136,6 +140,12 @@ def calibrate(
         raise UsageError(f"skew must be True, False or one of {', '.join(SKEWS)}, not {skew!r}")
     if skew == "auto" and method != "neuro":
         raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
+    if fix and method != "neuro":
+        raise UsageError(f"fix needs the method neuro, but the method is {method}; leave it out")
+    if fix and "alpha_v" in fix and skew not in (False, "fixed"):
+        raise UsageError(
+            "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
+        )
     if backprop is not None and trainer != "backprop":
         raise UsageError(f"backprop needs the trainer backprop, but the trainer is {trainer}; leave it out")
     if known_target is not None:
@@ -158,7 +168,9 @@ def calibrate(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
     )
     try:
-        problem = problem_for(points, type, image_center, known, extrinsics, skew in (True, "free"), model)
+        problem = problem_for(
+            points, type, image_center, known, extrinsics, skew in (True, "free"), model, fix
+        )
         if method != "neuro":
             from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
 
@@ -168,7 +180,7 @@ def calibrate(
         else:
             solution, rejected = _solved(problem, options, outliers, choice)
             if skew == "auto" and not type_3 and shows_skew(solution):
-                skewed = problem_for(points, type, image_center, known, extrinsics, True, model)
+                skewed = problem_for(points, type, image_center, known, extrinsics, True, model, fix)
                 solution, rejected = _solved(skewed, options, outliers, choice)
             if known_target is not None:
                 solution = replace(solution, target=known_target)

@@ -15,7 +15,7 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, StraightLines, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.measured_directions import equations
@@ -257,6 +257,13 @@ class Calibration:
     def projections(self) -> dict[str, Array]:
         """(3, 4) matrix P = A [R | t] of each view, paper eq. (1)."""
         return {name: self.K @ view.pose.D for name, view in self.views.items()}
+
+
+def fixed_intrinsics(calibration: Calibration) -> dict[str, float]:
+    """The intrinsic parameters that were given one by one, without those that the type gives, and theta."""
+    of_type = {1: (), 2: ("u0", "v0"), 3: INTRINSIC_NAMES, 4: ()}[calibration.type]
+    names = calibration.fixed & set(INTRINSIC_NAMES) - {"theta", *of_type}
+    return {name: float(getattr(calibration.intrinsics, name)) for name in sorted(names)}
 
 
 def free_entries(calibration: Calibration, held: Collection[str] = ()) -> NDArray[np.bool_]:

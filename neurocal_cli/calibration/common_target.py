@@ -11,7 +11,7 @@ from neurocal_cli.adjustment.adjust import Adjusted
 from neurocal_cli.adjustment.board.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.adjustment.board.surveyed import find_surveyed
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
-from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.calibration import Calibration, fixed_intrinsics
 from neurocal_cli.calibration.lens_choice.model_selection import (
     find_lens_and_target,
     named_lens_is_too_simple,
@@ -70,6 +70,7 @@ def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
         intrinsics=given if calibration.type == 3 else None,
         skew="theta" not in calibration.fixed or calibration.type == 3,
         distortion=calibration.camera.distortion,
+        fix=fixed_intrinsics(calibration),
     ).with_seen_pixels()
     problem = replace(problem, fixed=problem.fixed | calibration.fixed)
     state = calibration.state(problem.views.names)
@@ -89,7 +90,7 @@ def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
     fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
     if choice == "given" or fixed:
         return False
-    if choice == "auto" and any(camera.type != 1 for camera in cameras):
+    if choice == "auto" and any(camera.type != 1 or fixed_intrinsics(camera) for camera in cameras):
         return False  # a wrong given parameter would be absorbed by the target's shape
     n_views = sum(len(camera.views) for camera in cameras)
     return views_suffice([camera.points for camera in cameras], cameras[0].target, n_views)

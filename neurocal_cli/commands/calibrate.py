@@ -59,6 +59,8 @@ def calibrate(
       neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480 \\
           --lean -o camera.json
       neurocal calibrate sample_data/flat.csv --target free --skew auto -o camera.yaml
+      neurocal calibrate sample_data/flat.csv --fix u0=321.8 --fix theta=90
+      neurocal calibrate sample_data/flat.csv --distortion plumb_bob --fix k3=0
       neurocal calibrate sample_data/points.csv --type 2 --image-center 172 121
       neurocal calibrate sample_data/stereo_left.csv --type 3 \\
           --intrinsics camera.yaml -o poses.yaml

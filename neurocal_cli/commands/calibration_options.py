@@ -41,6 +41,7 @@ class Estimation:
     distortion: str
     no_skew: bool
     skew: str
+    fix: options.Named
     outliers: str
     target: str
 
@@ -65,6 +66,11 @@ class Estimation:
             raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
         if self.type == "3" and self.distortion not in ("auto", "none"):
             raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
+        if self.fix and self.method != "neuro":
+            raise UsageError(f"--fix needs --method neuro, but the method is {self.method}; leave it out")
+        if self.type == "3" and self.fix:
+            raise UsageError("--type 3 does not change the given camera; leave out --fix")
+        self._fixed()
         if self.trainer != "lm" and self.method != "neuro":
             raise UsageError(
                 f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
@@ -75,6 +81,22 @@ class Estimation:
             options.note_unused(f"with --method {self.method}", *unused)
         for name in _BACKPROP:
             self._require(name, "trainer", "backprop")
+
+    def _fixed(self) -> dict[str, float]:
+        """The values of ``--fix`` by name; theta in degrees."""
+        fixed: dict[str, float] = {}
+        for name, text in self.fix:
+            try:
+                value = float(text)
+            except ValueError:
+                raise UsageError(f"--fix {name}={text}: the value is no number; correct it") from None
+            if fixed.setdefault(name, value) != value:
+                raise UsageError(f"--fix gives {name} twice, and differs; keep one")
+        if fixed.get("theta", 90.0) != 90.0:
+            raise UsageError("--fix theta: the angle between the image axes is fixed at 90 degrees only")
+        if "theta" in fixed and self.skew == "auto":
+            raise UsageError("--fix theta=90 is --skew fixed, but --skew is auto; give one of them")
+        return fixed
 
     def _require(self, name: str, other: str, wanted: str) -> None:
         """Refuse an option that is given, but needs another value of the other option."""
@@ -90,7 +112,11 @@ class Estimation:
                 note(f"--image-size is used instead of the image_size in {points.source}")
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {name: getattr(self, name) for name in _SAME}
-        arguments |= {"type": int(self.type), "skew": "fixed" if self.no_skew else self.skew}
+        fix = self._fixed()
+        right_angle = self.no_skew or fix.pop("theta", None) is not None
+        arguments |= {"type": int(self.type), "skew": "fixed" if right_angle else self.skew}
+        if fix:
+            arguments["fix"] = fix
         values = {to: getattr(self, name) for name, to in _BACKPROP.items()}
         if given := {to: value for to, value in values.items() if value is not None}:
             from neurocal_cli.network.backprop import BackpropOptions
@@ -221,6 +247,7 @@ _OPTIONS = [
     ),
     options.no_skew,
     options.skew,
+    options.fix,
     options.choice(
         "--outliers",
         "reject keep",

@@ -6,7 +6,7 @@ Commands use them as ``@options.path(...)``, so that options with the same meani
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import partial, wraps
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 F = TypeVar("F", bound=Callable[..., Any])
+Named = tuple[tuple[str, str], ...]  # values of an option NAME=VALUE that can be repeated
 
 
 class _Place(click.Path):
@@ -311,6 +312,18 @@ seed = count(
     "--seed", "S", "Seed of the random weights. The same seed gives the same output.", default=0, least=0
 )
 
+
+def pairs(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Named:
+    """Values of an option NAME=VALUE that can be repeated."""
+    found = []
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise click.BadParameter(f"{word!r} is not {param.metavar}.")
+        found.append((name, value))
+    return tuple(found)
+
+
 no_skew = flag(
     "--no-skew", "Fix the angle between the image axes at 90 degrees.", without="estimate the angle"
 )
@@ -321,6 +334,16 @@ skew = choice(
     "Angle between the image axes: free estimates it, fixed holds it at 90 degrees as --no-skew does, auto "
     "estimates it only where the points show that it is another angle.",
     default="free",
+)
+
+fix = click.option(
+    "--fix",
+    metavar="NAME=VALUE",
+    multiple=True,
+    callback=pairs,
+    show_default="none",
+    help="A parameter that is known and stays as it is: alpha_u, alpha_v, u0, v0 [px], theta=90 [degrees], "
+    "or a coefficient of the model that --distortion names, such as k3=0. It can be repeated.",
 )
 
 interpolation = choice(

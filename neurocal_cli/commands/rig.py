@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -14,19 +13,6 @@ from neurocal_cli.commands.calibration_options import Estimation, estimation_opt
 from neurocal_cli.commands.pages import check_plot, html_option, plot_option, write_page, write_plot
 from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
 from neurocal_cli.errors import UsageError
-
-Named = tuple[tuple[str, str], ...]  # camera and value
-
-
-def _pairs(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Named:
-    """Values of an option NAME=VALUE that can be repeated."""
-    found = []
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise click.BadParameter(f"{word!r} is not NAME=VALUE, such as cam0={param.metavar!s}")
-        found.append((name, value))
-    return tuple(found)
 
 
 class _Command(options.Command):
@@ -58,7 +44,7 @@ class _Command(options.Command):
     "known",
     metavar="NAME=CAMERA.yaml",
     multiple=True,
-    callback=_pairs,
+    callback=options.pairs,
     show_default="none",
     help="A camera that is known: a neurocal, ROS or OpenCV file. Only its poses are estimated. It can be "
     "repeated.",
@@ -68,7 +54,7 @@ class _Command(options.Command):
     "models",
     metavar="NAME=MODEL",
     multiple=True,
-    callback=_pairs,
+    callback=options.pairs,
     show_default="as --distortion",
     help="The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
 )
@@ -80,8 +66,8 @@ class _Command(options.Command):
 @options.output("RIG.yaml", "Write the rig to this file.")
 def rig(
     files: tuple[str, ...],
-    known: Named,
-    models: Named,
+    known: options.Named,
+    models: options.Named,
     estimation: Estimation,
     plot: str | None,
     html: str | None,
@@ -125,6 +111,7 @@ def rig(
           --seed 1 > rig.yaml
       neurocal rig sample_data/rig_cam*.csv --type 2 --image-center 639.5 479.5 \\
           --skew auto -o rig.yaml
+      neurocal rig sample_data/rig_cam*.csv --fix theta=90 --fix v0=479.5 -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --trainer backprop --epochs 20000 --rate 0.05 \\
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
@@ -166,6 +153,7 @@ def rig(
                 image_center=None,
                 no_skew=False,
                 skew="free",
+                fix=(),
                 distortion="none",
             )
         points[name], camera_options[name] = own.prepare(one)

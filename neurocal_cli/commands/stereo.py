@@ -97,6 +97,8 @@ def stereo(
           --type 2 --image-center 319.5 239.5 --skew auto --json \\
           -o rig.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --distortion k1k2 --fix k2=0 --fix theta=90 -o rig.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
@@ -110,6 +112,7 @@ def stereo(
         known = (
             "no_skew",
             "skew",
+            "fix",
             "distortion",
             "image_center",
             *(["type"] if estimation.type == "2" else []),
@@ -168,5 +171,6 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
         image_center=None,
         no_skew=False,
         skew="free",
+        fix=(),
         distortion="none",
     )

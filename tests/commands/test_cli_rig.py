@@ -61,7 +61,7 @@ def test_names_known_cameras_and_models_of_single_cameras(tmp_path: Path) -> Non
         ((SAMPLES[0],), "two cameras or more"),
         ((*SAMPLES, "--type", "3"), "--intrinsics NAME=CAMERA.yaml"),
         ((*SAMPLES, "--intrinsics", "x=y.yaml"), "there is no camera 'x'"),
-        ((*SAMPLES, "--intrinsics", "y.yaml"), "is not NAME=VALUE"),
+        ((*SAMPLES, "--intrinsics", "y.yaml"), "is not NAME=CAMERA.yaml"),
         ((*SAMPLES, "--distortion", "rig_cam0=k7"), "k7"),
         (("-", "-"), "standard input (-) can be read only once"),
         ((*SAMPLES, "--plot", "rig.txt"), "not a picture file"),

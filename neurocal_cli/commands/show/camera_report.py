@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.calibration import Calibration, Verdict, fixed_intrinsics
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.pinhole import POSE_NAMES
@@ -44,8 +44,13 @@ _GIVEN = {
 def calibration_report(calibration: Calibration) -> str:
     """Summary of a calibration: parameters, views, fit, training and verdict, without the warnings."""
     size, points = calibration.image_size, calibration.points
+    given = _GIVEN[calibration.type]
+    if fixed := fixed_intrinsics(calibration):
+        given = (
+            f"{given} but {', '.join(fixed)}" if calibration.type == 1 else f"{given}, and {', '.join(fixed)}"
+        )
     headline = (
-        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]}), "
+        f"{printable(calibration.camera_name)}: type {calibration.type} ({given}), "
         f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
         f"{'image size unknown' if size is None else f'{size[0]} x {size[1]} px'}"
     )
