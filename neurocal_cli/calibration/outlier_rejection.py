@@ -58,6 +58,7 @@ from neurocal_cli.observations.target import distinct_points
 _EXACT = 1e-9  # of the pixels' spread: rms errors below this are rounding
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
+_LITTLE = 0.05  # share of the points that can change without another minimum being the lowest
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _FITS = 4.0  # standard deviations of a view's squared error: one that fits so well is not wrong
 _MAJORITY = 0.5  # share of the points that must be left
@@ -338,7 +339,8 @@ def _all_judged(
         if (kept.mask == last.mask).all():
             break
         _refuse_few(points, kept)
-        solution = fit_again(solution, points.select(kept.mask), options)
+        near = int((kept.mask != last.mask).sum()) <= _LITTLE * int(last.mask.sum())
+        solution = fit_again(solution, points.select(kept.mask), options, only_from_here=near)
         if kept.mask.tobytes() in known:  # a cycle: a point near the limit is alternately kept and rejected
             break
         known.add(kept.mask.tobytes())
