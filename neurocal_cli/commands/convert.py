@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 )
 @options.choice(
     "--to",
-    "neurocal opencv ros kalibr colmap mrcal matlab json npz",
+    "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt",
     "Format to write.",
     without="required",
     to="target",
@@ -88,6 +88,8 @@ def convert(
       matlab    .mat file with a struct for cameraParameters
       json      dictionary with OpenCV's names
       npz       the same for NumPy
+      dlt       11 rows of DLT coefficients, a column for each camera of a
+                rig (X, Y, Z as in the first view), or for each view
 
     If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
     differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs
@@ -107,6 +109,7 @@ def convert(
       neurocal convert camera.npz --to kalibr --force --unit mm \\
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
+      neurocal convert camera.yaml --to dlt -o dlt.csv
       neurocal calibrate sample_data/fisheye.csv --no-skew -o fisheye.yaml
       neurocal convert fisheye.yaml --to ros --model rational --json \\
           -o rational.yaml

@@ -25,7 +25,8 @@ from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)
-HOLDS = {name: target.models for name, target in FORMATS.items()}
+READ = {name: target for name, target in FORMATS.items() if name != "dlt"}  # a DLT is written only
+HOLDS = {name: target.models for name, target in READ.items()}
 POSES = {
     f"view{k}.png": Pose.from_euler(0.1 * k, 3.0 - 0.2 * k, -0.3, np.array([k, -2.0, 700.0 + k]))
     for k in range(3)
@@ -84,7 +85,7 @@ def test_a_camera_comes_back_from_each_format_as_it_was(target: str, model: str,
         same(read_intrinsics(written(given, target, tmp_path, ending)[0]), given.cameras[0])
 
 
-@pytest.mark.parametrize("target", FORMATS)
+@pytest.mark.parametrize("target", READ)
 def test_a_rig_comes_back_from_each_format_as_it_was(target: str, tmp_path: Path) -> None:
     left, right = lens("k1k2p1p2", name="left"), lens("none", name="right")
     given = CameraSet((left, replace(right, intrinsics=Intrinsics(700, 690, 300, 250))), (RIGHT,), unit="mm")
@@ -96,7 +97,7 @@ def test_a_rig_comes_back_from_each_format_as_it_was(target: str, tmp_path: Path
         assert found.unit == "m"
 
 
-@pytest.mark.parametrize("target", [name for name, target in FORMATS.items() if target.poses])
+@pytest.mark.parametrize("target", [name for name, target in READ.items() if target.poses])
 def test_the_poses_of_views_come_back_from_each_format_that_has_them(target: str, tmp_path: Path) -> None:
     found = read_back(written(CameraSet((lens("k1k2p1p2"),), (), POSES, "mm"), target, tmp_path))
     assert list(found.poses) == list(POSES)
@@ -120,7 +121,7 @@ def test_a_chain_of_four_cameras_goes_through_kalibr_colmap_and_mrcal(tmp_path: 
 @given(
     turn=st.tuples(*[st.floats(-3.1, 3.1)] * 3),
     shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
-    target=st.sampled_from([n for n in FORMATS if n not in ("neurocal", "ros")]),
+    target=st.sampled_from([n for n in READ if n not in ("neurocal", "ros")]),
 )
 def test_any_pose_between_two_cameras_comes_back(
     turn: tuple[float, float, float],
@@ -247,7 +248,7 @@ def test_what_is_not_known_is_refused_and_not_guessed(text: str, tmp_path: Path)
 
 @settings(max_examples=60, deadline=None)
 @given(
-    target=st.sampled_from(list(FORMATS)),
+    target=st.sampled_from(list(READ)),
     start=st.floats(0, 1),
     length=st.integers(0, 30),
     junk=st.binary(max_size=6),

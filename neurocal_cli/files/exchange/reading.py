@@ -11,7 +11,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.camera_tree import boofcv_camera
-from neurocal_cli.files.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
+from neurocal_cli.files.exchange import colmap, dictionary, dlt, kalibr, matlab, mrcal, neurocal, ros
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.files.failures import source_of, value_failures
 from neurocal_cli.files.file_storage import parse_tree
@@ -29,6 +29,7 @@ FORMATS: dict[str, Format] = {
     "matlab": matlab.FORMAT,
     "json": dictionary.JSON,
     "npz": dictionary.NPZ,
+    "dlt": dlt.FORMAT,
 }
 _COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 
