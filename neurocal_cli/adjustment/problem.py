@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import OPTIONS, Adjusted, Penalty, adjust
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_to_axis
@@ -155,6 +156,9 @@ class Problem:
         if self.free_distortion and state.model == "none":
             model = self.distortion.model
             state = replace(state, model=model, k=pinhole_coefficients(model))
+        if not self.free[[0, 2]].all() and self.type != 3:  # another model may have begun with another alpha
+            entries = np.where(self.free, state.entries, self.normalised_entries)
+            state = replace(state, entries=entries)
         if self.held and state.model == self.distortion.model:
             names = coefficient_names(state.model)
             k = [self.held.get(name, value) for name, value in zip(names, state.k.tolist(), strict=True)]
@@ -246,6 +250,11 @@ def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, ske
     if name == "alpha_v" and skew:
         raise UsageError(
             "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
+        )
+    if name.startswith("alpha") and model in WIDE and model != "fisheye":
+        raise UsageError(
+            f"{name} cannot be fixed with the distortion model {model}, which scales it by other parameters; "
+            "name fisheye or a model for ordinary lenses"
         )
     if name not in _PLACES and not (model in _HOLDING and name in coefficient_names(model)):
         names = ", ".join((*_PLACES, *(coefficient_names(model) if model in _HOLDING else ())))

@@ -76,6 +76,18 @@ def test_coefficients_stay_at_their_values() -> None:
     assert found.converged
 
 
+def test_a_wide_lens_keeps_a_given_focal_length() -> None:
+    points = read_points(SAMPLES / "fisheye.csv")
+    free = calibrate(points, skew=False)
+    value = free.intrinsics.alpha_u + 0.1
+    found = calibrate(points, skew=False, fix={"alpha_u": value})
+    assert found.distortion_model == free.distortion_model == "fisheye"
+    assert found.intrinsics.alpha_u == value
+    assert found.rmse_px < 1.01 * free.rmse_px
+    seen = [view.pose.t for view in found.views.values()]
+    np.testing.assert_allclose(seen, [view.pose.t for view in free.views.values()], atol=1.0)
+
+
 def test_a_file_keeps_what_was_fixed(tmp_path: Path) -> None:
     found = calibrate(flat(7), skew=False, fix={"v0": 240.0}, **KNOWN)
     write_calibration(found, tmp_path / "camera.yaml")
@@ -103,6 +115,7 @@ def test_cameras_of_a_rig_keep_it() -> None:
         ({"fix": {"alpha_v": 800.0}, "skew": "auto"}, "right angles only"),
         ({"fix": {"k1": 0.1}}, "cannot be fixed with the distortion model none"),
         ({"fix": {"k1": 0.1}, "distortion": "rational"}, "name one of the models"),
+        ({"fix": {"alpha_u": 300.0}, "distortion": "omnidir"}, "which scales it"),
         ({"fix": {"u0": 1.0}, "type": 2, "image_center": (1.0, 2.0)}, "type 2 gives u0 already"),
         ({"fix": {"u0": 1.0}, "type": 3, "intrinsics": CAMERA}, "type 3 gives u0 already"),
         ({"fix": {"u0": 1.0}, "method": "linear"}, "needs the method neuro"),
@@ -138,3 +151,14 @@ def test_the_option(tmp_path: Path) -> None:
         refused = run("calibrate", flat_csv, *words)
         assert refused.exit_code == 2
         assert message in refused.stderr
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_their_std_says() -> None:
+    over = []
+    for seed in range(100, 140):
+        known = {"alpha_u": float(CAMERA.alpha_u)}
+        found = calibrate(flat(seed), skew=False, fix=known, **KNOWN)
+        names = ("alpha_v", "u0", "v0")
+        over.append([(getattr(found.intrinsics, n) - getattr(CAMERA, n)) / found.std[n] for n in names])
+    assert 0.8 < np.sqrt(np.mean(np.square(over))) < 1.2
