@@ -35,6 +35,7 @@ _SUMMARIES = {
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
     "rig": "Calibrate a rig of any number of cameras, and their poses relative to the first.",
+    "sample": "Write the sample data, with which all examples work.",
     "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board with its estimated shape.",
@@ -141,6 +142,7 @@ def neurocal(quiet: int, verbose: bool) -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
           -o points.csv
       neurocal calibrate points.csv -o camera.yaml

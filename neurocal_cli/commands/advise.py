@@ -28,6 +28,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json

@@ -52,6 +52,7 @@ def calibrate(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml --camera-name left
       neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
           --plot errors.png --plot poses=poses.svg --html report.html \\

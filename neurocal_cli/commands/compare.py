@@ -74,6 +74,7 @@ def compare(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal compare sample_data/points.csv
       neurocal compare sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --no-skew --distortion k1

@@ -102,6 +102,7 @@ def convert(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml
       neurocal convert camera.yaml --to opencv -o camera.xml
       neurocal convert camera.xml --to mrcal -o camera.cameramodel

@@ -120,6 +120,7 @@ def detect(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
           --unit mm -o points.csv
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\

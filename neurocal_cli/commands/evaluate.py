@@ -54,6 +54,7 @@ def evaluate() -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
@@ -95,6 +96,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       neurocal evaluate camera camera.yaml sample_data/stereo_left.csv --json
@@ -193,6 +195,7 @@ def stereo(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
       neurocal evaluate stereo rig.yaml --plot space.png --plot depth=depth.svg
@@ -261,6 +264,7 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
           sample_data/rig_cam2.csv -o rig.yaml
       neurocal evaluate rig rig.yaml

@@ -26,6 +26,7 @@ def lens() -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens camera lens.yaml --zoom 1250 --focus 400 -o camera.yaml
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv
@@ -124,6 +125,7 @@ def fit(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens fit sample_data/zoom.csv --distortion k1 --no-skew \\
           --camera still --training alternating --plot lens.png -o lens.yaml
@@ -195,6 +197,7 @@ def camera(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens camera lens.yaml --zoom 1250 --focus 400 -o camera.yaml
       neurocal lens camera lens.yaml --zoom 3100 --focus 400 --extrapolate \\
@@ -248,6 +251,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --plot errors.png
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --json

@@ -78,6 +78,7 @@ def rectify(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
       neurocal rectify rig.yaml sample_data/stereo_left.csv \\

@@ -49,6 +49,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal report camera.yaml -o report.html
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\

@@ -98,6 +98,7 @@ def rig(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
           sample_data/rig_cam2.csv -o rig.yaml --plot rig.png --html rig.html
       neurocal rig left=sample_data/stereo_left.csv right=sample_data/stereo_right.csv \\

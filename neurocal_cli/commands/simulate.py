@@ -155,6 +155,7 @@ def simulate(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal simulate --trials 10 --sigma 0.2 1 --random-starts 10 --plot fig1.png
       neurocal simulate --methods neuro,linear,opencv --random-starts 0 --json
       neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml

@@ -82,6 +82,7 @@ def stereo(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml --plot errors.png --html rig.html --ros left.yaml right.yaml \\
           --alpha 0

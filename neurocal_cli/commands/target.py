@@ -29,6 +29,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/bent.csv -o camera.yaml
       neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml

@@ -83,6 +83,7 @@ def triangulate(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
       neurocal triangulate rig.yaml sample_data/matches.csv -o xyz.csv

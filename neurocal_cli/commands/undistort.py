@@ -100,6 +100,7 @@ def undistort(
 
     \b
     Examples:
+      neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv --distortion k1 -o camera.yaml
       neurocal undistort camera.yaml sample_data/flat.csv -o undistorted.csv
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\

@@ -106,7 +106,6 @@ def _slow(words: list[str]) -> bool:
 def test_the_examples_work_on_the_sample_data(
     words: list[str], command: click.Command, tmp_path: Path
 ) -> None:
-    (tmp_path / "sample_data").symlink_to(MAN.parent / "sample_data")
     tools = tmp_path / "bin"
     tools.mkdir()
     program = tools / "neurocal"

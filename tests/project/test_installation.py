@@ -16,6 +16,7 @@ from support.places import PROJECT
 ROOT = PROJECT
 COMMANDS = [" ".join(words) for words, _ in commands()]
 WORK = """\
+sample sample_data
 detect {sample}/board01.png {sample}/board02.png {sample}/board03.png \
   --cols 9 --rows 6 --square 25 -o board.csv
 calibrate board.csv --distortion k1 -o board.yaml
@@ -50,7 +51,7 @@ class Installed(NamedTuple):
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     made = Installed(tmp_path_factory.mktemp("installed"))
     source = made.folder / "source"  # a copy, for building leaves files behind
-    for folder in ("man", "neurocal_cli"):
+    for folder in ("man", "neurocal_cli", "sample_data"):
         shutil.copytree(ROOT / folder, source / folder)
     for file in ("LICENSE", "README.md", "pyproject.toml"):
         shutil.copy(ROOT / file, source)
@@ -84,7 +85,6 @@ def test_every_command_has_help(installed: Installed, command: str) -> None:
 
 @pytest.mark.slow
 def test_the_commands_work_on_the_sample_data(installed: Installed) -> None:
-    sample = ROOT / "sample_data"
-    for line in WORK.format(sample=sample).splitlines():
+    for line in WORK.format(sample="sample_data").splitlines():
         installed.run("neurocal", *line.split())
     assert [name for name in RESULTS.split() if not (installed.folder / name).exists()] == []
