@@ -61,4 +61,4 @@ def _sources() -> Iterator[Path]:
         return
     for file in installed.files or ():
         if file.as_posix().endswith(_INSTALLED):
-            yield Path(os.fspath(installed.locate_file(file))).resolve().parent
+            yield Path(str(installed.locate_file(file))).resolve().parent
