@@ -128,17 +128,24 @@ def covariance_by_camera(views: Views, state: CameraState, entries: Array) -> Ar
 
 
 def parameter_covariance(
-    intrinsics: Intrinsics, model: str, covariance: Array, pixel_scale: float, given: Collection[str]
+    intrinsics: Intrinsics,
+    model: str,
+    covariance: Array,
+    pixel_scale: float,
+    given: Collection[str],
+    square: bool = False,
 ) -> tuple[Array, dict[str, float]]:
     """Covariance of the intrinsic parameters and the K distortion coefficients, and their std by name.
 
     `covariance` is that of A's entries A11, A12, A22, A13, A23 in normalised pixels and of the coefficients;
     it is 0 for given ones. Both covariances are (5 + K, 5 + K). `pixel_scale` is S1 [px], and the std of the
-    `given` names is 0.
+    `given` names is 0. With `square` pixels A22 follows A11.
     """
     names = (*INTRINSIC_NAMES, *coefficient_names(model))
     J = np.eye(len(names))
     J[:5, :5] = intrinsics.entry_jacobian() * pixel_scale
+    if square:
+        J[:, 0] += J[:, 2]
     block = J @ covariance @ J.T
     std = {name: 0.0 if name in given else float(np.sqrt(block[n, n])) for n, name in enumerate(names)}
     return block, std

@@ -169,10 +169,10 @@ def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance)
 
     In models with xi this scale depends on alpha and xi together.
     """
-    free = np.flatnonzero(problem.free_camera if state.model != "none" else problem.free)
+    free = np.flatnonzero(problem.free_with(state.model))
     largest = 0.0
     for entry in (0, 2):
-        if not problem.free[entry]:
+        if entry not in free:
             continue
         gradient = (free == entry) / state.entries[0, entry]
         if state.model in WITH_XI:

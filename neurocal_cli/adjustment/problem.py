@@ -56,18 +56,26 @@ class Problem:
     penalty: Penalty | None = None
     # Values of the distortion coefficients that are given one by one.
     held: Mapping[str, float] = field(default_factory=dict)
+    # Whether the pixels are square: A22 follows A11.
+    square: bool = False
     # If a given wide lens is removed, each view has a pinhole that looks at its target: rotations (V, 3, 3)
     # from the camera's frame to that pinhole's. None after `with_seen_pixels`.
     turned: Array | None = None
 
     @property
     def free_camera(self) -> NDArray[np.bool_]:
-        """(5 + K,) which of A's entries and of the distortion coefficients are estimated."""
+        """(5 + K,) which of A's entries and of the distortion coefficients are unknowns."""
         coefficients = [
             self.free_distortion and name not in self.fixed
             for name in coefficient_names(self.distortion.model)
         ]
-        return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
+        free = np.concatenate([self.free, np.array(coefficients, dtype=bool)])
+        free[2] &= not self.square
+        return free
+
+    def free_with(self, model: str) -> NDArray[np.bool_]:
+        """`free_camera` of a state with this model: the problem's, or none before its coefficients exist."""
+        return self.free_camera if model == self.distortion.model else self.free_camera[:5]
 
     @property
     def free_of_prior(self) -> NDArray[np.bool_]:
@@ -163,9 +171,17 @@ class Problem:
             names = coefficient_names(state.model)
             k = [self.held.get(name, value) for name, value in zip(names, state.k.tolist(), strict=True)]
             state = replace(state, k=np.array(k))
-        free = self.free if state.model == "none" else self.free_camera
+        if self.square:
+            mean = np.sqrt(state.entries[:, :1] * state.entries[:, 2:3])
+            state = replace(state, square=True).with_entries(np.hstack([mean, state.entries[:, 1:]]))
         adjusted = adjust(
-            self.views.batches, state, free, self.free_poses, max_iterations, self.penalty, damping
+            self.views.batches,
+            state,
+            self.free_with(state.model),
+            self.free_poses,
+            max_iterations,
+            self.penalty,
+            damping,
         )
         return replace(adjusted, iterations=done + adjusted.iterations)
 
@@ -179,11 +195,12 @@ def problem_for(
     skew: bool = True,
     distortion: Distortion | None = None,
     fix: Mapping[str, float] | None = None,
+    square: bool = False,
 ) -> Problem:
     """State a problem; check that the given parameters are those of its type.
 
-    `image_center`, `intrinsics`, `extrinsics`, `skew` and `fix` are as for `calibrate`. `distortion` is the
-    given one with type 3, else the model to be estimated.
+    `image_center`, `intrinsics`, `extrinsics`, `skew`, `fix` and `square` (its `square_pixels`) are as for
+    `calibrate`. `distortion` is the given one with type 3, else the model to be estimated.
 
     Raises UsageError if the type does not exist, a parameter that it needs is missing, or one that it does
     not use is given. Raises InputError if there are no points, a value is not finite, the extrinsics lack a
@@ -225,6 +242,8 @@ def problem_for(
     elif type == 4:
         poses = _poses(points, extrinsics)
     distortion = distortion or Distortion()
+    if square:
+        fix = _both_alphas(fix or {}, type, skew)
     held: dict[str, float] = {}
     for name, number in (fix or {}).items():
         _check_fixed(name, number, fixed, type, skew, distortion.model)
@@ -238,7 +257,20 @@ def problem_for(
         fixed |= set(coefficient_names(distortion.model))
     views, turned = _views_of(points, distortion, entries, free_distortion)
     given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
-    return Problem(points, views, *given, held=held, turned=turned)
+    tied = square and "alpha_u" not in fixed
+    return Problem(points, views, *given, held=held, square=tied, turned=turned)
+
+
+def _both_alphas(fix: Mapping[str, float], type: int, skew: bool) -> Mapping[str, float]:
+    """The given parameters of a camera with square pixels: if one alpha is among them, so is the other."""
+    if type == 3:
+        raise UsageError("type 3 does not change the given camera; leave out square_pixels")
+    if skew:
+        raise UsageError("square pixels have right angles; give skew=False (--skew fixed) as well")
+    alphas = {float(fix[name]) for name in ("alpha_u", "alpha_v") if name in fix}
+    if len(alphas) > 1:
+        raise UsageError("square pixels have equal alphas, but alpha_u and alpha_v are fixed at two values")
+    return {**fix, **dict.fromkeys(("alpha_u", "alpha_v") if alphas else (), *alphas)}
 
 
 def _check_fixed(name: str, value: float, fixed: Collection[str], type: int, skew: bool, model: str) -> None:

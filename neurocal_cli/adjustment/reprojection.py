@@ -51,7 +51,7 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
     width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
     by_batch = np.empty((n_batches, width, width))
     sensible = np.empty(n_batches, dtype=bool)
-    buffer = batches.memory(width)
+    buffer = batches.memory(width, state.square)
     for chunk in batches.chunks():
         part = buffer[: chunk.stop - chunk.start]
         sensible[chunk] = derivatives(batches, chunk, state, part[:, :-1])
@@ -71,7 +71,7 @@ def displaced_blocks(
     """
     width, n = 12 + len(state.k), batches.local.shape[2]
     by_batch = np.empty((len(batches.view), width + m, width + m))
-    buffer = batches.memory(width)
+    buffer = batches.memory(width, state.square)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view), :-1]
@@ -140,6 +140,8 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
         entries, state.model, k, (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
         out[:, :5], by_point, out[:, _COEFFICIENTS:-1],
     )  # fmt: skip
+    if state.square:
+        out[:, 0, 1] = out[:, 2, 1]
     product = np.empty(by_omega[:, 0].shape)
     for n, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.multiply(Y[:, i, None], by_point[:, j], out=by_omega[:, n])
@@ -150,7 +152,9 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
     if batches.whitening is not None:
         du, dv, factors = out[:, :, 0], out[:, :, 1], batches.whitening[chunk][:, None]
         # The buffer is reused: structural zeros must be set again before whitening mixes the rows.
-        du[:, 2] = du[:, 4] = dv[:, 0] = dv[:, 1] = dv[:, 3] = 0.0
+        du[:, 2] = du[:, 4] = dv[:, 1] = dv[:, 3] = 0.0
+        if not state.square:
+            dv[:, 0] = 0.0
         du *= factors[:, :, 0]
         du += dv * factors[:, :, 1]
         dv *= factors[:, :, 2]

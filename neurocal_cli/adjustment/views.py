@@ -244,7 +244,7 @@ class PointBatches:
     first: NDArray[np.intp]  # (V,) first batch of each view
     view: NDArray[np.intp]  # (T,) view of each batch
     counts: NDArray[np.intp]  # (V,) number of points of each view
-    _memory: dict[int, Array] = field(default_factory=dict, init=False, repr=False)
+    _memory: dict[tuple[int, bool], Array] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def n_views(self) -> int:
@@ -258,18 +258,20 @@ class PointBatches:
         for start in range(0, len(self.view), step):
             yield slice(start, min(start + step, len(self.view)))
 
-    def memory(self, width: int) -> Array:
+    def memory(self, width: int, square: bool = False) -> Array:
         """(T, width + 1, 2, n) buffer for the derivatives of any one of the chunks; zero when it is new.
 
         Calls with the same width return the same buffer, because allocating new pages took up to half of the
-        time. Each derivative is contiguous over all points, which doubles the speed of arithmetic on it. The
-        last row is padding; see `products`.
+        time; a camera with square pixels has one of its own, since other derivatives are always 0 for it.
+        Each derivative is contiguous over all points, which doubles the speed of arithmetic on it. The last
+        row is padding; see `products`.
         """
-        if width not in self._memory:
+        key = width, square
+        if key not in self._memory:
             longest = next(self.chunks()).stop
             rows = np.zeros((width + 1, 2, longest, self.local.shape[2]))
-            self._memory[width] = np.moveaxis(rows, 2, 0)
-        return self._memory[width]
+            self._memory[key] = np.moveaxis(rows, 2, 0)
+        return self._memory[key]
 
     def sum_by_view(self, by_batch: Array) -> Array:
         """Sum of the batches' values over each view; (T, ...) -> (V, ...)."""

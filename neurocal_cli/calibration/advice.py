@@ -73,7 +73,9 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     options = candidates(calibration)
     if not options:
         raise InputError("no view shows the whole target; check the image size and the target")
-    told = [view_information(known.camera, known.free, option.pose, world) for option in options]
+    told = [
+        view_information(known.camera, known.free, option.pose, world, known.square) for option in options
+    ]
     before, more = known.worst(), np.zeros_like(known.information)
     chosen, after = [], []
     for _ in range(count):
@@ -95,6 +97,7 @@ class _Known:
     information: Array  # (f, f) normal matrix of the free parameters, with the prior of the open coefficients
     places: Array  # (g, 2, f) derivatives of the judged pixels, see `pixel_changes`
     sigma: float  # noise of the points [px]
+    square: bool  # whether A22 follows A11
 
     def worst(self, more: Array | float = 0.0) -> float:
         """Largest standard deviation of a projected pixel [px], with the information of further views."""
@@ -102,7 +105,7 @@ class _Known:
 
     @classmethod
     def of(cls, calibration: Calibration) -> _Known:
-        points, camera = calibration.points, calibration.camera
+        points, camera, square = calibration.points, calibration.camera, calibration.square_pixels
         size = camera.image_size
         if not len(points) or not calibration.views:
             raise InputError("the calibration holds no points; give a file that was not written with --lean")
@@ -126,12 +129,12 @@ class _Known:
         information, depths = np.diag(beforehand), []
         for k, name in enumerate(points.view_names):
             pose, own = calibration.views[name].pose, points.world[points.view_index == k]
-            information += view_information(camera, free, pose, own)
+            information += view_information(camera, free, pose, own, square)
             seen = pose.to_camera(own)
             depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
             depths.append(float(np.median(depth)))
-        places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths))
-        return cls(camera, free, information, places, sigma)
+        places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths), square)
+        return cls(camera, free, information, places, sigma, square)
 
 
 def _target(calibration: Calibration) -> Array:
@@ -207,20 +210,24 @@ def _tilted(tilt: float, way: float) -> Array:
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
 
 
-def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array) -> Array:
+def view_information(
+    camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array, square: bool = False
+) -> Array:
     """Information (f, f) of a view of points (N, 3) on the camera.
 
     It is the normal matrix of the free ones of A11, A12, A22, A13, A23 and the coefficients with the pose
     eliminated, for residuals of unit variance.
     """
     points = pose.to_camera(world)
-    J, P = _derivatives(camera, free, points)
+    J, P = _derivatives(camera, free, points, square)
     J, P = J.reshape(-1, J.shape[2]), P.reshape(-1, 6)
     C = J.T @ P
     return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T)
 
 
-def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array) -> Array:
+def pixel_changes(
+    camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array, square: bool = False
+) -> Array:
     """Derivatives (g, 2, f) of pixels by the free parameters, without what a motion of the frame compensates.
 
     The pixels (G, 2) are all over the image; those without a ray are left out. Each has a point at each of
@@ -228,7 +235,7 @@ def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths
     """
     rays = camera.seen_points(pixels)
     rays = rays[np.isfinite(rays[:, 0])]
-    J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]))
+    J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]), square)
     motion = np.linalg.lstsq(P.reshape(-1, 6), J.reshape(-1, J.shape[2]), rcond=None)[0]
     return np.asarray(J - P @ motion)
 
@@ -248,8 +255,10 @@ def worst_std(normal: Array, changes: Array, sigma: float) -> float:
     return sigma * float(np.sqrt(variance.max()))
 
 
-def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array) -> tuple[Array, Array]:
+def _derivatives(camera: Camera, free: NDArray[np.bool_], points: Array, square: bool) -> tuple[Array, Array]:
     """Derivatives of pixels by the free parameters (N, 2, f) and a motion of the points' frame (N, 2, 6)."""
     by_camera, by_point = camera.project_jacobian(points)
+    if square:
+        by_camera[:, :, 0] += by_camera[:, :, 2]
     moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
     return by_camera[:, :, free], by_point @ moved

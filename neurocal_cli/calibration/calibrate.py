@@ -64,6 +64,7 @@ def calibrate(
     target: str | Target = "auto",
     preferred: str = "",
     fix: Mapping[str, float] | None = None,
+    square_pixels: bool = False,
     starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
@@ -111,6 +112,8 @@ def calibrate(
     fix : dict of float by name, optional
         Parameters that are known, and stay as they are: alpha_u, alpha_v, u0, v0 [px], and coefficients of a
         named distortion model.
+    square_pixels : bool
+        Whether alpha_v is alpha_u, and theta pi/2, as in nearly all digital cameras.
     starts : int
         Most random starts for each network, at least 2.
     backprop : BackpropOptions, optional
@@ -142,6 +145,9 @@ def calibrate(
         raise UsageError(f"skew auto needs the method neuro, but the method is {method}; give free or fixed")
     if fix and method != "neuro":
         raise UsageError(f"fix needs the method neuro, but the method is {method}; leave it out")
+    if square_pixels:
+        _check_square(method, distortion, skew)
+        skew = False
     if fix and "alpha_v" in fix and skew not in (False, "fixed"):
         raise UsageError(
             "alpha_v can be fixed with right angles only; give skew=False (--skew fixed) as well"
@@ -169,7 +175,7 @@ def calibrate(
     )
     try:
         problem = problem_for(
-            points, type, image_center, known, extrinsics, skew in (True, "free"), model, fix
+            points, type, image_center, known, extrinsics, skew in (True, "free"), model, fix, square_pixels
         )
         if method != "neuro":
             from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
@@ -221,6 +227,16 @@ def _true_cause(points: Correspondences, type: int) -> str:
         return exchanged
     found = proportions(points) if type in (1, 2) else None
     return "" if found is None else f"{unlike_axes(found)}; {MEASURE_AXES}"
+
+
+def _check_square(method: str, distortion: str, skew: bool | str) -> None:
+    """Refuse options that do not go with square pixels."""
+    if method != "neuro":
+        raise UsageError(f"square_pixels needs the method neuro, but the method is {method}; leave it out")
+    if distortion == "plumb-line":
+        raise UsageError("square_pixels does not go with the distortion plumb-line; name k1k2p1p2 instead")
+    if skew in ("free", "auto"):
+        raise UsageError(f"square pixels have right angles, but skew is {skew}; leave it out")
 
 
 def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:

@@ -102,6 +102,8 @@ class Calibration:
         Standard deviation of alpha_u, alpha_v, u0, v0 [px] and theta [rad]; 0 for given ones.
     fixed : frozenset of str
         Names of the intrinsic parameters that were given.
+    square_pixels : bool
+        Whether alpha_v was bound to alpha_u, which is then one unknown for both.
     views : dict of ViewResult by view name
     points : Correspondences
         The points it was calibrated from, without outliers. If the target was estimated with the camera,
@@ -160,6 +162,7 @@ class Calibration:
     lens_choice: Mapping[str, float] = field(default_factory=dict)
     second_poses: Mapping[str, ViewResult] = field(default_factory=dict)
     target_stretched: float = 0.0
+    square_pixels: bool = False
     would_take: frozenset[str] = frozenset()
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
 
@@ -241,7 +244,8 @@ class Calibration:
         """The camera and its poses of the named views, in pixels and world units."""
         poses, camera = [self.views[name].pose for name in names], self.camera
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        return CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
+        k = camera.distortion.coefficients
+        return CameraState(np.array([camera.entries]), R, t, camera.model, k, self.square_pixels)
 
     @property
     def rotations(self) -> dict[str, Array]:
@@ -267,9 +271,11 @@ def fixed_intrinsics(calibration: Calibration) -> dict[str, float]:
 
 
 def free_entries(calibration: Calibration, held: Collection[str] = ()) -> NDArray[np.bool_]:
-    """(5 + K,) which of A11, A12, A22, A13, A23 and the coefficients are neither given nor held."""
+    """(5 + K,) which of A11, A12, A22, A13, A23 and the coefficients are unknowns, neither given nor held."""
     names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
-    return np.array([name not in calibration.fixed and name not in held for name in names])
+    free = np.array([name not in calibration.fixed and name not in held for name in names])
+    free[2] &= not calibration.square_pixels
+    return free
 
 
 def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:

@@ -71,6 +71,7 @@ def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
         skew="theta" not in calibration.fixed or calibration.type == 3,
         distortion=calibration.camera.distortion,
         fix=fixed_intrinsics(calibration),
+        square=calibration.square_pixels,
     ).with_seen_pixels()
     problem = replace(problem, fixed=problem.fixed | calibration.fixed)
     state = calibration.state(problem.views.names)

@@ -67,7 +67,9 @@ def calibration_of(
         intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     entries = _entries(solution, known)
     fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
-    block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
+    block, std = parameter_covariance(
+        intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed, problem.square
+    )
     squared = (solution.residuals**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
     free = tuple(parameter for parameter in std if parameter not in fixed)
@@ -83,6 +85,7 @@ def calibration_of(
         intrinsics=intrinsics,
         std=std,
         fixed=fixed,
+        square_pixels=problem.square,
         views=found,
         second_poses=second,
         points=problem.points,

@@ -26,6 +26,8 @@ class CameraState:
     model: str = "none"  # distortion model, one of `distortion.MODELS`
     # Coefficients of the model: (K,) the same for all views, or (V, K) each view's own.
     k: Array = field(default_factory=lambda: np.zeros(0))
+    # Whether A22 follows A11, so that the pixels are square. The derivative by A11 is then that by both.
+    square: bool = False
 
     @property
     def distortion(self) -> Distortion:
@@ -55,13 +57,18 @@ class CameraState:
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
         if self.model in WITH_XI:
             by_entries = by_entries + self._along_valley(by_entries, by_k)
-        return CameraState(
-            self.entries + by_entries,
-            rotation_step(by_pose[:, :3]) @ self.R,
-            self.t + by_pose[:, 3:],
-            self.model,
-            self.k + (by_k[0] if self.k.ndim == 1 else by_k),
+        return replace(
+            self.with_entries(self.entries + by_entries),
+            R=rotation_step(by_pose[:, :3]) @ self.R,
+            t=self.t + by_pose[:, 3:],
+            k=self.k + (by_k[0] if self.k.ndim == 1 else by_k),
         )
+
+    def with_entries(self, entries: Array) -> CameraState:
+        """The state with other entries of A; those of square pixels stay square."""
+        if self.square:
+            entries = np.concatenate([entries[:, :2], entries[:, :1], entries[:, 3:]], axis=1)
+        return replace(self, entries=entries)
 
     def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
         """Second-order correction of a step along the valley in which xi and alpha compensate.

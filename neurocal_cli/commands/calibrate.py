@@ -62,6 +62,7 @@ def calibrate(
       neurocal calibrate sample_data/flat.csv --target free --skew auto -o camera.yaml
       neurocal calibrate sample_data/flat.csv --fix u0=321.8 --fix theta=90
       neurocal calibrate sample_data/flat.csv --distortion plumb_bob --fix k3=0
+      neurocal calibrate sample_data/flat.csv --square-pixels -o camera.yaml
       neurocal calibrate sample_data/points.csv --type 2 --image-center 172 121
       neurocal calibrate sample_data/stereo_left.csv --type 3 \\
           --intrinsics camera.yaml -o poses.yaml

@@ -41,6 +41,7 @@ class Estimation:
     distortion: str
     no_skew: bool
     skew: str
+    square_pixels: bool
     fix: options.Named
     outliers: str
     target: str
@@ -70,6 +71,8 @@ class Estimation:
             raise UsageError(f"--fix needs --method neuro, but the method is {self.method}; leave it out")
         if self.type == "3" and self.fix:
             raise UsageError("--type 3 does not change the given camera; leave out --fix")
+        if self.square_pixels:
+            self._check_square()
         self._fixed()
         if self.trainer != "lm" and self.method != "neuro":
             raise UsageError(
@@ -81,6 +84,21 @@ class Estimation:
             options.note_unused(f"with --method {self.method}", *unused)
         for name in _BACKPROP:
             self._require(name, "trainer", "backprop")
+
+    def _check_square(self) -> None:
+        """Refuse options that do not go with ``--square-pixels``."""
+        if self.type == "3":
+            raise UsageError("--type 3 does not change the given camera; leave out --square-pixels")
+        if self.method != "neuro":
+            raise UsageError(
+                f"--square-pixels needs --method neuro, but the method is {self.method}; leave it out"
+            )
+        if self.skew == "auto":
+            raise UsageError("--square-pixels is --skew fixed, but --skew is auto; give one of them")
+        if self.distortion == "plumb-line":
+            raise UsageError(
+                "--square-pixels does not go with --distortion plumb-line; name k1k2p1p2 instead"
+            )
 
     def _fixed(self) -> dict[str, float]:
         """The values of ``--fix`` by name; theta in degrees."""
@@ -113,7 +131,10 @@ class Estimation:
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {name: getattr(self, name) for name in _SAME}
         fix = self._fixed()
-        right_angle = self.no_skew or fix.pop("theta", None) is not None
+        right_angle = self.no_skew or self.square_pixels or fix.pop("theta", None) is not None
+        if self.square_pixels:
+            arguments["square_pixels"] = True
+            fix.pop("theta", None)
         arguments |= {"type": int(self.type), "skew": "fixed" if right_angle else self.skew}
         if fix:
             arguments["fix"] = fix
@@ -248,6 +269,7 @@ _OPTIONS = [
     options.no_skew,
     options.skew,
     options.fix,
+    options.square_pixels,
     options.choice(
         "--outliers",
         "reject keep",

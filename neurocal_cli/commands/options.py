@@ -336,6 +336,13 @@ skew = choice(
     default="free",
 )
 
+square_pixels = flag(
+    "--square-pixels",
+    "Let alpha_v be alpha_u, and the angle between the image axes 90 degrees, as in nearly all digital "
+    "cameras.",
+    without="estimate both",
+)
+
 fix = click.option(
     "--fix",
     metavar="NAME=VALUE",

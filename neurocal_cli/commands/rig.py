@@ -113,6 +113,7 @@ def rig(
       neurocal rig sample_data/rig_cam*.csv --type 2 --image-center 639.5 479.5 \\
           --skew auto -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --fix theta=90 --fix v0=479.5 -o rig.yaml
+      neurocal rig sample_data/rig_cam*.csv --square-pixels -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --trainer backprop --epochs 20000 --rate 0.05 \\
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
@@ -155,6 +156,7 @@ def rig(
                 no_skew=False,
                 skew="free",
                 fix=(),
+                square_pixels=False,
                 distortion="none",
             )
         points[name], camera_options[name] = own.prepare(one)

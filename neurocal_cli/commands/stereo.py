@@ -100,6 +100,8 @@ def stereo(
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --distortion k1k2 --fix k2=0 --fix theta=90 -o rig.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --square-pixels -o rig.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
@@ -114,6 +116,7 @@ def stereo(
             "no_skew",
             "skew",
             "fix",
+            "square_pixels",
             "distortion",
             "image_center",
             *(["type"] if estimation.type == "2" else []),
@@ -173,5 +176,6 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
         no_skew=False,
         skew="free",
         fix=(),
+        square_pixels=False,
         distortion="none",
     )

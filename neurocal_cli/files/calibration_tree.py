@@ -93,6 +93,7 @@ def calibration_from_field(root: Field) -> Calibration:
         },
         second_poses=read_views(block.get("second_poses", [])),
         target_stretched=block.get("target_stretched", 0.0).number(),
+        square_pixels=block.get("square_pixels", False).boolean(),
     )
 
 

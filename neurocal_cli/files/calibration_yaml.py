@@ -83,6 +83,8 @@ def _block_lines(cal: Calibration, long: bool) -> Iterator[str]:
     yield f"distortion: {text(cal.distortion_model)}"
     if cal.lens_choice:  # rms error on data left out [px]
         yield f"lens_choice: {mapping(**{name: number(error) for name, error in cal.lens_choice.items()})}"
+    if cal.square_pixels:
+        yield "square_pixels: true"
     if cal.target_stretched:  # probability
         yield f"target_stretched: {number(cal.target_stretched)}"
     if cal.points.image_center is not None:

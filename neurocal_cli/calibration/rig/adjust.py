@@ -138,7 +138,9 @@ class RigState:
         """The state after a step: shared (columns.n_shared,), own (V, 6)."""
         columns = self.columns
         cameras = tuple(
-            replace(camera, entries=camera.entries + shared[None, place[:5]], k=camera.k + shared[place[5:]])
+            replace(
+                camera.with_entries(camera.entries + shared[None, place[:5]]), k=camera.k + shared[place[5:]]
+            )
             for camera, place in zip(self.cameras, columns.cameras, strict=True)
         )
         steps = np.zeros((len(cameras), 6))
@@ -499,6 +501,7 @@ def _side(
         ((R @ centre[..., None])[..., 0] + t) / scale[:, None],
         calibration.distortion_model,
         np.array(calibration.distortion, dtype=float),
+        calibration.square_pixels,
     )
     normal = normal_blocks(batches, state)[0]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views

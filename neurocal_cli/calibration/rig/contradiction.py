@@ -215,7 +215,7 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
     kinds = [("moved", unknowns[:, poses.rig], after_S, after_g), ("size", longer, after_S, after_g)]
     zooms = np.zeros((len(S), 2))
     for side, (kind, columns) in enumerate(zip(("left focal", "right focal"), poses.focal, strict=True)):
-        if len(columns) == 2:
+        if len(columns):
             kinds.append((kind, unknowns[:, columns], after_S + own_S, after_g + own_g))
             zooms[columns, side] = _focal(poses, side)
     if zooms.any(axis=0).all():
@@ -234,8 +234,8 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
 
 
 def _focal(poses: RelativePoses, side: int) -> Array:
-    """(2,) alpha_u and alpha_v of one camera, normalised."""
-    return np.asarray(poses.problem.cameras[side].entries[0, [0, 2]])
+    """Alpha_u and alpha_v of one camera, normalised, or the one for both."""
+    return np.asarray(poses.problem.cameras[side].entries[0, [0, 2][: len(poses.focal[side])]])
 
 
 def _motions(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:

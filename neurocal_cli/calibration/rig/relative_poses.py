@@ -49,7 +49,8 @@ class RelativePoses:
     pairs: Quadratics  # the cost of the common fit beyond that of the cameras alone, P groups
     frame: NDArray[np.intp]  # (P,) of each pair
     rig: NDArray[np.intp]  # (6,) columns of the rig's step
-    focal: tuple[NDArray[np.intp], NDArray[np.intp]]  # columns of alpha_u and alpha_v, if they are free
+    # Columns of alpha_u and alpha_v of each camera, or of the one for both; none if one is given.
+    focal: tuple[NDArray[np.intp], NDArray[np.intp]]
     reference: Array  # (3,) translation of the reference [`unit`]
     offset: Array  # (P, 6) z
     design: Array  # (P, 6, F) of z by the unknowns
@@ -161,7 +162,10 @@ class _Alone:
         times = np.where(larger > _MUCH_LARGER, larger, 1.0)[:, None, None]
         self.covariance = np.asarray(times * variance * own, dtype=float)
         self.quadratics = Quadratics(S / variance, g / variance, cost / variance)
-        self.focal = np.flatnonzero(np.isin(np.flatnonzero(free), (0, 2)))
+        alphas = (0,) if problem.cameras[side].square else (0, 2)
+        self.focal = np.flatnonzero(np.isin(np.flatnonzero(free), alphas))
+        if len(self.focal) < len(alphas):
+            self.focal = self.focal[:0]
         self.determined = bool(np.isfinite(solved).all() and np.isfinite(camera).all())
 
 

@@ -185,6 +185,7 @@ class RigAssembly:
             self._shared_block(self.columns.cameras[side]),
             self.problem.observations[side].pixel_scale,
             given.fixed,
+            given.square_pixels,
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
@@ -241,9 +242,10 @@ def non_monotonic_sides(fit: RigFit) -> list[int]:
 def _intrinsics(fit: RigFit, side: int) -> Intrinsics:
     """Intrinsic parameters of one camera [px]; given entries of A keep their exact values."""
     given = fit.problem.calibrations[side]
-    estimated = fit.free[fit.state.columns.cameras[side]][:5]
+    estimated = fit.free[fit.state.columns.cameras[side]][:5].copy()
     if not estimated.any():
         return given.intrinsics
+    estimated[2] |= given.square_pixels
     entries = fit.problem.observations[side].in_pixels(fit.state.cameras[side].entries[0])
     A = intrinsic_matrix(np.where(estimated, entries, given.K[ENTRIES]))
     if not estimated[1] and not given.intrinsics.skewed:

@@ -91,7 +91,8 @@ def _pose(fit: RigFit, side: int, motion: Motion | None) -> Array:
 
 def _focal(fit: RigFit, side: int, motion: Motion | None) -> Array:
     steps = np.zeros((len(fit.problem.names[side]), 8, 1))
-    steps[:, :2, 0] = fit.state.cameras[side].entries[0, [0, 2]]
+    camera = fit.state.cameras[side]
+    steps[:, :2, 0] = camera.entries[0, [0, 2]] * [1, not camera.square]
     return steps
 
 

@@ -72,7 +72,8 @@ def focal_length(lin: Linearised) -> Array:
     """A change of the focal length, relative."""
     steps = np.zeros((lin.width, 1))
     steps[:3, 0] = lin.state.entries[0, :3]
-    return steps if np.isin((0, 2), lin.free).all() else steps[:, :0]
+    steps[2] *= not lin.state.square  # A11 moves A22 as well
+    return steps if lin.alphas_free else steps[:, :0]
 
 
 def image_size(lin: Linearised) -> Array:
@@ -88,7 +89,8 @@ def centre(lin: Linearised) -> Array:
 
 def camera(lin: Linearised) -> Array:
     """A change of the focal lengths and the centre, over the focal length."""
-    return _of_entries(lin, *(lin.state.entries[0, 0] * np.eye(5)[[0, 2, 3, 4]]))
+    places = [0, 3, 4] if lin.state.square else [0, 2, 3, 4]
+    return _of_entries(lin, *(lin.state.entries[0, 0] * np.eye(5)[places]))
 
 
 def camera_and_lens(lin: Linearised) -> Array:
@@ -121,7 +123,8 @@ def lens(model: str) -> Steps:
 
 def _of_entries(lin: Linearised, *changes: Array) -> Array:
     steps = np.zeros((lin.width, len(changes)))
-    if not np.isin((0, 2, 3, 4), lin.free).all():
+    if not (lin.alphas_free and np.isin((3, 4), lin.free).all()):
         return steps[:, :0]
     steps[:5] = np.stack(changes, axis=1)
+    steps[2] *= not lin.state.square  # A11 moves A22 as well
     return steps

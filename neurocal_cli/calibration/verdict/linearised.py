@@ -95,6 +95,11 @@ class Linearised:
     board: Board | None
 
     @property
+    def alphas_free(self) -> bool:
+        """Whether alpha_u and alpha_v are estimated."""
+        return bool(np.isin((0,) if self.state.square else (0, 2), self.free).all())
+
+    @property
     def width(self) -> int:
         """Number of columns c without the residual."""
         return self.R.shape[1] - 1

@@ -66,6 +66,8 @@ def projection_uncertainty(
     free = np.flatnonzero(m.free)
     gain, motion = _motions(m, camera_columns(len(m.free) - 5)[free])
     by_camera, by_point, rays = _derivatives(camera, pixels, m.views.pixel_scale, farthest)
+    if m.state.square:
+        by_camera[:, :, 0] += by_camera[:, :, 2]
     by_camera = by_camera[:, :, free]
     std = np.empty((len(depths), len(pixels)))
     for k, depth in enumerate(depths):

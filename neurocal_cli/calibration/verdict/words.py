@@ -233,6 +233,11 @@ def wrongly_given(told: Told) -> Said:
     names: Mapping[int, str] = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
     places = told.lin.given[told.lin.given != 1].tolist()
     by = [f"{names[k]} {a * told.alpha:+.2g} px" for k, a in zip(places, told.found.amounts, strict=True)]
+    if told.lin.state.square and len(places) == 1:
+        amount = float(told.found.amounts[0])
+        return f"the pixels are not square: alpha_v - alpha_u is {100 * amount:+.2g} % of alpha_u", abs(
+            amount
+        )
     return (
         f"other values than the given ones fit the points: {', '.join(by)}",
         float(np.abs(told.found.amounts).max()),

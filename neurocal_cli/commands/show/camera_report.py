@@ -49,6 +49,8 @@ def calibration_report(calibration: Calibration) -> str:
         given = (
             f"{given} but {', '.join(fixed)}" if calibration.type == 1 else f"{given}, and {', '.join(fixed)}"
         )
+    if calibration.square_pixels:
+        given = f"{given}, square pixels"
     headline = (
         f"{printable(calibration.camera_name)}: type {calibration.type} ({given}), "
         f"{plural(len(points), 'point')} in {plural(len(calibration.views), 'view')}, "
