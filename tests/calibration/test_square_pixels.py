@@ -76,7 +76,8 @@ def test_every_lens_and_type_can_have_square_pixels(
     assert again.square_pixels
     assert again.std == found.std
     np.testing.assert_array_equal(again.covariance, found.covariance)
-    assert again.verdict is not None and found.verdict is not None
+    assert again.verdict is not None
+    assert found.verdict is not None
     assert again.verdict.word == found.verdict.word
 
 
@@ -122,7 +123,8 @@ def test_rigs_keep_square_pixels_square() -> None:
     apart = np.abs(rig.t - known.t) / np.array([known.std[f"t_{axis}"] for axis in "xyz"])
     assert apart.max() < 5
     one = calibrate_rig({"a": left, "b": right}, {"a": {"square_pixels": True}}, distortion="none")
-    assert one.cameras["a"].square_pixels and not one.cameras["b"].square_pixels
+    assert one.cameras["a"].square_pixels
+    assert not one.cameras["b"].square_pixels
 
 
 def test_advice_counts_what_both_rows_of_pixels_say_about_the_one_alpha() -> None:
