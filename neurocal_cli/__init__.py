@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibrate import calibrate
     from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.drift import Drift, find_drift
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_rig
@@ -54,6 +55,7 @@ _HOMES = {
     "Camera": "camera.camera",
     "CameraRig": "calibration.rig.camera_rig",
     "Correspondences": "observations.points",
+    "Drift": "calibration.drift",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
@@ -69,6 +71,7 @@ _HOMES = {
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
+    "find_drift": "calibration.drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
     "fit_rig": "calibration.rig.calibrate_stereo",
@@ -98,6 +101,7 @@ __all__ = [
     "Camera",
     "CameraRig",
     "Correspondences",
+    "Drift",
     "Intrinsics",
     "NeurocalError",
     "Pose",
@@ -113,6 +117,7 @@ __all__ = [
     "evaluate_lens",
     "evaluate_rig",
     "evaluate_stereo",
+    "find_drift",
     "fit_lens",
     "fit_lens_cameras",
     "fit_rig",

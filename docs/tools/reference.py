@@ -21,7 +21,8 @@ MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
 # The names of the package by topic. A name that is in none of them goes to the last.
 TOPICS = {
     "Calibrating": ["calibrate", "Calibration", "Correspondences", "Camera", "Intrinsics", "Pose"],
-    "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_camera_rig", "evaluate_lens"],
+    "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_camera_rig", "evaluate_lens",
+                "find_drift", "Drift"],
     "Points from images": ["detect_points", "Board", "read_board", "read_image"],
     "Removing distortion": ["undistort_points", "undistort_image"],
     "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate"],

@@ -92,7 +92,9 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 
     A calibration also gets a verdict. It uses the points of the calibration: the cross-validation error,
     the noise floor, the agreement of two halves of the data, the coverage of the image and the uncertainty
-    of predicted pixels. With POINTS.csv it also includes the error on these points.
+    of predicted pixels. With POINTS.csv it also includes the error on these points. If they determine a
+    camera, it is calibrated again from them and compared with the old one as in `neurocal drift`, which tells
+    whether the camera has changed.
 
     \b
     Examples:
@@ -109,20 +111,24 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     preparation.check_outputs((file for _, file in plots), (calibration, points))
     given = None if points is None else preparation.given_points(points)
     from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.drift import drift_since
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.verdict.assessment import assess
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
+    from neurocal_cli.commands.show.drift_report import drift_json, since_lines
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
     evaluation = evaluate_camera(judged, seen)
-    verdict = None
+    verdict, drift = None, None
     if isinstance(judged, Calibration):
         verdict = assess(judged)
         if verdict is not None and given is not None:
-            verdict = judged_by_points(verdict, judged, evaluation.given_points)
+            if evaluation.fit is not None:
+                drift = drift_since(judged, evaluation.fit.points)
+            verdict = judged_by_points(verdict, judged, evaluation.given_points, drift)
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
@@ -139,9 +145,10 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
     if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
+        since = {} if drift is None else {"drift": drift_json(drift)}
+        print_summary(evaluation_json(evaluation, verdict) | since)
     else:
-        show(evaluation_tables(evaluation), verdict_lines(verdict))
+        show(evaluation_tables(evaluation), [*since_lines(drift), *verdict_lines(verdict)])
 
 
 @evaluate.command(cls=options.Command)

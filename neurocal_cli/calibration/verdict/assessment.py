@@ -52,6 +52,7 @@ from neurocal_cli.calibration.verdict.projection_uncertainty import (
 )
 from neurocal_cli.calibration.verdict.proportions import Proportions, proportions
 from neurocal_cli.calibration.verdict.rules import reach_verdict
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array, median
@@ -90,6 +91,24 @@ def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | 
     if not _has_points(calibration) or _views_behind(calibration):
         return None
     return _AtMinimum(calibration).projection()
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
+    """The camera, and the covariance (5 + K, 5 + K) of A's entries [px] and its coefficients.
+
+    Given ones have none. With points of its own, the camera has the coefficients that the selection of its
+    distortion model leaves open, too, so that the covariance includes the uncertainty of that choice.
+    """
+    c = calibration
+    if not _has_points(c) or _views_behind(c):
+        return c.camera, entry_covariance(c.intrinsics, c.distortion_model, *c.known_covariance, 1.0)
+    found = _AtMinimum(c)
+    m, camera, shared = found.opened()
+    whole = np.zeros((len(m.free), len(m.free)))
+    whole[np.ix_(m.free, m.free)] = shared
+    to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
+    return camera, to_pixels[:, None] * whole * to_pixels
 
 
 def _has_points(calibration: Calibration) -> bool:
@@ -343,6 +362,15 @@ class _AtMinimum:
                 (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
             )
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
+        m, camera, shared = self.opened()
+        pixels = image_grid(self.points.image_size)
+        return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
+
+    def opened(self) -> tuple[Minimum, Camera, Array]:
+        """The minimum and the camera, with the coefficients that the selection of its model leaves open.
+
+        The third is the covariance (f, f) of the minimum's free parameters, normalised.
+        """
         m, camera, shared = self.minimum, self.camera, self.covariance
         if self.wide is not None:
             lens, shared = self.wide.open, self.wide.entries
@@ -355,5 +383,4 @@ class _AtMinimum:
             given = self._covariance_of_given()
             free = np.diagonal(given) > 0
             m, shared = replace(m, free=free), given[np.ix_(free, free)]
-        pixels = image_grid(self.points.image_size)
-        return projection_uncertainty(m, camera, self.variance, pixels, depths, shared, angle)
+        return m, camera, shared

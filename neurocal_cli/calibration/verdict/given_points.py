@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.drift import Drift
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.findings import (
     ERROR,
@@ -40,10 +41,30 @@ class GivenPoints:
     fit: Calibration | None = None  # the views whose poses were fitted to these points, with the camera given
 
 
-def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Verdict:
-    """Add the findings about given points to the verdict of the calibration, which becomes no better."""
+def judged_by_points(
+    verdict: Verdict, calibration: Calibration, given: GivenPoints, drift: Drift | None = None
+) -> Verdict:
+    """Add the findings about given points to the verdict of the calibration, which becomes no better.
+
+    `drift` is that from the calibration to a camera calibrated from these points, if they determine one.
+    """
     findings = [given_error(verdict, calibration.rmse_px, calibration.points, given)]
-    return with_findings(verdict, [*findings, *given_camera(calibration, given.fit)])
+    return with_findings(verdict, [*findings, *given_camera(calibration, given.fit), *changed_camera(drift)])
+
+
+def changed_camera(drift: Drift | None) -> list[Finding]:
+    """The finding that the camera has changed since its calibration, if it has."""
+    if drift is None or not drift.different:
+        return []
+    (u, v), worst = drift.pixels[drift.worst], drift.worst
+    scale, std = 100 * drift.changes[0], 100 * drift.changes_std[0]
+    moved = two_digits(float(np.hypot(*drift.changes[1:])))
+    reason = (
+        f"the camera has changed since: its scale by {scale:+.2g} % (std {std:.2g} %), its image centre by "
+        f"{moved} px; a pixel at ({u:.0f}, {v:.0f}) by {two_digits(float(drift.length[worst]))} px (std "
+        f"{two_digits(float(drift.std[worst]))} px)"
+    )
+    return [(1, reason, "use a calibration from the new points")]
 
 
 def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Finding]:

@@ -1,0 +1,189 @@
+"""A drift from one calibration of a camera to another, as tables, lines, JSON and a picture."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.drift import SHARE, Drift
+from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.show.figure import ACCENT, picture, style
+from neurocal_cli.commands.show.text import (
+    UNITS,
+    Table,
+    labelled,
+    number_or_none,
+    parameters,
+    rounded,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from neurocal_cli.camera.camera import Camera
+
+_COLUMNS, _ROWS = ("left", "middle", "right"), ("top", "middle", "bottom")
+_CHANGES = ("scale", "centre_u", "centre_v")
+_SURELY = 1e-12  # smaller shares are rounding errors of the tail
+_ROUND = 0.1  # larger shares are shown in whole percents
+_LEVELS = 12
+_STRONG = 3.0  # standard deviations, a line in the picture
+_ARROWS = 11  # across
+_LONGEST = 0.06  # of the image's width, the longest arrow
+
+
+def drift_tables(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> list[Table]:
+    """The parameters that both cameras have with their difference, and the differences over the image."""
+    return [table for table in (_parameter_table(old, new), _image_table(drift)) if len(table) > 1]
+
+
+def drift_lines(drift: Drift) -> list[str]:
+    """The judgement in words, and the numbers behind it."""
+    u, v = drift.pixels[drift.worst]
+    scale, *centre = zip(drift.changes.tolist(), drift.changes_std.tolist(), strict=True)
+    moves = [" +- ".join(rounded(value, std)) for value, std in centre]
+    return [
+        f"{'different' if drift.different else 'the same within chance'}: {_in_pixels(drift)}",
+        f"  most clearly at ({u:.0f}, {v:.0f}): {two_digits(drift.length[drift.worst])} px, std "
+        f"{two_digits(drift.std[drift.worst])} px",
+        f"  scale: {' +- '.join(rounded(100 * scale[0], 100 * scale[1]))} %",
+        f"  image centre: {moves[0]} px in u, {moves[1]} px in v",
+        f"  chance: {_chance(drift)} of the calibrations of an unchanged camera differ as much; the limit is "
+        f"{100 * SHARE:g} %",
+    ]
+
+
+def since_lines(drift: Drift | None) -> list[str]:
+    """What new points say of a calibration, in one line; none if they say nothing."""
+    if drift is None:
+        return []
+    word = "has changed" if drift.different else "is the same within chance"
+    return [
+        f"calibrated from these points, the camera {word}: {_in_pixels(drift)}; {_chance(drift)} of "
+        "unchanged cameras differ as much"
+    ]
+
+
+def _in_pixels(drift: Drift) -> str:
+    return f"{two_digits(drift.rms_px)} px rms over the image, std {two_digits(drift.rms_std)} px"
+
+
+def _chance(drift: Drift) -> str:
+    if drift.share < _SURELY:
+        return f"less than {100 * _SURELY:g} %"
+    return f"{format(100 * drift.share, '.0f' if drift.share > _ROUND else '.1g')} %"
+
+
+def drift_json(drift: Drift) -> dict[str, Any]:
+    """The judgement and the numbers behind it."""
+    u, v = drift.pixels[drift.worst].tolist()
+    at = {"u": u, "v": v, "px": float(drift.length[drift.worst]), "std_px": float(drift.std[drift.worst])}
+    changes = zip(_CHANGES, drift.changes.tolist(), drift.changes_std.tolist(), strict=True)
+    return {
+        "different": drift.different,
+        "share": drift.share,
+        "limit": SHARE,
+        "rms_px": drift.rms_px,
+        "expected_px": drift.rms_std,
+        "changes": {name: {"value": value, "std": std} for name, value, std in changes},
+        "worst": at,
+    }
+
+
+def details_json(old: Calibration | Camera, new: Calibration | Camera, drift: Drift) -> dict[str, Any]:
+    """The parameters that both cameras have, and the differences over the image; nan becomes None."""
+    rows = zip(drift.pixels.tolist(), drift.difference.tolist(), drift.std.tolist(), strict=True)
+    return {
+        "parameters": {
+            name: {"old": a, "new": b, "std": number_or_none(std)}
+            for name, (a, b, std) in _compared(old, new).items()
+        },
+        "image": [{"u": u, "v": v, "du": du, "dv": dv, "std_px": std} for (u, v), (du, dv), std in rows],
+    }
+
+
+def _compared(old: Calibration | Camera, new: Calibration | Camera) -> dict[str, tuple[float, float, float]]:
+    """Old value, new value and std of the difference of the parameters that two calibrations have."""
+    if not (isinstance(old, Calibration) and isinstance(new, Calibration)):
+        return {}
+    before, after = parameters(old), parameters(new)
+    stds = [camera.std_of_given | dict(camera.std) for camera in (old, new)]
+    return {
+        name: (before[name], after[name], math.hypot(*(std.get(name, math.nan) for std in stds)))
+        for name in before
+        if name in after and not name.startswith("d_")
+    }
+
+
+def _parameter_table(old: Calibration | Camera, new: Calibration | Camera) -> Table:
+    rows = [["parameter", "old", "new", "difference", "std", "in std"]]
+    for name, (a, b, std) in _compared(old, new).items():
+        if a == b and not std > 0:
+            continue
+        known = std > 0
+        difference, stated = rounded(b - a, std)
+        values = [rounded(x, std)[0] for x in (a, b)]
+        ratio = f"{(b - a) / std:+.1f}" if known else "-"
+        rows.append([labelled(name, UNITS.get(name, "")), *values, difference, stated, ratio])
+    return rows
+
+
+def _image_table(drift: Drift) -> Table:
+    """Differences in nine places of the image."""
+    rows = [["difference [px]", *_COLUMNS]]
+    low, high = drift.pixels.min(axis=0), drift.pixels.max(axis=0)
+    for k, name in enumerate(_ROWS):
+        cells = []
+        for j in range(3):
+            place = low + (high - low) * np.array([j, k]) / 2
+            nearest = int(np.argmin(((drift.pixels - place) ** 2).sum(axis=1)))
+            cells.append(" +- ".join(rounded(drift.length[nearest], drift.std[nearest])))
+        rows.append([name, *cells])
+    return rows
+
+
+def draw_drift(drift: Drift, size: tuple[int, int], kind: str = "png") -> bytes:
+    """Draw the differences over the image, in pixels and in standard deviations."""
+
+    def draw(figure: Figure) -> None:
+        length, ratio = drift.length, drift.length / np.maximum(drift.std, 1e-300)
+        first, second = figure.subplots(1, 2)
+        _map(figure, first, drift, length, "px")
+        longest = float(length.max(initial=1e-300))
+        enlarged = _LONGEST * size[0] / longest
+        u, v = np.unique(drift.pixels[:, 0]), np.unique(drift.pixels[:, 1])
+        step = max(1, round(len(u) / _ARROWS))
+        some = np.isin(drift.pixels[:, 0], u[::step]) & np.isin(drift.pixels[:, 1], v[::step])
+        first.quiver(
+            *drift.pixels[some].T, *drift.difference[some].T,
+            color="white", angles="xy", scale_units="xy", scale=1 / enlarged, width=0.005,
+        )  # fmt: skip
+        style(first, f"New minus old pixel of the same ray,\narrows enlarged {enlarged:,.2g} times")
+        first.grid(False)
+        _map(figure, second, drift, ratio, "standard deviations")
+        second.tricontour(*drift.pixels.T, ratio, levels=[_STRONG], colors=ACCENT)
+        second.plot(*drift.pixels[drift.worst], "o", color=ACCENT, fillstyle="none", markersize=10)
+        word = "different" if drift.different else "the same"
+        style(
+            second,
+            f"In standard deviations of both: {word}\n(line: {_STRONG:g}; circle: largest)",
+        )
+        second.grid(False)
+        for axes in (first, second):
+            axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal")
+            axes.set(xlabel="u [px]", ylabel="v [px]")
+
+    return picture(draw, (11.0, 4.6), 0.1, kind)
+
+
+def _map(figure: Figure, axes: Axes, drift: Drift, values: Array, unit: str) -> None:
+    """Draw values over the image, with a colour bar."""
+    levels = np.linspace(0.0, max(float(values.max()), 1e-12), _LEVELS)
+    u, v = drift.pixels.T
+    shown = axes.tricontourf(u, v, values, levels=levels, cmap="viridis")
+    figure.colorbar(shown, ax=axes, label=unit, shrink=0.8, format="%.2g")
