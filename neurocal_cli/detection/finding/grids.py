@@ -31,6 +31,7 @@ from neurocal_cli.detection.finding.overlaps import (
     split_at_folds,
     trim_overlaps,
 )
+from neurocal_cli.detection.finding.round_marks import between_round_marks
 from neurocal_cli.detection.finding.saddles import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, local_sigma, refined, stretch
 from neurocal_cli.detection.grid import Grid
@@ -60,7 +61,8 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     clutter and no third vertex tests their lines.
     """
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
-    lattices = _find(levels_of(image), wanted)
+    levels = levels_of(image)
+    lattices = [x for x in _find(levels, wanted) if not between_round_marks(levels[0], x)]
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 

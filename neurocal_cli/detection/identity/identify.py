@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.ends import End, board_ends, surrounded
 from neurocal_cli.detection.identity.placement import (
     SYMMETRIC_BOARD,
-    End,
     NoBoardError,
     Placement,
     ambiguous,
-    board_ends,
     placements,
     trimmed,
     wrong_size,
@@ -132,6 +131,8 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
     ends = board_ends(grey, grid) if alone or not alike else {}
     if not alone:  # the pattern of another plane continues beyond a fold
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
+    elif not alike and surrounded(ends):
+        return _Candidate(grid, (), False, ends)  # this is all of another board, or a lit part of the board
     possible = [
         placement
         for k in alike or range(len(board.planes))

@@ -1,9 +1,6 @@
 """Placements of a grid on a plane of the board: rotated, mirrored if seen from behind, and shifted.
 
-The board's ends exclude most of them. `board_ends` decides whether the board ends at a side of a grid, or its
-pattern continues. One more ring of squares surrounds the outer vertices. If the board ends, the brightness
-beyond the ring is the same next to dark and light squares, and the change is where the next vertices would
-be. An occluder or the image border cuts the ring at another place.
+The board's ends (`ends`) exclude most of them.
 
 Before that, `trimmed` removes outer lines of a grid that are not lines of the board. False vertices occur
 where a corner of the paper lies near the outer squares, and at corners of squares on a fold.
@@ -14,33 +11,22 @@ A grid that cannot be placed gives a `NoBoardError`, whose message says what the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import TURNS, Grid
+from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.board import Board, Plane
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
-# Sides of a grid, named by their outward directions (c, r).
-DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _SIDES: tuple[tuple[slice | int, ...], ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
 _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in TURNS)
-
-# With these limits test_identity.py classifies ends of rendered boards, occluders and image borders.
-_STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
-_RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
-_ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
-_SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark and light squares
-_AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
-_SHARE = 0.75  # least share of the squares along a side that must agree
-_FEWEST = 2  # least number of usable squares at a side
 
 # With these limits test_identity.py removes false lines, and keeps those of larger boards.
 _FEW = 0.34  # a line may be removed if at most this share of its vertices was found
@@ -110,7 +96,7 @@ def _allowed(
 ) -> bool:
     """Whether a grid's sides lie at the ends of the plane, 0 and `last`, exactly where the board ends."""
     for direction, end in ends.items():
-        if end is End.UNKNOWN:
+        if end not in (End.BOARD, End.PATTERN):
             continue
         outwards = [a * direction[0] + b * direction[1] for a, b in matrix]
         axis = 0 if outwards[0] else 1
@@ -143,113 +129,6 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
         left = Grid(pixels[top : bottom + 1, west : east + 1], int(left.dark + top + west) % 2)
 
 
-class End(Enum):
-    """State of a side of a grid in the image."""
-
-    BOARD = "the board ends there"
-    PATTERN = "the pattern goes on"
-    UNKNOWN = "hidden, blurred or outside the image"
-
-
-def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
-    """Classify the sides of a grid in a grey image, named by their directions."""
-    with np.errstate(invalid="ignore"):  # unknown values are NaN
-        sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
-        sides += _opposite(grey, grid.pixels, grid.dark)
-        return {direction: _classify(*side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
-
-
-def _classify(light: NDArray[np.bool_], profile: Array) -> End:
-    """Classify a side by the colours (N,) of its ring squares and the profiles (N, steps) across the side."""
-    ring = profile[:, _RING].mean(axis=1)
-    valid = np.abs(ring - light) < _SAME
-    count = np.count_nonzero(valid)
-    if count < max(_FEWEST, 0.6 * len(valid)):
-        return End.UNKNOWN
-    profile, ring, light = profile[valid], ring[valid], light[valid]
-    if light.all() or not light.any():
-        return End.UNKNOWN
-    beyond = profile[:, _BEYOND].mean(axis=1)
-    turns = np.abs(beyond - ring) > _SAME
-    at_line = np.abs(_crossings(profile, ring, beyond) - 1) < _AT_THE_LINE
-    agreeing, turning = np.count_nonzero(turns & at_line), np.count_nonzero(turns)
-    step = float(np.median(beyond[~light]) - np.median(beyond[light]))
-    if step > _DIFFERENT and agreeing >= _SHARE * count:
-        return End.PATTERN
-    if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
-        return End.BOARD
-    return End.UNKNOWN
-
-
-def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
-    """Position where each profile is halfway between its two ends [squares]; arbitrary if they are equal."""
-    rise = np.where(beyond > ring, 1.0, -1.0)[:, None]
-    height = rise * (profile - 0.5 * (ring + beyond)[:, None])
-    k = np.argmax(height[:, 1:] > 0, axis=1)  # the last step before the half-way level
-    rows = np.arange(len(k))
-    low, high = height[rows, k], height[rows, k + 1]
-    share = np.minimum(np.maximum(-low / np.where(high == low, 1.0, high - low), 0.0), 1.0)
-    return _STEPS[k] + share * (_STEPS[k + 1] - _STEPS[k])
-
-
-def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[NDArray[np.bool_], Array]]:
-    """Colours of the ring squares at two opposite sides, True for light, and the profiles outwards from them.
-
-    A profile is 0 at the dark and 1 at the light level, and NaN outside the image and where vertices are
-    missing. `rows` are the lines of vertices (rows, n, 2) [px] parallel to the two sides.
-    """
-    few = min(len(rows), 3)
-    ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
-    outer = np.array([[-1], [len(rows) - 1]])
-    # The colour of a square follows from the indices of its first vertex.
-    light = (np.arange(rows.shape[1] - 1) + outer + dark) % 2 == 1
-    inner = _between(0.5 * (ends[:, 0] + ends[:, 1]), np.array([0.5]))  # centres of the squares inside
-    places = _between(_beyond(ends), _ACROSS)  # (2, steps, n - 1, across, 2)
-    values = _sample(grey, np.concatenate([inner.reshape(-1, 2), places.reshape(-1, 2)]))
-    level, values = values[: light.size].reshape(light.shape), values[light.size :].reshape(places.shape[:-1])
-    padded = np.full((2, light.shape[1] + 2), np.nan)
-    padded[:, 1:-1] = level
-    # The neighbours of the inner square have the colour of the ring square; one of them may be missing.
-    before, after = padded[:, :-2], padded[:, 2:]
-    same = 0.5 * (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after))
-    contrast = np.where(light, same - level, level - same)
-    darker = np.where(light, level, same)
-    contrast[~(contrast > 0)] = np.nan
-    profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
-    return list(zip(light, profile, strict=True))
-
-
-def _beyond(ends: Array) -> Array:
-    """Extrapolate rows (2, 2 or 3, n, 2) outwards to points (2, steps, n, 2), by parabolas or lines."""
-    t = -_STEPS[:, None, None]
-    first, second = ends[:, :1], ends[:, 1:2]
-    line = first + t * (second - first)
-    if ends.shape[1] < 3:
-        return line
-    change = ends[:, 2:] - 2 * second + first
-    return line + 0.5 * t * (t - 1) * np.where(np.isnan(change), 0.0, change)
-
-
-def _between(line: Array, shares: Array) -> Array:
-    """Interpolate between neighbours on lines (..., n, 2); (..., n - 1, shares, 2) array."""
-    return line[..., :-1, None, :] + shares[:, None] * (line[..., 1:, None, :] - line[..., :-1, None, :])
-
-
-def _sample(grey: NDArray[np.generic], places: Array) -> Array:
-    """Interpolate the image linearly at places (N, 2), in float64; NaN outside."""
-    height, width = grey.shape
-    if height < 2 or width < 2:
-        return np.full(len(places), np.nan)
-    u, v = places.T
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
-    i = np.minimum(u.astype(np.intp), width - 2)
-    j = np.minimum(v.astype(np.intp), height - 2)
-    a, b = u - i, v - j
-    upper, lower = ((1 - a) * grey[j + k, i] + a * grey[j + k, i + 1] for k in (0, 1))
-    return np.where(inside, (1 - b) * upper + b * lower, np.nan)
-
-
 class NoBoardError(NeurocalError):
     """The image does not show the board, or not enough of it to locate its points.
 
@@ -275,6 +154,13 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
         return NoBoardError(
             f"detected no board of {wanted} inner vertices, only parts of a pattern of {_size(shape)}; "
             "show the whole board, sharp and evenly lit",
+            shape,
+        )
+    known = not {End.UNKNOWN, End.PATTERN} & set(ends)
+    if len(board.planes) == 1 and End.STOPS in ends and known and _fits(shape, board.planes[0]):
+        return NoBoardError(
+            f"detected {_size(shape)} inner vertices with ends on all sides, but the board has {wanted}; "
+            "give the size of the board in the image, or light the whole board evenly",
             shape,
         )
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
@@ -305,6 +191,12 @@ def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
         f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
         "axes, or take the image from nearer"
     )
+
+
+def _fits(shape: tuple[int, int], plane: Plane) -> bool:
+    """Whether a grid of this shape may be a part of the plane."""
+    (short, long), (narrow, wide) = sorted(shape), sorted((plane.cols, plane.rows))
+    return short <= narrow and long <= wide
 
 
 def _in_order(shape: tuple[int, int], board: Board) -> tuple[int, int]:

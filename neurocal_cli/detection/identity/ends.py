@@ -1,0 +1,153 @@
+"""Whether the board ends at a side of a grid, or its pattern continues.
+
+One more ring of squares surrounds the outer vertices. If the board ends, the brightness beyond the ring is
+the same next to dark and light squares, and the change is where the next vertices would be. An occluder, a
+shadow or the image border cuts the ring at another place. A shadow may begin just at a line of the board.
+What lies beyond is then dark at one side and light at the others, so that side is not taken for an end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.grid import Grid
+
+# Sides of a grid, named by their outward directions (c, r).
+DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
+# With these limits test_identity.py classifies ends of rendered boards, occluders and image borders.
+_STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
+_RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
+_ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
+_SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark and light squares
+_AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
+_SHARE = 0.75  # least share of the squares along a side that must agree
+_FEWEST = 2  # least number of usable squares at a side
+
+
+class End(Enum):
+    """State of a side of a grid in the image."""
+
+    BOARD = "the board ends there"
+    STOPS = "the pattern stops there: the board ends, or something hides the rest of it"
+    PATTERN = "the pattern goes on"
+    UNKNOWN = "hidden, blurred or outside the image"
+
+
+def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
+    """Classify the sides of a grid in a grey image, named by their directions."""
+    with np.errstate(invalid="ignore"):  # unknown values are NaN
+        sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
+        sides += _opposite(grey, grid.pixels, grid.dark)
+        found = [_classify(*side) for side in sides]
+    margins = [light for end, light in found if end is End.BOARD]
+    # The margin of most sides; the light one if there are as many dark ones, which may be shadows.
+    usual = 2 * sum(margins) >= len(margins)
+    return {
+        direction: End.STOPS if end is End.BOARD and light != usual else end
+        for direction, (end, light) in zip(DIRECTIONS, found, strict=True)
+    }
+
+
+def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
+    """Whether the pattern is seen to stop at all sides of a grid."""
+    return set(ends.values()) <= {End.BOARD, End.STOPS} and len(ends) == len(DIRECTIONS)
+
+
+def _classify(light: NDArray[np.bool_], profile: Array) -> tuple[End, bool]:
+    """Classify a side by the colours (N,) of its ring squares and the profiles (N, steps) across the side.
+
+    Also returns whether it is light beyond the ring.
+    """
+    ring = profile[:, _RING].mean(axis=1)
+    valid = np.abs(ring - light) < _SAME
+    count = np.count_nonzero(valid)
+    if count < max(_FEWEST, 0.6 * len(valid)):
+        return End.UNKNOWN, False
+    profile, ring, light = profile[valid], ring[valid], light[valid]
+    if light.all() or not light.any():
+        return End.UNKNOWN, False
+    beyond = profile[:, _BEYOND].mean(axis=1)
+    turns = np.abs(beyond - ring) > _SAME
+    at_line = np.abs(_crossings(profile, ring, beyond) - 1) < _AT_THE_LINE
+    agreeing, turning = np.count_nonzero(turns & at_line), np.count_nonzero(turns)
+    next_to_dark, next_to_light = float(np.median(beyond[~light])), float(np.median(beyond[light]))
+    step, margin = next_to_dark - next_to_light, bool(next_to_dark + next_to_light > 1)
+    if step > _DIFFERENT and agreeing >= _SHARE * count:
+        return End.PATTERN, margin
+    if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
+        return End.BOARD, margin
+    return (End.STOPS if -_DIFFERENT < step < _SAME else End.UNKNOWN), margin
+
+
+def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
+    """Position where each profile is halfway between its two ends [squares]; arbitrary if they are equal."""
+    rise = np.where(beyond > ring, 1.0, -1.0)[:, None]
+    height = rise * (profile - 0.5 * (ring + beyond)[:, None])
+    k = np.argmax(height[:, 1:] > 0, axis=1)  # the last step before the half-way level
+    rows = np.arange(len(k))
+    low, high = height[rows, k], height[rows, k + 1]
+    share = np.minimum(np.maximum(-low / np.where(high == low, 1.0, high - low), 0.0), 1.0)
+    return _STEPS[k] + share * (_STEPS[k + 1] - _STEPS[k])
+
+
+def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[NDArray[np.bool_], Array]]:
+    """Colours of the ring squares at two opposite sides, True for light, and the profiles outwards from them.
+
+    A profile is 0 at the dark and 1 at the light level, and NaN outside the image and where vertices are
+    missing. `rows` are the lines of vertices (rows, n, 2) [px] parallel to the two sides.
+    """
+    few = min(len(rows), 3)
+    ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
+    outer = np.array([[-1], [len(rows) - 1]])
+    # The colour of a square follows from the indices of its first vertex.
+    light = (np.arange(rows.shape[1] - 1) + outer + dark) % 2 == 1
+    inner = _between(0.5 * (ends[:, 0] + ends[:, 1]), np.array([0.5]))  # centres of the squares inside
+    places = _between(_beyond(ends), _ACROSS)  # (2, steps, n - 1, across, 2)
+    values = _sample(grey, np.concatenate([inner.reshape(-1, 2), places.reshape(-1, 2)]))
+    level, values = values[: light.size].reshape(light.shape), values[light.size :].reshape(places.shape[:-1])
+    padded = np.full((2, light.shape[1] + 2), np.nan)
+    padded[:, 1:-1] = level
+    # The neighbours of the inner square have the colour of the ring square; one of them may be missing.
+    before, after = padded[:, :-2], padded[:, 2:]
+    same = 0.5 * (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after))
+    contrast = np.where(light, same - level, level - same)
+    darker = np.where(light, level, same)
+    contrast[~(contrast > 0)] = np.nan
+    profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
+    return list(zip(light, profile, strict=True))
+
+
+def _beyond(ends: Array) -> Array:
+    """Extrapolate rows (2, 2 or 3, n, 2) outwards to points (2, steps, n, 2), by parabolas or lines."""
+    t = -_STEPS[:, None, None]
+    first, second = ends[:, :1], ends[:, 1:2]
+    line = first + t * (second - first)
+    if ends.shape[1] < 3:
+        return line
+    change = ends[:, 2:] - 2 * second + first
+    return line + 0.5 * t * (t - 1) * np.where(np.isnan(change), 0.0, change)
+
+
+def _between(line: Array, shares: Array) -> Array:
+    """Interpolate between neighbours on lines (..., n, 2); (..., n - 1, shares, 2) array."""
+    return line[..., :-1, None, :] + shares[:, None] * (line[..., 1:, None, :] - line[..., :-1, None, :])
+
+
+def _sample(grey: NDArray[np.generic], places: Array) -> Array:
+    """Interpolate the image linearly at places (N, 2), in float64; NaN outside."""
+    height, width = grey.shape
+    if height < 2 or width < 2:
+        return np.full(len(places), np.nan)
+    u, v = places.T
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+    i = np.minimum(u.astype(np.intp), width - 2)
+    j = np.minimum(v.astype(np.intp), height - 2)
+    a, b = u - i, v - j
+    upper, lower = ((1 - a) * grey[j + k, i] + a * grey[j + k, i + 1] for k in (0, 1))
+    return np.where(inside, (1 - b) * upper + b * lower, np.nan)
