@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.camera.remapping import undistort_image
+    from neurocal_cli.detection.board_size import find_board
     from neurocal_cli.detection.detect import detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
@@ -71,6 +72,7 @@ _HOMES = {
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
+    "find_board": "detection.board_size",
     "find_drift": "calibration.drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
@@ -117,6 +119,7 @@ __all__ = [
     "evaluate_lens",
     "evaluate_rig",
     "evaluate_stereo",
+    "find_board",
     "find_drift",
     "fit_lens",
     "fit_lens_cameras",

@@ -23,7 +23,7 @@ TOPICS = {
     "Calibrating": ["calibrate", "Calibration", "Correspondences", "Camera", "Intrinsics", "Pose"],
     "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_camera_rig", "evaluate_lens",
                 "find_drift", "Drift"],
-    "Points from images": ["detect_points", "Board", "read_board", "read_image"],
+    "Points from images": ["detect_points", "find_board", "Board", "read_board", "read_image"],
     "Removing distortion": ["undistort_points", "undistort_image"],
     "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate"],
     "Many cameras": ["calibrate_rig", "CameraRig", "triangulate_many"],

@@ -5,16 +5,22 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.frames import detections, of_one_size, videos_as_frames, watch_for_images
+from neurocal_cli.commands.requested_board import (
+    board_in_images,
+    check_size,
+    complain_of,
+    described_board,
+)
 from neurocal_cli.commands.streams import (
     ProgressBar,
-    complain,
     debugging,
     note,
     note_once,
@@ -26,6 +32,7 @@ from neurocal_cli.commands.streams import (
 )
 from neurocal_cli.errors import NeurocalError, UsageError
 from neurocal_cli.files.image_files import find_images, stated_sizes, view_names
+from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -33,6 +40,7 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.measuring import Points
     from neurocal_cli.observations.board import Board
 
+_ENOUGH = 3  # images that have arrived
 _SECOND = 2  # images of another size that are no longer a single stray one
 
 
@@ -84,6 +92,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     without="no",
     positive=True,
 )
+@options.path("--save-board", "BOARD.yaml", "Write the board, as it was described or found, to this file.")
 @options.summary
 @options.output("POINTS.csv", "Write the points to this file.")
 def detect(
@@ -96,14 +105,17 @@ def detect(
     frames: int,
     cache: str | None,
     watch: float | None,
+    save_board: str | None,
     as_json: bool,
     output: str,
 ) -> None:
     """Detect chessboards in images and measure points on them.
 
-    Describe the board by --cols, --rows and --square, or by a board file. Each image becomes a view
-    with the name of its file. A board that is partly hidden or cut off by the image is used if enough
-    of its outer border is visible to tell which part it is.
+    The number of columns and rows is found if neither these nor a board file are given; at least some
+    images must show the whole board then. Give the side of a square by --square; without it, the unit
+    of all lengths is a square. Each image becomes a view with the name of its file. A board that is
+    partly hidden or cut off by the image is used if enough of its outer border is visible to tell which
+    part it is.
 
     A point has the same id in all images. Vertex 0:0 is the corner where OpenCV's
     findChessboardCorners begins; the inner square there is dark. If the numbers of columns and rows
@@ -121,6 +133,8 @@ def detect(
     \b
     Examples:
       neurocal sample sample_data
+      neurocal detect sample_data/board*.png --square 25 -o points.csv
+      neurocal detect sample_data/board*.png --save-board found.yaml -o points.csv
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
           --unit mm -o points.csv
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
@@ -136,24 +150,25 @@ def detect(
     if watch is not None:
         options.note_unused("with --watch, which waits for single images", "jobs", "frames")
     preparation.compute_in_one_thread()
-    target = _measured(board.read())
-    from neurocal_cli.detection.batch import DetectionCache, DetectionOptions
-    from neurocal_cli.files.board_yaml import format_board
-
-    kind, known = cast("Points", points), None
     if cache is not None:
         preparation.check_folder("--cache", cache)
-        known = DetectionCache(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(target)}")
-    wanted = DetectionOptions(target, kind, gamma, overlay is not None, debugging(), known)
-    if watch is None:
-        outcomes = _examined(images, wanted, board.file, output, overlay, jobs, frames)
-    else:
-        outcomes = _watched(images, wanted, board.file, output, watch)
-    outcomes = of_one_size(outcomes)
+    described, enough = described_board(board), 1 if watch is None else _ENOUGH
+    wanted = _Request(described, board, cast("Points", points), gamma, overlay is not None, cache, enough)
+    outputs = (output, save_board)
+    with repeatable_stdin() if described is None and "-" in images else nullcontext():
+        if watch is None:
+            outcomes = _examined(images, wanted, outputs, overlay, jobs, frames)
+        else:
+            outcomes = _watched(images, wanted, outputs, watch)
+    outcomes, target = of_one_size(outcomes), wanted.board
+    assert target is not None
     _report(outcomes, target, as_json)
     from neurocal_cli.detection.detect import gather
+    from neurocal_cli.files.board_yaml import format_board
     from neurocal_cli.files.points_csv import format_points
 
+    if save_board is not None:
+        write_whole(save_board, format_board(target))
     text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
     if overlay is not None:
         make_folder(overlay)
@@ -163,25 +178,39 @@ def detect(
     write_whole(output, text)
 
 
-def _measured(board: Board | None) -> Board:
-    """The board in its measured size; a UsageError if there is none."""
-    if board is None:
-        raise UsageError(options.NO_SIZE)
-    if board.distances:
-        scale = board.scale
-        said = f"; {scale.contradiction}" if scale.contradiction else ""
-        note(
-            f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
-            f"{100 * scale.std:.2g} %{said}"
-        )
-    return board.as_measured()
+@dataclass
+class _Request:
+    """What is asked for; the board may have to be found first."""
+
+    board: Board | None
+    described: options.BoardOptions
+    points: Points
+    gamma: float | None
+    overlay: bool
+    cache: str | None
+    enough: int  # images from which a board can be found if its ends are not seen
+
+    def options(self, paths: Sequence[str]) -> DetectionOptions:
+        """The options for detection in these images, in which the board's size is found if it is not known.
+
+        Raises NoBoardError if it cannot be found.
+        """
+        from neurocal_cli.detection.batch import DetectionCache, DetectionOptions
+        from neurocal_cli.files.board_yaml import format_board
+
+        if self.board is None:
+            self.board = board_in_images(paths, self.described, self.enough)
+        known = None
+        if self.cache is not None:
+            request = f"{self.points} {self.gamma!r} {self.overlay} {format_board(self.board)}"
+            known = DetectionCache(self.cache, request)
+        return DetectionOptions(self.board, self.points, self.gamma, self.overlay, debugging(), known)
 
 
 def _examined(
     words: tuple[str, ...],
-    wanted: DetectionOptions,
-    board_file: str | None,
-    output: str,
+    wanted: _Request,
+    outputs: tuple[str | None, ...],
     overlay: str | None,
     jobs: int | None,
     frames: int,
@@ -191,7 +220,7 @@ def _examined(
 
     given = find_images(words)
     view_names(given)  # no name twice
-    preparation.check_outputs((output,), (*given, board_file))
+    preparation.check_outputs(outputs, (*given, wanted.described.file))
     with videos_as_frames(given, frames) as (paths, folder):
         names = view_names(paths)
         sizes = Counter(size for size in stated_sizes(paths) if size is not None)
@@ -203,25 +232,25 @@ def _examined(
             folders = {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}
             if os.path.realpath(overlay) in folders:
                 raise UsageError(f"--overlay {overlay} is the folder of the images; give another folder")
-        outcomes = []
+        outcomes, prepared = [], wanted.options(paths)
         with ProgressBar() as progress:
-            for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
+            for outcome in detect_files(paths, prepared, jobs or default_jobs(len(paths))):
                 outcomes.append(replace(outcome, problem=outcome.problem.removeprefix(folder)))
                 progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
     return dict(zip(names, outcomes, strict=True))
 
 
 def _watched(
-    words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
+    words: tuple[str, ...], wanted: _Request, outputs: tuple[str | None, ...], seconds: float
 ) -> dict[str, Outcome]:
     """Outcomes of the images that have arrived, by the names of their views."""
     if "-" in words:
         raise UsageError("--watch needs folders or patterns; standard input has one image")
-    preparation.check_outputs((output,), (board_file,))
-    outcomes = watch_for_images(lambda: find_images(words), wanted, seconds)
+    preparation.check_outputs(outputs, (wanted.described.file,))
+    outcomes = watch_for_images(lambda: find_images(words), wanted.options, seconds)
     if not outcomes:
         raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
-    preparation.check_outputs((output,), outcomes)
+    preparation.check_outputs(outputs, outcomes)
     return dict(zip(view_names(outcomes), outcomes.values(), strict=True))
 
 
@@ -229,8 +258,7 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
     """Report failed images with the reason, and remarks common to several images once."""
     found = detections(outcomes)
     problems = {name: outcome.problem for name, outcome in outcomes.items() if outcome.problem}
-    for problem in problems.values() if len(outcomes) > 1 else ():
-        complain(problem)
+    complain_of(outcomes.values(), board)
     remarks: dict[str, list[str]] = {}
     for name, outcome in outcomes.items():
         for text in outcome.notes:
@@ -238,7 +266,7 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
     note_once(remarks)
     warn(*dict.fromkeys(text for detection in found.values() for text in detection.warnings))
     warn(*_mixed_orientations(outcomes.values()))
-    warn(*_another_board([_shown(outcome) for outcome in outcomes.values()], board))
+    check_size(outcomes.values(), board)
     if not found and len(outcomes) == 1:
         raise NeurocalError(*problems.values())
     if not found:
@@ -269,27 +297,4 @@ def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:
         f"the images have different EXIF orientations ({counts}), so their image centres differ although "
         "they may be of one camera; remove the orientation from all files, for example with `exiftool "
         "-Orientation= FILE`, and detect again"
-    ]
-
-
-def _shown(outcome: Outcome) -> tuple[int, int] | None:
-    """Columns and rows of inner vertices that an image shows of a board of one plane."""
-    if outcome.detection is None:
-        return outcome.shown
-    ids = [label.rpartition("/")[2].split(":") for label in outcome.detection.ids]
-    columns = {one[-2] for one in ids if one[0] != "h"}
-    rows = {one[-1] for one in ids if one[0] != "v"}
-    return len(columns), len(rows)
-
-
-def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
-    """Suggest another board size that most images show: often squares were counted instead of vertices."""
-    (size, count), *_ = Counter(shown).most_common(1)
-    plane = board.planes[0]
-    given = size == (plane.cols, plane.rows)
-    if size is None or given or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
-        return []
-    return [
-        f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
-        "for; count inner vertices, not squares"
     ]

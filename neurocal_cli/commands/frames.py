@@ -84,32 +84,48 @@ def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
 
 
 def watch_for_images(
-    find: Callable[[], Sequence[str]], options: DetectionOptions, seconds: float
+    find: Callable[[], Sequence[str]],
+    prepare: Callable[[Sequence[str]], DetectionOptions],
+    seconds: float,
 ) -> dict[str, Outcome]:
     """Detect boards in images as they arrive, until a timeout or an interrupt by the user.
 
-    `find` returns the paths of the present images; `seconds` is the time to wait for another one. Returns the
-    outcomes by path, in the order in which the images arrived.
+    `find` returns the paths of the present images, and `prepare` the options for images that have arrived, or
+    raises NoBoardError if more are needed to find the board. `seconds` is the time to wait for another one.
+    Returns the outcomes by path, in the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
+    from neurocal_cli.detection.identity.placement import NoBoardError
 
     outcomes: dict[str, Outcome] = {}
+    waiting: list[str] = []  # for the size of the board
     sizes: dict[str, tuple[int, float]] = {}
     last = time.monotonic()
     try:
         while time.monotonic() - last < seconds:
-            for path in _whole(find, sizes, outcomes):
-                outcomes[path] = detect_file(path, options)
-                _tell(path, outcomes, options)
+            for path in _whole(find, sizes, {*outcomes, *waiting}):
+                waiting.append(path)
+                last = time.monotonic()
+                try:
+                    options = prepare(waiting)
+                except NoBoardError as error:
+                    complain(f"{path}: {error}")
+                    continue
+                for name in waiting:
+                    outcomes[name] = detect_file(name, options)
+                    _tell(name, outcomes, options)
+                waiting.clear()
                 last = time.monotonic()
             time.sleep(_PAUSE)
     except KeyboardInterrupt:
         say("watching ends")
+    if waiting:
+        prepare(waiting)  # says why not
     return outcomes
 
 
 def _whole(
-    find: Callable[[], Sequence[str]], sizes: dict[str, tuple[int, float]], known: dict[str, Outcome]
+    find: Callable[[], Sequence[str]], sizes: dict[str, tuple[int, float]], known: set[str]
 ) -> list[str]:
     """New images that have not changed since the last check."""
     try:

@@ -242,6 +242,27 @@ class BoardOptions:
             raise UsageError(NO_SIZE)
         return Board.single(cols, rows, square, "mm" if unit is None else unit)
 
+    def read_or_unknown(self) -> Board | None:
+        """The board, for a command that finds its size itself: None without a size; the square may lack."""
+        if self.file is not None or (self.cols is None) != (self.rows is None):
+            return self.read()
+        square, unit = self.side
+        if self.cols is None or self.rows is None:
+            return None
+        from neurocal_cli.observations.board import Board
+
+        return Board.single(self.cols, self.rows, square, unit)
+
+    @property
+    def side(self) -> tuple[float, str]:
+        """Side of a square and its unit; if the side is unknown, it is the unit."""
+        self.check_unit()
+        if self.square is not None:
+            return self.square, "mm" if self.unit is None else self.unit
+        if self.unit is not None:
+            raise UsageError("--unit is the unit of --square, which is missing; give both")
+        return 1.0, "squares"
+
     def check_unit(self) -> None:
         """Refuse a unit that cannot be stored in a file, with a UsageError."""
         unit = self.unit

@@ -9,7 +9,8 @@ image -> pyramid -> saddle points           `finding.saddles`
 -> links along edges -> seeds of lattices   `finding.links`
 -> growing lattices                         `finding.grow` (`finding.lattice`)
 -> grids, one for each plane                `finding.grids` (`overlaps`, `straighten`, `wide_lens`)
--> identity: the board's coordinates        `identity.identify` (`identity.placement`)
+-> size of the board, if it is not given    `board_size`
+-> identity: the board's coordinates        `identity.identify` (`identity.placement`, `identity.ends`)
 -> edge fits to all pixels nearby           `fitting.grid_fit` (`grid_edges`, `initial_fit`,
                                             `common_parameters`, `edge_fit`, `edge_profile`, `shading`)
 -> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.wide_map`, `fitting.map_fit`

@@ -119,7 +119,8 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     write(folder / "i_white.bmp", np.full((300, 400), 255, np.uint8))
     result = detect(folder, folder / "absent.png", *BOARD)
     assert result.exit_code == 0
-    *lines, summary = result.stderr.splitlines()
+    *lines, remedy, summary = result.stderr.splitlines()
+    assert remedy == "3 of these 8 images: show the whole board, sharp and evenly lit"
     expected = {
         "c_cut.png": "cut off",
         "d_empty.png": "is empty",
@@ -233,8 +234,8 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), "the size of the board is missing"),
-        (("--cols", 9, "--rows", 6), "the size of the board is missing"),
+        (("--cols", 9), "the size of the board is missing"),
+        (("--unit", "inch"), "--unit is the unit of --square, which is missing"),
         (("--board", "b.yaml", "--cols", 9), "leave out --cols"),
         (("--cols", 9, "--rows", 1, "--square", 25), "--rows"),
         (("--cols", 9, "--rows", 6, "--square", -1), "--square"),
@@ -333,3 +334,56 @@ def test_detected_points_calibrate_the_camera(tmp_path: Path) -> None:
     for name, value in truth.items():
         assert getattr(camera.intrinsics, name) == pytest.approx(value, abs=0.1)
     assert camera.rmse_px < 0.01
+
+
+def test_the_size_of_the_board_is_found_and_told_first(folder: Path, tmp_path: Path) -> None:
+    board, points = tmp_path / "board.yaml", tmp_path / "p.csv"
+    result = detect(folder, "--square", 25, "--save-board", board, "-o", points)
+    assert result.exit_code == 0
+    assert result.stderr.splitlines()[0] == "found a chessboard of 9 x 6 inner vertices"
+    given = detect(folder, *BOARD)
+    assert points.read_text() == given.stdout
+    assert detect(folder, "--board", board).stdout == given.stdout
+
+
+def test_without_the_side_of_a_square_it_is_the_unit(folder: Path) -> None:
+    result = detect(folder, "--cols", 9, "--rows", 6)
+    assert result.exit_code == 0
+    assert result.stderr.startswith(
+        "note: the side of a square is not given, so it is the unit of all lengths"
+    )
+    assert "# unit: squares\n" in result.stdout
+    assert "\nboard01,h:0:0,0.5,0.0,0.0," in result.stdout
+
+
+def test_a_board_is_found_in_an_image_from_standard_input(folder: Path) -> None:
+    result = run("detect", "-", "--square", 25, stdin=(folder / "board01.png").read_bytes())
+    assert result.exit_code == 0
+    assert "\nstdin,h:0:0,12.5,0.0,0.0," in result.stdout
+
+
+def test_without_a_board_in_any_image_there_is_no_size(tmp_path: Path) -> None:
+    write(tmp_path / "none.png", np.zeros((300, 400), np.uint8))
+    result = detect(tmp_path / "none.png", "--square", 25, "--save-board", tmp_path / "b.yaml")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "no image shows a chessboard" in result.stderr
+    assert not (tmp_path / "b.yaml").exists()
+
+
+def test_the_remedy_of_the_commonest_reason_is_told_once(folder: Path) -> None:
+    for name in ("a", "b"):
+        write(folder / f"{name}.png", np.zeros((300, 400), np.uint8))
+    lines = detect(folder, *BOARD).stderr.splitlines()
+    assert lines[0] == f"{folder / 'a.png'}: no board detected"
+    assert lines[2] == "2 of these 2 images: show the whole board, sharp and evenly lit"
+
+
+def test_a_board_that_most_images_contradict_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from neurocal_cli.commands import requested_board
+
+    monkeypatch.setattr(requested_board, "_shown", lambda outcome: (8, 5))
+    result = detect(folder, *BOARD)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "most images show 8 x 5 inner vertices, and 9 x 6 were asked for; give --cols 8" in result.stderr

@@ -19,7 +19,7 @@ from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, read_image
-from neurocal_cli.commands.detect import _another_board, _shown
+from neurocal_cli.commands.requested_board import _shown, another_size
 from neurocal_cli.commands.show import terminal
 from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
@@ -70,7 +70,7 @@ def test_another_board_in_most_images_is_named_once() -> None:
 def test_a_board_of_which_most_images_show_another_size_is_questioned(
     shown: list[tuple[int, int] | None], named: bool
 ) -> None:
-    assert bool(_another_board(shown, Board.single(9, 7, 25.0))) == named
+    assert (another_size(shown, Board.single(9, 7, 25.0)) is not None) == named
 
 
 @pytest.mark.parametrize("kind", ["midpoints", "vertices", "edges"])

@@ -1,8 +1,9 @@
 """Tell a lattice between round marks from a chessboard.
 
-Between staggered circles the brightness has saddle points like those at the vertices of squares, and they form
-a grid. But a circle reaches equally far in all directions, where a square reaches 1.4 times as far towards its
-corners as towards its sides. Overexposed squares are smaller and blurred ones are rounder, but not so much.
+Between staggered circles the brightness has saddle points like those at the vertices of squares, and they
+form a grid. But a circle reaches equally far in all directions, where a square reaches 1.4 times as far
+towards its corners as towards its sides. Overexposed squares are smaller and blurred ones are rounder, but
+not so much.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ _ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a squa
 _SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark and light squares
 _AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
 _SHARE = 0.75  # least share of the squares along a side that must agree
+_OUTSIDE = 0.5  # share of the profiles that leave the image above which the side does
 _FEWEST = 2  # least number of usable squares at a side
 
 
@@ -34,8 +35,10 @@ class End(Enum):
 
     BOARD = "the board ends there"
     STOPS = "the pattern stops there: the board ends, or something hides the rest of it"
+    DIM = "the same in the dark, where the board ends before light at other sides: it may be a shadow"
     PATTERN = "the pattern goes on"
-    UNKNOWN = "hidden, blurred or outside the image"
+    OUTSIDE = "outside the image"
+    UNKNOWN = "hidden or blurred"
 
 
 def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
@@ -48,21 +51,23 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
     # The margin of most sides; the light one if there are as many dark ones, which may be shadows.
     usual = 2 * sum(margins) >= len(margins)
     return {
-        direction: End.STOPS if end is End.BOARD and light != usual else end
+        direction: End.DIM if end is End.BOARD and light != usual else end
         for direction, (end, light) in zip(DIRECTIONS, found, strict=True)
     }
 
 
 def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
     """Whether the pattern is seen to stop at all sides of a grid."""
-    return set(ends.values()) <= {End.BOARD, End.STOPS} and len(ends) == len(DIRECTIONS)
+    return len(ends) == len(DIRECTIONS) and not {End.PATTERN, End.OUTSIDE, End.UNKNOWN} & set(ends.values())
 
 
-def _classify(light: NDArray[np.bool_], profile: Array) -> tuple[End, bool]:
+def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool_]) -> tuple[End, bool]:
     """Classify a side by the colours (N,) of its ring squares and the profiles (N, steps) across the side.
 
     Also returns whether it is light beyond the ring.
     """
+    if outside.mean() > _OUTSIDE:
+        return End.OUTSIDE, False
     ring = profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - light) < _SAME
     count = np.count_nonzero(valid)
@@ -95,11 +100,14 @@ def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
     return _STEPS[k] + share * (_STEPS[k + 1] - _STEPS[k])
 
 
-def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[NDArray[np.bool_], Array]]:
+def _opposite(
+    grey: NDArray[np.generic], rows: Array, dark: int
+) -> list[tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]]:
     """Colours of the ring squares at two opposite sides, True for light, and the profiles outwards from them.
 
-    A profile is 0 at the dark and 1 at the light level, and NaN outside the image and where vertices are
-    missing. `rows` are the lines of vertices (rows, n, 2) [px] parallel to the two sides.
+    The third result says which profiles leave the image. A profile is 0 at the dark and 1 at the light level,
+    and NaN outside the image and where vertices are missing. `rows` are the lines of vertices (rows, n, 2)
+    [px] parallel to the two sides.
     """
     few = min(len(rows), 3)
     ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
@@ -119,7 +127,8 @@ def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[N
     darker = np.where(light, level, same)
     contrast[~(contrast > 0)] = np.nan
     profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
-    return list(zip(light, profile, strict=True))
+    outside = np.any(np.isnan(values[:, -1]) & np.isfinite(places[:, -1, ..., 0]), axis=-1)
+    return [(light[k], profile[k], outside[k]) for k in (0, 1)]
 
 
 def _beyond(ends: Array) -> Array:

@@ -118,7 +118,7 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
         others = [c for c in every if not c.placements]
         usable = [c for c in usable if not any(_may_be_a_piece(c, other) for other in others)]
     if not usable:
-        raise wrong_size(board, largest.grid, list(largest.ends.values()))
+        raise wrong_size(board, largest.grid, largest.ends)
     return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.grid import TURNS, Grid
-from neurocal_cli.detection.identity.ends import End
+from neurocal_cli.detection.identity.ends import End, surrounded
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.observations.board import Board, Plane
 
@@ -140,13 +140,13 @@ class NoBoardError(NeurocalError):
         self.shown = shown
 
 
-def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
+def wrong_size(board: Board, grid: Grid, ends: Mapping[tuple[int, int], End]) -> NoBoardError:
     """Make the error about a grid that does not fit on the board."""
     wanted = _sizes(board)
     shape = _in_order(grid.shape, board)
     if len(board.planes) == 1:
         plane = board.planes[0]
-        if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
+        if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends.values():
             return NoBoardError(
                 f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
             )
@@ -156,8 +156,8 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
             "show the whole board, sharp and evenly lit",
             shape,
         )
-    known = not {End.UNKNOWN, End.PATTERN} & set(ends)
-    if len(board.planes) == 1 and End.STOPS in ends and known and _fits(shape, board.planes[0]):
+    doubtful = surrounded(ends) and set(ends.values()) != {End.BOARD}
+    if doubtful and len(board.planes) == 1 and _fits(shape, board.planes[0]):
         return NoBoardError(
             f"detected {_size(shape)} inner vertices with ends on all sides, but the board has {wanted}; "
             "give the size of the board in the image, or light the whole board evenly",
@@ -179,7 +179,7 @@ def ambiguous(board: Board, grids: Sequence[Grid], rms: float) -> NoBoardError:
         shape = _in_order(part.shape, board)
         return NoBoardError(
             f"detected {_size(shape)} of {_sizes(board)} inner vertices, but it is ambiguous "
-            "which ones; show the whole board, or its outer border on more sides",
+            "which ones; show its outer border on more sides, or correct the size if this is all of it",
             shape,
         )
     if len(grids) < len(board.planes):

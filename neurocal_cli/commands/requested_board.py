@@ -1,0 +1,138 @@
+"""The board of ``neurocal detect``: described by the user, or found in the images, and compared with them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from math import gcd
+from typing import TYPE_CHECKING
+
+from neurocal_cli.commands.options import BoardOptions
+from neurocal_cli.commands.streams import complain, note, say, warn
+from neurocal_cli.errors import NeurocalError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from neurocal_cli.detection.batch import Outcome
+    from neurocal_cli.observations.board import Board
+
+Size = tuple[int, int]
+
+_SELDOM = 0.2  # ratio of images with the described size to those with another; boards are seen in mirrors
+_FEW = 3  # images; fewer may by chance show the same part of the board
+
+
+def described_board(options: BoardOptions) -> Board | None:
+    """The described board in its measured size; None if its size is to be found."""
+    board = options.read_or_unknown()
+    if options.file is None and options.square is None:
+        note("the side of a square is not given, so it is the unit of all lengths; give it by --square")
+    if board is None or not board.distances:
+        return board
+    scale = board.scale
+    said = f"; {scale.contradiction}" if scale.contradiction else ""
+    note(
+        f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
+        f"{100 * scale.std:.2g} %{said}"
+    )
+    return board.as_measured()
+
+
+def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) -> Board:
+    """Find the size of the board in image files, and say what it is; see `find_board`.
+
+    Unless an image shows all ends of the board, it is a NoBoardError to have less than `enough` images.
+    """
+    from neurocal_cli.detection.board_size import found_size
+    from neurocal_cli.detection.identity.placement import NoBoardError
+    from neurocal_cli.observations.board import Board
+
+    found = found_size(_readable(_spread(paths)))
+    if not found.sure and len(paths) < enough:
+        raise NoBoardError(
+            "it is not certain where the board ends; more images of the whole board are needed"
+        )
+    (cols, rows), (square, unit) = found.size, options.side
+    say(f"found a chessboard of {cols} x {rows} inner vertices")
+    if not found.sure:
+        warn(
+            f"no image shows that the board ends on all sides; if it has more than {cols} x {rows} inner "
+            "vertices, give their numbers by --cols and --rows"
+        )
+    return Board.single(cols, rows, square, unit)
+
+
+def _spread(paths: Sequence[str]) -> list[str]:
+    """The same paths, so ordered that the first ones are spread over all: neighbours may be alike."""
+    step = next(k for k in range(round(0.38 * len(paths)) or 1, len(paths) + 2) if gcd(k, len(paths)) == 1)
+    return [paths[k * step % len(paths)] for k in range(len(paths))]
+
+
+def _readable(paths: Sequence[str]) -> Iterator[NDArray[np.generic]]:
+    """The grey images of files, without those that cannot be read, which detection reports."""
+    from neurocal_cli.files.images import read_image
+
+    for path in paths:
+        try:
+            grey = read_image(path).grey
+        except NeurocalError:
+            continue
+        yield grey
+
+
+def check_size(outcomes: Collection[Outcome], board: Board) -> None:
+    """Compare the size of a described board with what most images show, and warn if it differs.
+
+    Another board may fit as a part of the described one, and its points would have wrong coordinates. So it
+    is a NeurocalError if hardly an image shows the described size.
+    """
+    shown = [_shown(outcome) for outcome in outcomes]
+    size = another_size(shown, board)
+    if size is None:
+        return
+    given = (board.planes[0].cols, board.planes[0].rows)
+    seen, asked = ("{} x {}".format(*each) for each in (size, given))
+    told = f"most images show {seen} inner vertices, and {asked} were asked for"
+    found = any(outcome.detection is not None for outcome in outcomes)
+    if found and len(shown) >= _FEW and shown.count(given) < _SELDOM * shown.count(size):
+        raise NeurocalError(
+            f"{told}; give --cols {size[0]} --rows {size[1]}, the numbers of inner vertices, not squares"
+        )
+    warn(f"{told}; count inner vertices, not squares")
+
+
+def another_size(shown: Sequence[Size | None], board: Board) -> Size | None:
+    """Another size than that of a board of one plane, if most images show it; often squares were counted."""
+    (size, count), *_ = Counter(shown).most_common(1)
+    plane = board.planes[0]
+    given = size == (plane.cols, plane.rows)
+    if given or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
+        return None
+    return size
+
+
+def _shown(outcome: Outcome) -> Size | None:
+    """Columns and rows of inner vertices that an image shows of a board of one plane."""
+    if outcome.detection is None:
+        return outcome.shown
+    ids = [label.rpartition("/")[2].split(":") for label in outcome.detection.ids]
+    columns = {one[-2] for one in ids if one[0] != "h"}
+    rows = {one[-1] for one in ids if one[0] != "v"}
+    return len(columns), len(rows)
+
+
+def complain_of(outcomes: Collection[Outcome], board: Board) -> None:
+    """Report why images were left out, a line each, and once the remedy of the commonest reason."""
+    problems = [outcome.problem for outcome in outcomes if outcome.problem]
+    if len(problems) < 2:
+        for problem in problems if len(outcomes) > 1 else ():
+            complain(problem)
+        return
+    parts = [problem.partition("; ") for problem in problems]
+    for reason, _, _ in parts:
+        complain(reason)
+    (remedy, count), *_ = Counter(remedy for _, _, remedy in parts).most_common(1)
+    if remedy and another_size([_shown(outcome) for outcome in outcomes], board) is None:
+        complain(f"{count} of these {len(problems)} images: {remedy}")

@@ -1,0 +1,193 @@
+"""Find the size of a chessboard from images of it: the most complete grid that enough images agree on.
+
+Each image votes for the size of its foremost grid. A vote for a whole grid, without gaps and within the
+image, counts before one for a part, and a vote is sure if the pattern is seen to stop at all sides. Parts of
+a board, in images that cut it off or hide some of it, have smaller sizes that seldom agree. So the largest
+size with enough votes is the board's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.identity.ends import End, board_ends, surrounded
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.other_targets import other_target
+from neurocal_cli.errors import plural
+from neurocal_cli.observations.board import Board
+
+Size = tuple[int, int]  # columns and rows of inner vertices, the larger number first
+
+# test_board_size.py finds the sizes of all boards with these limits.
+_COMPLETE = 0.9  # least share of the vertices of a whole grid that were found
+_OUTER = 0.6  # least share of them in its outer lines
+_BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
+_ENOUGH = 0.2  # least share of the votes for the board's size
+_CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
+_MOST_TRIED = 5  # images without a chessboard that are searched for another target
+
+
+class Vote(IntEnum):
+    """How much a grid says about the size of its board."""
+
+    NONE = 0  # the pattern goes on beyond it
+    PART = 1  # it has gaps or reaches the image border
+    WHOLE = 2
+    SURE = 3  # the pattern is seen to stop at all sides
+
+
+@frozen_dataclass
+class SeenBoard:
+    """The foremost grid of an image."""
+
+    size: Size
+    vote: Vote
+    beside: tuple[Size, ...] = ()  # whole grids next to it, not far behind
+
+
+@frozen_dataclass
+class FoundSize:
+    """The size of a board that images agree on."""
+
+    size: Size
+    sure: bool  # whether an image shows all its ends
+
+
+def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
+    """The foremost chessboard of a grey image; None if there is none."""
+    grids = find_grids(grey)
+    if not grids:
+        return None
+    foremost, *others = grids
+    ends = board_ends(grey, foremost)
+    states = set(ends.values())
+    if End.PATTERN in states:
+        vote = Vote.NONE
+    elif End.OUTSIDE in states or not _is_whole(foremost.seen):
+        vote = Vote.PART
+    else:
+        vote = Vote.SURE if surrounded(ends) and End.DIM not in states else Vote.WHOLE
+    near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
+    return SeenBoard(_ordered(foremost.shape), vote, tuple(_ordered(x.shape) for x in near))
+
+
+def _is_whole(seen: NDArray[np.bool_]) -> bool:
+    outer = min(float(line.mean()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
+    return bool(seen.mean() >= _COMPLETE and outer >= _OUTER)
+
+
+def _ordered(shape: Size) -> Size:
+    return max(shape), min(shape)
+
+
+def _holds(large: Size, small: Size) -> bool:
+    return large[0] >= small[0] and large[1] >= small[1]
+
+
+def found_size(images: Iterable[NDArray[np.generic]]) -> FoundSize:
+    """Find the size of the board in grey images, which are examined until it is certain; see `find_board`."""
+    seen: list[SeenBoard] = []
+    others: list[str] = []
+    for image in images:
+        board = seen_board(image)
+        if board is not None:
+            seen.append(board)
+        elif not seen and len(others) < _MOST_TRIED:
+            others.append(other_target(image))
+        if _is_certain(seen):
+            break
+    if not seen:
+        named = next(filter(None, others), "")
+        raise NoBoardError(named or "no image shows a chessboard; show the whole board, sharp and evenly lit")
+    return agreed_size(seen)
+
+
+def _is_certain(seen: Sequence[SeenBoard]) -> bool:
+    """Whether further images need not be examined: there are enough votes, and all grids are parts of it."""
+    votes = Counter(one.size for one in seen if one.vote >= Vote.WHOLE and not one.beside)
+    if not votes:
+        return False
+    size, count = votes.most_common(1)[0]
+    sure = any(one.vote == Vote.SURE for one in seen if one.size == size)
+    needed = _CERTAIN if sure else _CERTAIN_UNSURE
+    return count >= needed and 2 * count > len(seen) and all(_holds(size, one.size) for one in seen)
+
+
+def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
+    """The size of the board that at least one image shows; see `find_board`."""
+    several = [one for one in seen if one.beside]
+    if 2 * len(several) > len(seen):
+        sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
+        raise NoBoardError(
+            f"the images show {len(sizes)} chessboards beside each other, of {_names(sizes)} inner vertices; "
+            "describe them in a board file and give it with --board, or show only one of them"
+        )
+    sure = Counter(one.size for one in seen if one.vote == Vote.SURE)
+    enough = _with_enough_votes(seen, Vote.WHOLE) or _with_enough_votes(seen, Vote.PART)
+    if not enough:
+        parts = [size for size, _ in Counter(one.size for one in seen).most_common(3)]
+        raise NoBoardError(
+            f"only parts of a chessboard are seen, of {_names(parts)} inner vertices in "
+            f"{plural(len(seen), 'image')}; give its size by --cols and --rows, or show it whole"
+        )
+    best = max(enough, key=lambda size: (size[0] * size[1], size))
+    if other := next((size for size in enough if not _holds(best, size)), None):
+        raise NoBoardError(
+            f"the images show boards of different sizes, {_names((best, other))} inner vertices; give the "
+            "size of yours by --cols and --rows"
+        )
+    if sure and not sure[best]:
+        # A smaller one whose ends are seen is no part of a larger one, which may have a false line.
+        best = max(enough, key=lambda size: (sure[size], enough[size]))
+    return FoundSize(best, sure[best] > 0)
+
+
+def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int]:
+    """Sizes with enough votes of some kind, and their numbers; a single one must be sure or the only grid."""
+    votes = Counter(one.size for one in seen if one.vote >= least)
+    sure = {one.size for one in seen if one.vote == Vote.SURE}
+    alone = len(seen) == 1 and least == Vote.WHOLE
+    return {
+        size: count
+        for size, count in votes.items()
+        if count >= _ENOUGH * votes.total() and (count > 1 or size in sure or alone)
+    }
+
+
+def _names(sizes: Iterable[Size]) -> str:
+    *names, last = (f"{cols} x {rows}" for cols, rows in sizes)
+    return f"{', '.join(names)} and {last}" if names else last
+
+
+def find_board(images: Iterable[NDArray[np.generic]], square: float = 1.0, unit: str = "squares") -> Board:
+    """Find the chessboard that grey images show: its numbers of columns and rows.
+
+    Parameters
+    ----------
+    images : iterable of (height, width) arrays
+        Of 8 or 16 bits, of one board. They are examined until its size is certain.
+    square : float
+        Side of a square, which images do not show.
+    unit : str
+        Unit of the side.
+
+    Returns
+    -------
+    board : Board
+        With at least as many columns as rows.
+
+    Raises
+    ------
+    NoBoardError
+        No image shows a chessboard, or only parts, or the images do not agree; the message says what they
+        show.
+    """
+    cols, rows = found_size(images).size
+    return Board.single(cols, rows, square, unit)

@@ -1,0 +1,190 @@
+"""The size of a board is found without being told, and never another one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from support.real_data import RealFiles
+from support.rendered import CONDITIONS, condition, picture
+from support.slow_cases import slow_but
+
+from neurocal_cli.detection.board_size import SeenBoard, Vote, agreed_size, find_board, found_size, seen_board
+from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.identity.identify import identify
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.observations.board import Board
+
+FIRST = 1400  # seeds that nothing was developed on
+SINGLE = tuple(name for name in CONDITIONS if "planes" not in name and "boards" not in name)
+WHOLE, SURE, PART = Vote.WHOLE, Vote.SURE, Vote.PART
+
+
+def grey(path: object) -> np.ndarray:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+def votes(*given: tuple[int, int, int, Vote]) -> list[SeenBoard]:
+    """So many images of a size."""
+    return [SeenBoard((cols, rows), vote) for count, cols, rows, vote in given for _ in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("seen", "size"),
+    [
+        (votes((1, 9, 6, SURE)), (9, 6)),
+        (votes((1, 9, 6, WHOLE)), (9, 6)),
+        (votes((2, 9, 6, WHOLE), (5, 8, 6, WHOLE), (3, 9, 5, WHOLE)), (9, 6)),
+        (votes((1, 9, 6, SURE), (4, 8, 6, PART)), (9, 6)),
+        (votes((1, 10, 6, WHOLE), (20, 9, 6, WHOLE)), (9, 6)),  # a single false line
+        (votes((3, 10, 6, WHOLE), (7, 9, 6, SURE)), (9, 6)),  # a false line where the board is seen to end
+        (votes((3, 9, 6, PART), (1, 8, 6, PART)), (9, 6)),
+    ],
+)
+def test_the_largest_size_with_enough_votes_is_the_boards(
+    seen: list[SeenBoard], size: tuple[int, int]
+) -> None:
+    assert agreed_size(seen).size == size
+
+
+@pytest.mark.parametrize(
+    ("seen", "said"),
+    [
+        (votes((1, 9, 6, PART)), "only parts of a chessboard are seen, of 9 x 6 inner vertices in 1 image;"),
+        (votes((1, 9, 6, WHOLE), (1, 8, 6, WHOLE)), "only parts of a chessboard are seen"),
+        (votes((5, 9, 6, Vote.NONE)), "only parts of a chessboard are seen"),
+        (
+            votes((3, 9, 6, SURE), (3, 7, 7, SURE)),
+            "boards of different sizes, 9 x 6 and 7 x 7 inner vertices",
+        ),
+        (
+            [SeenBoard((8, 6), WHOLE, ((8, 6), (7, 6)))] * 3,
+            "the images show 3 chessboards beside each other, of 7 x 6, 8 x 6 and 8 x 6 inner vertices",
+        ),
+    ],
+)
+def test_images_that_do_not_tell_the_size_are_refused(seen: list[SeenBoard], said: str) -> None:
+    with pytest.raises(NoBoardError, match=said):
+        agreed_size(seen)
+
+
+def test_images_are_examined_until_the_size_is_certain() -> None:
+    taken = []
+
+    def images() -> np.ndarray:
+        for k in range(100):
+            taken.append(k)
+            yield picture("base", 0).image
+
+    board = find_board(images(), 25.0, "mm")
+    assert board == Board.single(9, 6, 25.0)
+    assert len(taken) == 5
+    assert find_board([picture("base", 0).image]).unit == "squares"
+
+
+def test_images_without_a_chessboard_are_refused() -> None:
+    with pytest.raises(NoBoardError, match="no image shows a chessboard"):
+        find_board([np.zeros((480, 640), np.uint8)])
+    with pytest.raises(NoBoardError, match="no image shows a chessboard"):
+        find_board([])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SINGLE)
+def test_rendered_boards_have_their_size_in_every_image_that_tells_it(name: str) -> None:
+    count = 2 if "Mpx" in name else 12
+    told = []
+    for seed in range(FIRST, FIRST + count):
+        seen = seen_board(picture(name, seed).image)
+        if seen is None:
+            assert name in ("clutter only", "stress 2", "tilt 75")
+            continue
+        plane = condition(name, seed).targets[0].plane
+        try:
+            size = agreed_size([seen]).size
+        except NoBoardError:
+            continue
+        told.append(size == (max(plane.cols, plane.rows), min(plane.cols, plane.rows)))
+    assert all(told)
+    if name not in ("occluded", "board cut", "clutter only"):
+        assert len(told) >= 0.75 * count
+
+
+@pytest.mark.parametrize(
+    ("pattern", "size", "step"),
+    [
+        ("opencv_stereo/left*.jpg", (9, 6), 2),
+        ("opencv_stereo/right*.jpg", (9, 6), 2),
+        ("sony_chess/*.jpg", (6, 4), 2),
+        ("fisheye_ocam/*.jpg", (8, 6), 2),
+        ("fisheye_stereo/left*.jpg", (9, 6), 2),
+        ("fisheye_stereo/right*.jpg", (9, 6), 2),
+        ("line_pattern/chessboard.jpg", (36, 25), 1),
+        ("photographs/sharpened[01]*.png", (9, 6), 1),
+        ("photographs/fisheye_7x5_*.png", (7, 5), 1),
+    ],
+)
+def test_the_sizes_of_real_boards_are_found(
+    real_files: RealFiles, pattern: str, size: tuple[int, int], step: int
+) -> None:
+    assert found_size(grey(path) for path in real_files(pattern)[::step]).size == size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pattern", "size"),
+    [
+        ("opencv_stereo/*.jpg", (9, 6)),
+        ("sony_chess/*.jpg", (6, 4)),
+        ("fisheye_ocam/*.jpg", (8, 6)),
+        ("fisheye_stereo/*.jpg", (9, 6)),
+    ],
+)
+def test_no_single_photograph_tells_another_size(
+    real_files: RealFiles, pattern: str, size: tuple[int, int]
+) -> None:
+    for path in real_files(pattern):
+        seen = seen_board(grey(path))
+        assert seen is not None
+        assert seen.size == size, path.name
+
+
+def test_walls_of_a_corner_are_no_single_board(real_files: RealFiles) -> None:
+    images = (grey(path) for path in real_files("ortho3/*_calib.jpg"))
+    with pytest.raises(NoBoardError, match="3 chessboards beside each other, of 7 x 6, 8 x 6 and 8 x 6"):
+        found_size(images)
+
+
+def test_photographs_of_circles_have_no_grid(real_files: RealFiles) -> None:
+    for path in real_files("photographs/circles*.jpg"):
+        assert find_grids(grey(path)) == []
+
+
+@pytest.mark.parametrize("blur", slow_but((1.5,), (0.5, 1.5, 3.0)))
+def test_drawn_circles_have_no_grid_and_overexposed_squares_have_one(blur: float) -> None:
+    squares, circles = (np.full((400, 500), 255, np.uint8) for _ in range(2))
+    for row in range(8):
+        for col in range(10):
+            if (row + col) % 2 == 0:
+                left, top = 50 + 40 * col, 40 + 40 * row
+                cv2.rectangle(squares, (left + 4, top + 4), (left + 36, top + 36), (0,), -1)
+                cv2.circle(circles, (left + 20, top + 20), 17, (0,), -1, cv2.LINE_AA)
+    assert find_grids(cv2.GaussianBlur(circles, (0, 0), blur)) == []
+    assert [sorted(x.shape) for x in find_grids(cv2.GaussianBlur(squares, (0, 0), blur))] == [[7, 9]]
+
+
+def test_the_border_of_a_shadow_is_no_end_of_the_board(real_files: RealFiles) -> None:
+    (image,) = map(grey, real_files("photographs/shadow_rim.png"))
+    with pytest.raises(NoBoardError, match="with ends on all sides, but the board has 9 x 7"):
+        identify(Board.single(9, 7, 25.0), find_grids(image), image)
+    assert not found_size([image]).sure
+
+
+def test_a_smaller_board_is_no_part_of_the_one_that_is_described(real_files: RealFiles) -> None:
+    for path in real_files("photographs/fisheye_7x5_*.png"):
+        image = grey(path)
+        grids = find_grids(image)
+        with pytest.raises(NoBoardError, match="detected 7 x 5 inner vertices") as told:
+            identify(Board.single(8, 6, 25.0), grids, image)
+        assert told.value.shown == (7, 5)
+        assert len(identify(Board.single(7, 5, 25.0), grids, image).located) == 1
