@@ -3,7 +3,8 @@
 Data flow one way: points, network, calibration, evaluation. The page `docs/architecture.md` lists the
 packages in their order and describes the path of a calibration through them.
 
-The names below are loaded on first use, so that a command imports only what it needs.
+The package `neurocal` has the same names. They are loaded on first use, so that a command imports only what
+it needs.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration.advice import advise
     from neurocal_cli.calibration.calibrate import calibrate
-    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.calibration import Calibration, Verdict
     from neurocal_cli.calibration.drift import Drift, find_drift
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
     from neurocal_cli.calibration.rig.many_views import triangulate_many
+    from neurocal_cli.calibration.rig.rectification import rectify
     from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_camera_rig
     from neurocal_cli.calibration.rig.triangulation import triangulate
@@ -28,10 +31,12 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
     from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens, camera_at
     from neurocal_cli.camera.camera import Camera
+    from neurocal_cli.camera.distortion import Distortion
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.camera.remapping import undistort_image
+    from neurocal_cli.commands.show.results import plot, report
     from neurocal_cli.detection.board_size import find_board
-    from neurocal_cli.detection.detect import detect_points
+    from neurocal_cli.detection.detect import Detection, detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
     from neurocal_cli.files.calibration_tree import read_calibration
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.rig_yaml import read_rig
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
+    from neurocal_cli.observations.target import Target
     from neurocal_cli.observations.undistorted_points import undistort_points
 
 __version__ = "0.1.0"
@@ -56,12 +62,17 @@ _HOMES = {
     "Camera": "camera.camera",
     "CameraRig": "calibration.rig.camera_rig",
     "Correspondences": "observations.points",
+    "Detection": "detection.detect",
+    "Distortion": "camera.distortion",
     "Drift": "calibration.drift",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
     "Rig": "calibration.rig.rig",
+    "Target": "observations.target",
+    "Verdict": "calibration.calibration",
     "ZoomLens": "calibration.zoom.zoom_lens",
+    "advise": "calibration.advice",
     "calibrate": "calibration.calibrate",
     "calibrate_rig": "calibration.rig.calibrate_rig",
     "calibrate_stereo": "calibration.rig.calibrate_stereo",
@@ -77,6 +88,7 @@ _HOMES = {
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
     "fit_rig": "calibration.rig.calibrate_stereo",
+    "plot": "commands.show.results",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_tree",
     "read_camera_rig": "files.camera_rig_yaml",
@@ -87,6 +99,8 @@ _HOMES = {
     "read_points": "files.points_csv",
     "read_rig": "files.rig_yaml",
     "read_rig_points": "files.rig_points",
+    "rectify": "calibration.rig.rectification",
+    "report": "commands.show.results",
     "triangulate": "calibration.rig.triangulation",
     "triangulate_many": "calibration.rig.many_views",
     "undistort_image": "camera.remapping",
@@ -103,12 +117,17 @@ __all__ = [
     "Camera",
     "CameraRig",
     "Correspondences",
+    "Detection",
+    "Distortion",
     "Drift",
     "Intrinsics",
     "NeurocalError",
     "Pose",
     "Rig",
+    "Target",
+    "Verdict",
     "ZoomLens",
+    "advise",
     "calibrate",
     "calibrate_rig",
     "calibrate_stereo",
@@ -124,6 +143,7 @@ __all__ = [
     "fit_lens",
     "fit_lens_cameras",
     "fit_rig",
+    "plot",
     "read_board",
     "read_calibration",
     "read_camera_rig",
@@ -134,6 +154,8 @@ __all__ = [
     "read_points",
     "read_rig",
     "read_rig_points",
+    "rectify",
+    "report",
     "triangulate",
     "triangulate_many",
     "undistort_image",

@@ -7,7 +7,8 @@ A page's blocks run in order, in one empty folder that holds ``sample_data`` alo
   ``...`` stands for lines left out, in the middle or at the end;
 * ``python``: the program has to succeed.
 
-A comment ``<!-- not run: why -->`` in the line before a block excepts it.
+A comment ``<!-- not run: why -->`` in the line before a block excepts it. With ``<!-- one program -->`` in a
+page, its ``python`` blocks continue each other, and run as one program in the place of the last.
 
 ``python docs/tools/consoles.py [PAGE...]`` runs the pages and rewrites what the consoles show.
 """
@@ -20,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,6 +32,7 @@ _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _REPEATS = re.compile(r"\d+(?= (?:\w+ )?(?:iterations?|steps?|starts?)\b)")
 _RELATIVE = 2e-3  # two processors differ by less in anything that is printed
 _LEFT_OUT = "..."
+_ONE_PROGRAM = "<!-- one program -->"
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,16 @@ def blocks(page: str) -> Iterator[Block]:
         setting_up = match["text"].startswith("python3 -m venv")  # the continuous integration runs these two
         if "<!-- not run" not in match["before"] and not setting_up:
             yield Block(match["kind"], match["text"], match.start("text") - 1, match.end("text") - 1)
+
+
+def joined(page: str) -> list[Block]:
+    """The blocks of a page, with those of ``python`` as one where they continue each other."""
+    found = list(blocks(page))
+    python = [block for block in found if block.kind == "python"]
+    if _ONE_PROGRAM not in page or not python:
+        return found
+    whole = replace(python[-1], text="\n".join(block.text for block in python))
+    return [whole if block is python[-1] else block for block in found if block not in python[:-1]]
 
 
 def commands(block: Block) -> Iterator[Shown]:
@@ -115,7 +127,7 @@ def run_page(text: str, folder: Path) -> Iterator[tuple[Shown, str]]:
         A block ``sh`` or ``python`` failed.
     """
     environment = prepare(folder)
-    for block in blocks(text):
+    for block in joined(text):
         if block.kind == "console":
             for shown in commands(block):
                 yield shown, run(["sh", "-c", shown.command], folder, environment).stdout

@@ -20,12 +20,14 @@ MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
 
 # The names of the package by topic. A name that is in none of them goes to the last.
 TOPICS = {
-    "Calibrating": ["calibrate", "Calibration", "Correspondences", "Camera", "Intrinsics", "Pose"],
+    "Calibrating": ["calibrate", "Calibration", "Verdict", "Target", "Correspondences", "Camera",
+                    "Intrinsics", "Distortion", "Pose"],
     "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_camera_rig", "evaluate_lens",
                 "find_drift", "Drift"],
-    "Points from images": ["detect_points", "find_board", "Board", "read_board", "read_image"],
+    "Showing": ["report", "plot", "advise"],
+    "Points from images": ["detect_points", "find_board", "Detection", "Board", "read_board", "read_image"],
     "Removing distortion": ["undistort_points", "undistort_image"],
-    "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate"],
+    "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate", "rectify"],
     "Many cameras": ["calibrate_rig", "CameraRig", "triangulate_many"],
     "Zoom lenses": ["fit_lens", "fit_lens_cameras", "camera_at", "ZoomLens"],
     "Files": ["read_points", "write_points", "read_calibration", "write_calibration", "read_rig", "write_rig",
@@ -126,7 +128,8 @@ def _api_page() -> str:
         MADE,
         "# Python",
         "Everything that a program needs is in the package `neurocal_cli` itself: "
-        "`from neurocal_cli import calibrate`. The functions do what the commands of the same names do. "
+        "`from neurocal_cli import calibrate`. The package `neurocal` has the same names. The functions "
+        "do what the commands of the same names do. "
         "Where a command ends with exit status 1, they raise `NeurocalError`. "
         "[Use it from Python](../how-to/python.md) has examples.",
     ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -22,22 +22,28 @@ from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
 from neurocal_cli.calibration.verdict.odd_points import repeated_views
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
-from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.distortion import MODELS, Distortion, Model
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_seed
 from neurocal_cli.network.options import Options, Progress, options_for
 from neurocal_cli.observations.points import Correspondences
-from neurocal_cli.observations.target import TARGETS, Target
+from neurocal_cli.observations.target import TARGETS, Target, TargetChoice
 
 if TYPE_CHECKING:
     from neurocal_cli.network.backprop import BackpropOptions
 
-METHODS = ("neuro", "linear", "nonlinear", "tsai")
-TRAINERS = ("lm", "backprop")
+Method = Literal["neuro", "linear", "nonlinear", "tsai"]
+Trainer = Literal["lm", "backprop"]
+Lens = Model | Literal["auto", "plumb-line"]
+Outliers = Literal["reject", "keep"]
+Skew = Literal["free", "fixed", "auto"]
+
+METHODS = get_args(Method)
+TRAINERS = get_args(Trainer)
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
-OUTLIERS = ("reject", "keep")
-SKEWS = ("free", "fixed", "auto")
+OUTLIERS = get_args(Outliers)
+SKEWS = get_args(Skew)
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
@@ -54,15 +60,15 @@ def calibrate(
     image_center: tuple[float, float] | None = None,
     intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
     extrinsics: Mapping[str, Pose] | Calibration | None = None,
-    method: str = "neuro",
-    trainer: str = "lm",
-    distortion: str = "auto",
-    skew: bool | str = True,
-    outliers: str = "reject",
+    method: Method = "neuro",
+    trainer: Trainer = "lm",
+    distortion: Lens = "auto",
+    skew: bool | Skew = True,
+    outliers: Outliers = "reject",
     seed: int = 0,
     *,
-    target: str | Target = "auto",
-    preferred: str = "",
+    target: TargetChoice | Target = "auto",
+    preferred: Model | Literal[""] = "",
     fix: Mapping[str, float] | None = None,
     square_pixels: bool = False,
     starts: int = _STARTS,
@@ -161,15 +167,14 @@ def calibrate(
     if isinstance(extrinsics, Calibration):
         extrinsics = {name: view.pose for name, view in extrinsics.views.items()}
     type_3 = isinstance(type, (int, np.integer)) and type == 3
-    if method != "neuro" and not type_3:
-        distortion = _distortion_of(method, distortion)
+    lens = distortion if method == "neuro" or type_3 else _distortion_of(method, distortion)
     if not type_3:
-        model = Distortion() if distortion in _FOUND else Distortion(distortion)
-    elif distortion not in ("auto", "none", model.model):
+        model = Distortion() if lens in _FOUND else Distortion(lens)
+    elif lens not in ("auto", "none", model.model):
         raise UsageError(
-            f"type 3 uses the distortion of the given camera ({model.model}), not {distortion}; leave it out"
+            f"type 3 uses the distortion of the given camera ({model.model}), not {lens}; leave it out"
         )
-    way = distortion if distortion in _FOUND and not type_3 else ""
+    way = lens if lens in _FOUND and not type_3 else ""
     options = options_for(
         trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
     )

@@ -6,22 +6,28 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import field, replace
 from enum import Enum
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, StraightLines, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.late_import import late
+from neurocal_cli.camera.opencv_names import camera_info, opencv_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projected_points import ProjectedPoints
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.measured_directions import equations
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
+_MOST_SHOWN = 5  # coefficients, on a line
 _ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # what A11, A12, A22, A13, A23 determine
 
 
@@ -92,7 +98,7 @@ class Verdict:
 
 
 @frozen_dataclass(eq=False)
-class Calibration:
+class Calibration(Presented):
     """A calibrated camera.
 
     Attributes
@@ -165,6 +171,70 @@ class Calibration:
     square_pixels: bool = False
     would_take: frozenset[str] = frozenset()
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
+
+    _summary = ("commands.show.camera_report", "calibration_report")
+
+    def __repr__(self) -> str:
+        size = "unknown" if self.image_size is None else "{} x {} px".format(*self.image_size)
+        names = ("alpha_u", "alpha_v", "u0", "v0")
+        values = {name: getattr(self.intrinsics, name) for name in names}
+        known = (f"{name} {value:.6g} +- {self.std.get(name, np.nan):.2g}" for name, value in values.items())
+        coefficients = ", ".join(f"{k:.4g}" for k in self.distortion[:_MOST_SHOWN].tolist())
+        more = ", ..." if len(self.distortion) > _MOST_SHOWN else ""
+        return (
+            f"Calibration of {self.camera_name!r}: {len(self.points)} points in {len(self.views)} views, "
+            f"images {size}, rms {self.rmse_px:.4g} px\n"
+            f"  {', '.join(known)} px, theta {np.degrees(self.intrinsics.theta):.4f} degrees\n"
+            f"  distortion {self.distortion_model} [{coefficients}{more}]; see .summary()"
+        )
+
+    def project(self, points: Array, view: str | None = None) -> ProjectedPoints:
+        """Project points, with the covariance that the calibration gives their pixels.
+
+        Parameters
+        ----------
+        points : (N, 3) array [world unit]
+            In the frame of the view's target; without a view, in the camera's own frame (x right, y down, z
+            forward).
+        view : str, optional
+            A view of this calibration, whose pose is used, with its uncertainty.
+
+        Returns
+        -------
+        ProjectedPoints
+            `pixels` and `covariance`. The latter is that of points which are fixed to the target of the view,
+            or without a view to the targets of all views: a change of the camera that a change of the poses
+            compensates is no uncertainty. This is the std of predicted pixels of the verdict.
+
+        Raises
+        ------
+        InputError
+            There is no such view, or the array has another shape.
+        """
+        found: ProjectedPoints = late("calibration.point_projection", "project")(self, points, view)
+        return found
+
+    @property
+    def cv2_distortion(self) -> Array:
+        """(5,), (8,), (12,) or (14,) coefficients for ``cv2.projectPoints``, ``cv2.undistort`` and so on.
+
+        With `K`, and `rotations` and `translations` of a view. Raises InputError for a distortion model that
+        OpenCV lacks, a fisheye (see `cv2_fisheye_distortion`), or a camera with skew, which OpenCV ignores.
+        """
+        return opencv_coefficients(self.camera)
+
+    @property
+    def cv2_fisheye_distortion(self) -> Array:
+        """(4,) coefficients k1 to k4 for ``cv2.fisheye``; raises InputError for any other lens."""
+        return opencv_coefficients(self.camera, fisheye=True)
+
+    def to_ros(self) -> dict[str, Any]:
+        """Fields of ROS's message: ``sensor_msgs.msg.CameraInfo(**camera.to_ros())``.
+
+        They are width, height, distortion_model, d, k, r and p. Raises InputError for a distortion model that
+        ROS lacks, a camera with skew, which ROS ignores, or images of unknown size.
+        """
+        return camera_info(self.camera)
 
     @cached_property
     def verdict(self) -> Verdict | None:

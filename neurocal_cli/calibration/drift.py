@@ -19,6 +19,8 @@ combinations count as known no better than a third of what a pixel is.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, spare_equations
@@ -129,11 +131,11 @@ def drift_since(calibration: Calibration, points: Correspondences) -> Drift | No
 
     None if the points do not determine the camera well enough to tell.
     """
-    from neurocal_cli.calibration.calibrate import calibrate
+    from neurocal_cli.calibration.calibrate import Lens, calibrate
 
-    skew = "fixed" if "theta" in calibration.fixed else "free"
+    lens, skew = cast("Lens", calibration.distortion_model), "theta" not in calibration.fixed
     try:
-        new = calibrate(points, distortion=calibration.distortion_model, skew=skew, seed=calibration.seed)
+        new = calibrate(points, distortion=lens, skew=skew, seed=calibration.seed)
         if not new.converged or spare_equations(new) < _SPARE:
             return None
         return find_drift(calibration, new)

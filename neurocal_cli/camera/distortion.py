@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field
+from typing import Literal
 
 import numpy as np
 
@@ -20,6 +21,12 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.polynomial import Coefficients, Distorted, distorted, distorted_with_jacobian
 from neurocal_cli.errors import InputError
+
+Model = Literal[
+    "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted",
+    "fisheye", "omnidir", "double_sphere", "eucm", "rich",
+]  # fmt: skip
+"""The names of `MODELS`, for type checkers."""
 
 MODELS = {
     "none": (),

@@ -14,14 +14,15 @@ Arrays of rotations carry leading batch axes: ``(..., 3, 3)``.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-UNDISTORTED = ("plane", "cylinder", "equirectangular")
+Shape = Literal["plane", "cylinder", "equirectangular"]
+UNDISTORTED = get_args(Shape)
 """Shapes that undistorted pixels are projected on."""
 
 # Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.

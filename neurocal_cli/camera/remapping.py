@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, Shape
 from neurocal_cli.camera.undistortion import Undistorted, chosen_view, sources
 from neurocal_cli.errors import InputError
 
+Interpolation = Literal["nearest", "linear", "cubic", "lanczos"]
 INTERPOLATIONS = {
     "nearest": cv2.INTER_NEAREST,
     "linear": cv2.INTER_LINEAR,
@@ -111,8 +112,8 @@ def undistort_image(
     image: NDArray[np.uint8] | NDArray[np.uint16],
     camera: Camera | Calibrated,
     alpha: float | None = None,
-    interpolation: str = "cubic",
-    to: str = "plane",
+    interpolation: Interpolation = "cubic",
+    to: Shape = "plane",
     fov: float | None = None,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Undistort an image.

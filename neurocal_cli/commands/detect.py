@@ -163,13 +163,14 @@ def detect(
     outcomes, target = of_one_size(outcomes), wanted.board
     assert target is not None
     _report(outcomes, target, as_json)
-    from neurocal_cli.detection.detect import gather
     from neurocal_cli.files.board_yaml import format_board
     from neurocal_cli.files.points_csv import format_points
+    from neurocal_cli.observations.points import Correspondences
 
     if save_board is not None:
         write_whole(save_board, format_board(target))
-    text = format_points(replace(gather(detections(outcomes), target.unit), distances=target.distances))
+    found = Correspondences.from_detections(detections(outcomes), target.unit, target.distances)
+    text = format_points(found)
     if overlay is not None:
         make_folder(overlay)
         for name, outcome in outcomes.items():

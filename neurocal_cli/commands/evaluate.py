@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.triangulation import Method
     from neurocal_cli.observations.points import Correspondences
 
 
@@ -176,7 +177,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 @panel_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
-    cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, plots: Plots, as_json: bool
+    cameras: tuple[str, ...], points: tuple[str, str] | None, method: Method, plots: Plots, as_json: bool
 ) -> None:
     """Measure the triangulation error of two calibrated cameras.
 
@@ -302,7 +303,7 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
 
 
 def _evaluate_stereo(
-    cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
+    cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: Method
 ) -> tuple[StereoEvaluation, Rig | None]:
     """Evaluate the rig of a file, or two calibrations, of which no rig is known."""
     from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo

@@ -158,11 +158,12 @@ def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) ->
     from neurocal_cli.calibration.advice import advise
     from neurocal_cli.calibration.calibrate import calibrate
     from neurocal_cli.commands.show.advice import advised_views
-    from neurocal_cli.detection.detect import gather
+    from neurocal_cli.observations.points import Correspondences
 
     head = f"{os.path.basename(path)}: {len(outcome.detection.ids)} points, {plural(len(found), 'view')}"
     try:
-        calibration = calibrate(gather(found, options.board.unit))
+        board = options.board
+        calibration = calibrate(Correspondences.from_detections(found, board.unit, board.distances))
         verdict = calibration.verdict
         word = "" if verdict is None else f", {verdict.word}"
         say(one_line(f"{head}: rms {calibration.rmse_px:.3g} px{word}"))

@@ -1,11 +1,11 @@
-"""Detect labelled points in one image, and gather those of several images for a calibration.
+"""Detect labelled points in one image.
 
 `detect_points` runs all steps on one image: `find_grids`, `identify`, `measure` and `label`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.grey import grey_image
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located, identify
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
-from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
-from neurocal_cli.observations.points import Correspondences
 
 _FEWEST = 8  # points; fewer determine little more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
@@ -91,6 +90,12 @@ class Detection:
     located: tuple[Located, ...] = ()
     measured: tuple[Measured, ...] = ()
 
+    def __repr__(self) -> str:
+        width, height = self.image_size
+        rejected = f", {self.rejected} rejected" if self.rejected else ""
+        warned = f", warnings {list(self.warnings)}" if self.warnings else ""
+        return f"Detection({len(self.ids)} points in an image of {width} x {height} px{rejected}{warned})"
+
 
 def detect_points(
     image: NDArray[np.generic],
@@ -103,8 +108,8 @@ def detect_points(
 
     Parameters
     ----------
-    image : (height, width) array
-        Grey, of 8 or 16 bits.
+    image : (height, width) or (height, width, 3) array
+        Grey or in colours, blue first as in OpenCV, of 8 or 16 bits.
     board : Board
     points : {"midpoints", "edges", "vertices"}
         Mid-points of the edges between inner vertices; these and the mid-points of the edges to the rim; or
@@ -119,10 +124,9 @@ def detect_points(
     NoBoardError
         The image does not show the board, or not enough of it. The message gives the reason.
     InputError
-        Pixels of the image are not finite.
+        The image has another shape or type, or pixels that are not finite.
     """
-    if image.dtype.kind == "f" and not np.isfinite(image).all():
-        raise InputError("some pixels of the image are not finite numbers; replace them, for example by 0")
+    image = grey_image(image)
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
     try:
         identified = identify(board, found, image)
@@ -185,38 +189,3 @@ def label(located: Located, measured: Measured) -> Labels:
     along_x, along_y = np.rint(np.abs(second - first)).astype(bool).T
     kind = np.where(along_x, EDGE_H, np.where(along_y, EDGE_V, VERTEX))
     return Labels(located.plane, kind, start)
-
-
-def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Correspondences:
-    """Join the points of several images of one camera, by the name of the view.
-
-    Raises InputError if there is no image, or image sizes differ, so the images come from more than one
-    camera.
-    """
-    if not detections:
-        raise InputError("there are no images with points; give at least one")
-    names, found = list(detections), list(detections.values())
-    for name, one in zip(names, found, strict=True):
-        if one.image_size != found[0].image_size:
-            sizes = ["{} x {}".format(*each.image_size) for each in (one, found[0])]
-            raise InputError(
-                f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; run detect "
-                "for each camera separately"
-            )
-    across = None
-    if any(one.across is not None for one in found):
-        # Vertices have no direction.
-        across = np.concatenate(
-            [np.zeros((len(one.ids), 2)) if one.across is None else one.across for one in found]
-        )
-    return Correspondences(
-        np.concatenate([one.world for one in found]),
-        np.concatenate([one.pixels for one in found]),
-        view=np.repeat(names, [len(one.ids) for one in found]),
-        image_size=found[0].image_size,
-        point=np.array([name for one in found for name in one.ids]),
-        covariance=np.concatenate([one.covariance for one in found]),
-        across=across,
-        unit=unit,
-        source="detected points",
-    )

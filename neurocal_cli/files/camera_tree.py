@@ -20,6 +20,7 @@ from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM, Distortion, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import checked_size
+from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.failures import value_failures
@@ -44,8 +45,6 @@ _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
 # Keys about distortion that are not its coefficients.
 _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 _BOOFCV = ("pinhole", "pinhole_radial_tangential", "omnidirectional_universal")
-# ROS's names of our models. Others are a plumb_bob with 5 coefficients; simpler models use the first of them.
-_ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}
 _FORMULAS = {
     "cylinder": "u = f atan2(X, Z) + u0, v = f Y / hypot(X, Z) + v0",
     "equirectangular": "u = f atan2(X, Z) + u0, v = f atan2(Y, hypot(X, Z)) + v0",
@@ -240,20 +239,6 @@ def format_panorama(panorama: Panorama) -> str:
 def _matrix(matrix: Array) -> str:
     rows, cols = matrix.shape
     return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
-
-
-def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
-    """Find ROS's name of one of our models, and pad its coefficients, which must fit, with zeros."""
-    own = len(coefficient_names(model))
-    name = _ROS.get(model, model if model in (*WIDE, *WITH_PRISM) else "plumb_bob")
-    values = np.asarray(coefficients, dtype=float).ravel()
-    if np.any(values[own:] != 0) or not np.isfinite(values).all():
-        raise InputError(
-            f"the distortion model {model} has {own} finite coefficients, found {values.tolist()}"
-        )
-    padded = np.zeros(5 if name == "plumb_bob" else own)
-    padded[: min(own, len(values))] = values[:own]
-    return name, padded
 
 
 def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:

@@ -18,7 +18,8 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.table import Table, read_table
 from neurocal_cli.files.table_header import Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.observations.points import Correspondences, first_moved
+from neurocal_cli.observations.labels import first_moved
+from neurocal_cli.observations.points import Correspondences
 
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")

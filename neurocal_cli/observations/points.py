@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +14,37 @@ from neurocal_cli.camera.geometry import UNDISTORTED, Array
 from neurocal_cli.camera.given_values import checked_size, real_array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.distances import Distance
+from neurocal_cli.observations.labels import factorise, first_repeat
 
-_ONLY_VIEW = "view"  # name of the single view if the points name none
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
-_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z, as a share of the target's size
+
+
+class Detected(Protocol):
+    """Points of a target that were measured in one image, such as a `Detection`."""
+
+    @property
+    def ids(self) -> Sequence[str]:
+        """Of N points; a point of the target has the same id in all images."""
+
+    @property
+    def world(self) -> Array:
+        """(N, 3) array [world unit]."""
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) array [px]."""
+
+    @property
+    def covariance(self) -> Array:
+        """(N, 3) array [px^2], suu, suv, svv."""
+
+    @property
+    def across(self) -> Array | None:
+        """(N, 2) array or None; see `Correspondences`."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height [px]."""
 
 
 @frozen_dataclass(eq=False)
@@ -117,7 +144,7 @@ class Correspondences:
                     raise InputError(f"{self.source}: {name} needs one entry for each of the {n} points")
                 self._set(**{name: _frozen(labels)})
         self._check_finite()
-        names, index = _factorise(self.view, n)
+        names, index = factorise(self.view, n)
         self._set(view_names=names, view_index=_frozen(index))
         if self.point is not None:
             self._check_ids(np.asarray(self.point))
@@ -165,8 +192,74 @@ class Correspondences:
         empty._set(view_names=(), view_index=_frozen(np.zeros(0, dtype=np.int64)))
         return empty
 
+    @classmethod
+    def from_detections(
+        cls, detections: Mapping[str, Detected], unit: str = "mm", distances: tuple[Distance, ...] = ()
+    ) -> Correspondences:
+        """Join the points that were measured in several images of one camera.
+
+        Parameters
+        ----------
+        detections : dict of Detection by view name
+            What `detect_points` returned for each image.
+        unit : str
+            Of the board.
+        distances : tuple of Distance
+            Those of the board, if any were measured: ``board.distances``.
+
+        Raises
+        ------
+        InputError
+            There is no image, or image sizes differ, so the images come from more than one camera.
+        """
+        if not detections:
+            raise InputError("there are no images with points; give at least one")
+        names, found = list(detections), list(detections.values())
+        for name, one in zip(names, found, strict=True):
+            if one.image_size != found[0].image_size:
+                sizes = ["{} x {}".format(*each.image_size) for each in (one, found[0])]
+                raise InputError(
+                    f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; calibrate each "
+                    "camera separately"
+                )
+        counts = [len(one.ids) for one in found]
+        across = None
+        if any(one.across is not None for one in found):
+            # Vertices have no direction.
+            parts = zip(found, counts, strict=True)
+            across = np.concatenate(
+                [np.zeros((n, 2)) if one.across is None else one.across for one, n in parts]
+            )
+        return cls(
+            np.concatenate([one.world for one in found]),
+            np.concatenate([one.pixels for one in found]),
+            view=np.repeat(names, counts),
+            image_size=found[0].image_size,
+            point=np.array([name for one in found for name in one.ids]),
+            covariance=np.concatenate([one.covariance for one in found]),
+            across=across,
+            unit=unit,
+            source="detected points",
+            distances=distances,
+        )
+
+    def __repr__(self) -> str:
+        size = "unknown" if self.image_size is None else "{} x {} px".format(*self.image_size)
+        known = ("point", "covariance", "across", "world_std", "time")
+        columns = [name for name in known if getattr(self, name) is not None]
+        with_them = f", with {', '.join(columns)}" if columns else ""
+        return (
+            f"Correspondences({len(self)} points in {self.n_views} views, image size {size}, "
+            f"unit {self.unit!r}{with_them})"
+        )
+
     def __len__(self) -> int:
         return len(self.world)
+
+    @property
+    def pixel_covariance(self) -> Array | None:
+        """(N, 2, 2) covariance of each pixel [px^2], as far as it was given; see `covariance`."""
+        return None if self.covariance is None else self.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
     @property
     def n_points(self) -> int:
@@ -230,7 +323,7 @@ class Correspondences:
             raise InputError(f"{self.source}: X,Y,Z are too small to be squared; give them in another unit")
 
     def _check_ids(self, ids: NDArray[Any]) -> None:
-        repeat = _first_repeat(self.view_index, ids)
+        repeat = first_repeat(self.view_index, ids)
         if repeat is None:
             return
         row, earlier = repeat
@@ -275,63 +368,3 @@ def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     array.setflags(write=False)
     return array
-
-
-def _factorise(
-    labels: NDArray[Any] | Sequence[Any] | None, n: int
-) -> tuple[tuple[str, ...], NDArray[np.int64]]:
-    """Names in order of first appearance and each row's position among them.
-
-    Rows of a view are mostly consecutive, so only the first row of each run is sorted.
-    """
-    if labels is None:
-        return (_ONLY_VIEW,), np.zeros(n, dtype=np.int64)
-    labels = np.asarray(labels)
-    starts = np.flatnonzero(np.concatenate([[True], labels[1:] != labels[:-1]]))
-    try:
-        distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
-    except TypeError as error:
-        raise InputError("the views' labels must be all text or all numbers") from error
-    order = np.argsort(first, kind="stable")
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    run_lengths = np.diff(np.concatenate([starts, [n]]))
-    return tuple(str(distinct[k]) for k in order), np.repeat(rank[inverse.ravel()], run_lengths)
-
-
-def _first_repeat(view: NDArray[np.int64], ids: NDArray[Any]) -> tuple[int, int] | None:
-    """Find the first row whose id occurred in its view before, and that earlier row, if there is one."""
-    ids = ids.astype(str, copy=False)
-    hashes = _hashes(view, ids)
-    ordered = np.sort(hashes)
-    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
-    if len(repeated) == 0:  # nearly always; comparing a million labels directly would take seconds
-        return None
-    seen: dict[tuple[int, str], int] = {}
-    for row in np.flatnonzero(np.isin(hashes, repeated)).tolist():
-        earlier = seen.setdefault((int(view[row]), str(ids[row])), row)
-        if earlier != row:
-            return row, earlier
-    return None
-
-
-def first_moved(world: Array, ids: NDArray[Any]) -> tuple[int, int] | None:
-    """Find the first row whose id had another place before, and the first row of that id, if there is one."""
-    hashes = _hashes(np.zeros(len(ids), dtype=np.int64), ids.astype(str, copy=False))
-    _, first, point = np.unique(hashes, return_index=True, return_inverse=True)
-    earlier = first[point.reshape(-1)]
-    moved = np.abs(world - world[earlier]).max(axis=1) > _SAME_PLACE * np.ptp(world, axis=0).max()
-    if not moved.any():
-        return None
-    row = int(np.argmax(moved))
-    return row, int(earlier[row])
-
-
-def _hashes(view: NDArray[np.int64], ids: NDArray[np.str_]) -> NDArray[np.uint64]:
-    """Hash each row to 64 bits, with FNV-1a over the view and the characters of the id."""
-    hashes = np.uint64(0xCBF29CE484222325) ^ view.astype(np.uint64)
-    characters = np.ascontiguousarray(ids).view(np.uint32).reshape(len(ids), -1)
-    for k in range(characters.shape[1]):
-        hashes *= np.uint64(0x100000001B3)
-        hashes ^= characters[:, k]
-    return hashes

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,8 @@ from neurocal_cli.observations.board import Board, Plane, planes_of, smooth_betw
 from neurocal_cli.observations.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.observations.points import Correspondences
 
-TARGETS = ("auto", "given", "flat", "free")
+TargetChoice = Literal["auto", "given", "flat", "free"]
+TARGETS = get_args(TargetChoice)
 
 _DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
 N_SHAPES = 3
@@ -53,6 +54,11 @@ class Target:
     point: NDArray[np.str_] | None = None  # (n,) ids
     stated: Array | None = None  # (n, 3) [world unit] stds of the given points, if a survey states them
     bends: Bends | None = None  # of each view, for a board that bends differently each time
+
+    def __repr__(self) -> str:
+        shape = "flat" if self.flat else f"bent by {self.bend():.3g}"
+        offset = float(np.sqrt((self.offsets**2).sum(axis=1).mean()))
+        return f"Target of {len(self.found)} points, {shape}: {offset:.3g} rms from where they were given"
 
     @property
     def offsets(self) -> Array:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.camera.camera import Calibrated, Camera, camera_of
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, Shape
+from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.undistortion import (
     Undistorted,
     chosen_view,
@@ -20,19 +22,39 @@ from neurocal_cli.observations.measured_directions import unit
 from neurocal_cli.observations.points import Correspondences
 
 
+@overload
 def undistort_points(
     points: Correspondences,
     camera: Camera | Calibrated,
     alpha: float | None = None,
-    to: str = "plane",
+    to: Shape = "plane",
     fov: float | None = None,
-) -> Correspondences:
+) -> Correspondences: ...
+
+
+@overload
+def undistort_points(
+    points: ArrayLike,
+    camera: Camera | Calibrated,
+    alpha: float | None = None,
+    to: Shape = "plane",
+    fov: float | None = None,
+) -> Array: ...
+
+
+def undistort_points(
+    points: Correspondences | ArrayLike,
+    camera: Camera | Calibrated,
+    alpha: float | None = None,
+    to: Shape = "plane",
+    fov: float | None = None,
+) -> Correspondences | Array:
     """Undistort points.
 
     Parameters
     ----------
-    points : Correspondences
-        Their covariances and the image centre, where given, are transformed as well.
+    points : Correspondences, or (..., 2) array of pixels
+        Covariances and the image centre of Correspondences, where given, are transformed as well.
     camera : Camera or Calibration
     alpha : float, optional
         See `new_matrix`; None keeps the camera's own matrix. For a plane without `fov`.
@@ -40,12 +62,27 @@ def undistort_points(
     fov : float, optional [degrees]
         Field of view from left to right; see `undistorted_view`.
 
+    Returns
+    -------
+    Correspondences, or (..., 2) array
+        Pixels of a camera without distortion. They are pixels, not the normalised coordinates that
+        ``cv2.undistortPoints`` returns without ``P``.
+
     Raises
     ------
     InputError
         A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
     """
     camera = camera_of(camera)
+    if not isinstance(points, Correspondences):
+        pixels = real_array("points", points)
+        if pixels.shape[-1:] != (2,):
+            raise InputError(f"pixels must have the shape (..., 2), found {pixels.shape}")
+        if not pixels.size:
+            return pixels
+        flat = pixels.reshape(-1, 2)
+        rows = Correspondences(np.zeros((len(flat), 3)), flat, image_size=camera.image_size, source="pixels")
+        return undistort_points(rows, camera, alpha, to, fov).pixels.reshape(pixels.shape)
     return map_points(points, camera, chosen_view(camera, alpha, to, fov, points.image_size))
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
 from neurocal_cli.adjustment.problem import problem_for
-from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.calibrate import Lens, Method, Outliers, calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.other_methods.calibrate_by import calibrate_by
 from neurocal_cli.calibration.rig.evaluation import StereoEvaluation, evaluate_stereo
@@ -70,7 +71,8 @@ def compare(
     cameras: list[dict[str, Compared]] = []
     steps = 1 + len(methods)  # for each camera
     for done, one in enumerate(points):
-        first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed, target="given")
+        lens, kept_or_not = cast("Lens", distortion), cast("Outliers", outliers)
+        first = calibrate(one, distortion=lens, skew=skew, outliers=kept_or_not, seed=seed, target="given")
         if first.n_rejected:
             notes.append(f"{one.source}: {first.n_rejected} outliers are left out for all methods")
         kept.append(first.points)
@@ -100,9 +102,9 @@ def calibrate_with(
         model = "k1"
     return calibrate(
         points,
-        method="neuro" if method == "backprop" else method,
+        method="neuro" if method == "backprop" else cast("Method", method),
         trainer="backprop" if method == "backprop" else "lm",
-        distortion=model,
+        distortion=cast("Lens", model),
         skew=skew,
         outliers="keep",
         seed=seed,

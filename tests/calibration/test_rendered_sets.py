@@ -14,7 +14,6 @@ from neurocal_cli.calibration.lens_choice.monotonic_fit import where_not_monoton
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.detection.detect import gather
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.simulation.rendering import (
@@ -74,7 +73,7 @@ def pictures(model: str, seed: int) -> list[tuple[Scene, Rendered]]:
 
 def detected(taken: list[tuple[Scene, Rendered]], kind: Points) -> Correspondences:
     board = Board.single(9, 6, 25.0)
-    return gather(
+    return Correspondences.from_detections(
         {f"view{k}": detect_points(picture.image, board, kind) for k, (_, picture) in enumerate(taken)}
     )
 

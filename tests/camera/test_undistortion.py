@@ -380,3 +380,17 @@ def test_a_photograph_has_straight_edges_afterwards(real_files: RealFiles) -> No
         rms.append(np.sqrt(np.mean(np.square(off))))
     assert rms[0] > 0.3
     assert rms[1] < 0.12
+
+
+def test_arrays_of_pixels_are_undistorted_like_points() -> None:
+    camera = Camera(Intrinsics(600, 610, 320, 240), Distortion("k1", [-0.2]), (640, 480))
+    pixels = np.array([[10.0, 20.0], [320.0, 240.0], [600.0, 400.0]])
+    expected = undistort_points(Correspondences(np.zeros((3, 3)), pixels), camera).pixels
+    np.testing.assert_array_equal(undistort_points(pixels, camera), expected)
+    assert undistort_points(pixels[:, None], camera).shape == (3, 1, 2)  # OpenCV's shape
+    assert undistort_points(pixels[0].tolist(), camera).tolist() == expected[0].tolist()
+    assert undistort_points(np.zeros((0, 2)), camera).shape == (0, 2)
+    with pytest.raises(InputError, match=r"shape \(\.\.\., 2\), found \(3, 3\)"):
+        undistort_points(np.zeros((3, 3)), camera)
+    with pytest.raises(InputError, match="pixels, row 2: the distortion maps nothing to the pixel"):
+        undistort_points([[320.0, 240.0], [1e5, 240.0]], camera)

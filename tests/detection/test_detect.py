@@ -13,11 +13,12 @@ from support.seen_grids import labelled_vertices, seen_grid
 from support.slow_cases import slow_but
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
-from neurocal_cli.detection.detect import Detection, detect_points, gather, label
+from neurocal_cli.detection.detect import Detection, detect_points, label
 from neurocal_cli.detection.identity.identify import Identified, Located
 from neurocal_cli.detection.identity.placement import NoBoardError, Placement
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.simulation.rendering import Rendered, render
 
 BOARD = Board.single(9, 6, 28.0)
@@ -143,7 +144,7 @@ def test_points_that_are_no_numbers_are_rejected(monkeypatch: pytest.MonkeyPatch
     found = detect_points(seen.image, BOARD)
     assert len(found.ids) == len(whole.ids) - 4
     assert found.rejected == whole.rejected + 4
-    gather({"a": found})
+    Correspondences.from_detections({"a": found})
 
 
 def test_a_handful_of_points_is_not_a_view(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +160,7 @@ def test_a_handful_of_points_is_not_a_view(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_views_are_gathered_with_their_covariance() -> None:
     views = {f"view{seed}": detected("base", seed)[0] for seed in range(2)}
-    points = gather(views, "inch")
+    points = Correspondences.from_detections(views, "inch")
     assert points.view_names == ("view0", "view1")
     assert (points.image_size, points.unit) == ((640, 480), "inch")
     assert points.n_points == sum(len(one.ids) for one in views.values())
@@ -173,9 +174,9 @@ def test_images_of_two_sizes_are_refused_by_name() -> None:
     one, _ = detected("base", 0)
     other = replace(one, image_size=(320, 240))
     with pytest.raises(InputError, match="image b has 320 x 240 px but a has 640 x 480 px"):
-        gather({"a": one, "b": other})
+        Correspondences.from_detections({"a": one, "b": other})
     with pytest.raises(InputError, match="no images"):
-        gather({})
+        Correspondences.from_detections({})
 
 
 def test_pixels_that_are_not_finite_are_refused() -> None:

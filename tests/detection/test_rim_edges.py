@@ -14,9 +14,10 @@ from support.rendered import condition, rendered
 from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
-from neurocal_cli.detection.detect import Detection, detect_points, gather
+from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.files.board_yaml import format_board, parse_board
 from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, board_of
 from neurocal_cli.simulation.rendering import Scene, Sides
 
@@ -109,7 +110,7 @@ def test_paper_that_bends_anew_at_its_rim_is_not_taken_for_two_cameras(real_file
     images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
     board = Board.single(9, 6, 24.23)
     found = {f"{k}": detect_points(image, board, "edges") for k, image in enumerate(images)}
-    points = gather(found)
+    points = Correspondences.from_detections(found)
     for part in (0, 1):
         half = calibrate(points.select(points.view_index % 2 == part))
         assert half.target is not None

@@ -22,12 +22,13 @@ from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import evaluate_camera
 from neurocal_cli.camera.geometry import rotation_step
 from neurocal_cli.commands.show.camera_report import calibration_report
-from neurocal_cli.detection.detect import detect_points, gather
+from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_calibration
 from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Bends, surface_of
 
 FLEXING = draw("flexing", 29)  # eight views
@@ -154,7 +155,9 @@ def test_standard_deviations_of_photographs_count_what_bends_take_in(real_files:
     """Bends hide that views contradict each other; leaving views out shows it."""
     images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in real_files("opencv_stereo/right??.jpg")]
     sheet = Board.single(9, 6, 25.0)
-    points = gather({f"{k:02d}": detect_points(image, sheet, "vertices") for k, image in enumerate(images)})
+    points = Correspondences.from_detections(
+        {f"{k:02d}": detect_points(image, sheet, "vertices") for k, image in enumerate(images)}
+    )
     target = calibrate(points).target
     assert target is not None
     assert target.bends is not None

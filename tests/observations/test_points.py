@@ -137,3 +137,15 @@ def test_selecting_rows_keeps_everything_that_belongs_to_them() -> None:
     assert rows.across.tolist() == [[8, 9], [2, 3], [6, 7]]
     assert (rows.image_size, rows.unit, len(rows)) == ((640, 480), "m", 3)
     assert points.select(slice(None)).view_names == points.view_names
+
+
+def test_covariances_as_matrices() -> None:
+    points = Correspondences(WORLD, PIXELS, covariance=np.tile([4.0, 1.0, 2.0], (N, 1)))
+    found = points.pixel_covariance
+    assert found is not None
+    assert found.shape == (N, 2, 2)
+    assert found[5].tolist() == [[4.0, 1.0], [1.0, 2.0]]
+    assert Correspondences(WORLD, PIXELS).pixel_covariance is None
+    assert repr(points) == (
+        "Correspondences(6 points in 1 views, image size unknown, unit 'mm', with covariance)"
+    )

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
@@ -17,7 +18,7 @@ from neurocal_cli.errors import InputError
 
 
 @frozen_dataclass(eq=False)
-class CameraRig:
+class CameraRig(Presented):
     """Calibrated cameras that are fixed to each other.
 
     Attributes
@@ -71,6 +72,14 @@ class CameraRig:
     warnings: tuple[str, ...] = ()
     judgement: Verdict | Callable[[CameraRig], Verdict | None] | None = None
     stereo: Rig | None = None
+
+    _summary = ("commands.show.camera_rig_report", "camera_rig_report")
+
+    def __repr__(self) -> str:
+        return (
+            f"CameraRig of {len(self.cameras)} cameras ({', '.join(self.cameras)}): {len(self.frames)} "
+            f"frames, rms {self.rmse_px:.4g} px; see .cameras, .poses and .summary()"
+        )
 
     @cached_property
     def verdict(self) -> Verdict | None:

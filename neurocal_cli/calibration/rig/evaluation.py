@@ -21,7 +21,7 @@ from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig, poses_on_rig
 from neurocal_cli.calibration.rig.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
-from neurocal_cli.calibration.rig.triangulation import triangulate
+from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.verdict.findings import Finding
 from neurocal_cli.calibration.verdict.given_points import (
     GivenPoints,
@@ -68,7 +68,7 @@ def evaluate_stereo(
     right: Calibration,
     points: tuple[Correspondences, Correspondences] | None = None,
     *,
-    method: str = "optimal",
+    method: Method = "optimal",
 ) -> StereoEvaluation:
     """Evaluate two calibrated cameras by the points of both.
 
@@ -100,7 +100,7 @@ def evaluate_stereo(
 
 
 def evaluate_rig(
-    rig: Rig, points: tuple[Correspondences, Correspondences] | None = None, *, method: str = "optimal"
+    rig: Rig, points: tuple[Correspondences, Correspondences] | None = None, *, method: Method = "optimal"
 ) -> StereoEvaluation:
     """Evaluate a rig by the points of both cameras; see `evaluate_stereo`.
 
@@ -132,7 +132,7 @@ class _Evaluator:
         cameras: tuple[Calibration, Calibration],
         rig: Rig | None,
         points: tuple[Correspondences, Correspondences] | None,
-        method: str,
+        method: Method,
         failure: str = "",
     ) -> None:
         self.cameras, self.rig, self.method, self.failure = cameras, rig, method, failure

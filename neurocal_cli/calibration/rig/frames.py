@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.points import Correspondences, first_moved
+from neurocal_cli.observations.labels import first_moved
+from neurocal_cli.observations.points import Correspondences
 
 _ANY_CAMERA = r"cam(?:era)?[ _-]?[0-9]+(?![0-9])|left|right"
 

@@ -9,13 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
 from neurocal_cli.camera.pinhole import Pose
 
 
 @frozen_dataclass(eq=False)
-class Rig:
+class Rig(Presented):
     """Two calibrated cameras on one rig.
 
     Attributes
@@ -59,6 +60,16 @@ class Rig:
     iterations: int = 0
     warnings: tuple[str, ...] = ()
     judgement: Verdict | Callable[[Rig], Verdict | None] | None = None
+
+    _summary = ("commands.show.rig_report", "rig_report")
+
+    def __repr__(self) -> str:
+        std = self.std.get("baseline", float("nan"))
+        return (
+            f"Rig of {self.left.camera_name!r} and {self.right.camera_name!r}: {len(self.pairs)} pairs of "
+            f"views, rms {self.rmse_px:.4g} px\n"
+            f"  baseline {self.baseline:.6g} +- {std:.2g} {self.unit}; see .left, .right and .summary()"
+        )
 
     @cached_property
     def verdict(self) -> Verdict | None:

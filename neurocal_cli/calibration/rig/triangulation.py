@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, check_choice
 
-METHODS = ("optimal", "linear", "midpoint")
+Method = Literal["optimal", "linear", "midpoint"]
+METHODS = get_args(Method)
 
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
 _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
@@ -58,11 +60,26 @@ class Triangulated:
     epipolar: Array  # (N,) [px]
     behind: NDArray[np.bool_]  # (N,) not in front of both cameras, or not finite
 
+    def space_covariance(self, sigma: float) -> Array:
+        """(N, 3, 3) covariance of the points [unit^2], for pixels of a standard deviation [px].
+
+        It is that of the pixels' noise, not of the calibration. Raises InputError unless the method is
+        optimal.
+        """
+        if self.covariance is None:
+            raise InputError("only the method optimal gives the covariance of the points; use it")
+        return sigma**2 * self.covariance[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
     def off(self, limit: float) -> NDArray[np.bool_]:
         """(N,) which epipolar errors exceed a limit [px]."""
         return np.asarray(~(self.epipolar <= limit))
 
 
+@overload
+def triangulate(left: Rig, right: Array, pose: Array, /, *, method: Method = "optimal") -> Triangulated: ...
+
+
+@overload
 def triangulate(
     left: Camera | Calibration,
     right: Camera | Calibration,
@@ -71,10 +88,25 @@ def triangulate(
     right_pixels: Array,
     *,
     which: NDArray[np.intp] | None = None,
-    method: str = "optimal",
+    method: Method = "optimal",
+    whitening: tuple[Array, Array] | None = None,
+) -> Triangulated: ...
+
+
+def triangulate(
+    left: Any,
+    right: Any,
+    pose: Any,
+    left_pixels: Any = None,
+    right_pixels: Any = None,
+    *,
+    which: NDArray[np.intp] | None = None,
+    method: Method = "optimal",
     whitening: tuple[Array, Array] | None = None,
 ) -> Triangulated:
     """Triangulate points from their pixels in two cameras.
+
+    Call it with a rig, ``triangulate(rig, left_pixels, right_pixels)``, or with its parts.
 
     Parameters
     ----------
@@ -98,6 +130,8 @@ def triangulate(
         Arrays of different lengths or wrong shapes, or a rig that is no Pose.
     """
     check_choice("method", method, METHODS)
+    if isinstance(left, Rig):
+        left, right, pose, left_pixels, right_pixels = left.left, left.right, left.pose, right, pose
     pixels = _pixels(left_pixels), _pixels(right_pixels)
     n = len(pixels[0])
     if len(pixels[1]) != n:

@@ -48,6 +48,7 @@ from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rej
 from neurocal_cli.calibration.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
+    pixel_covariance,
     projection_uncertainty,
 )
 from neurocal_cli.calibration.verdict.proportions import Proportions, proportions
@@ -109,6 +110,19 @@ def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
     whole[np.ix_(m.free, m.free)] = shared
     to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
     return camera, to_pixels[:, None] * whole * to_pixels
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def pixel_covariance_of(calibration: Calibration, points: Array, view: str | None) -> Array | None:
+    """Covariance (N, 2, 2) [px^2] of the pixels of points (N, 3) in the camera's frame.
+
+    None if the calibration has no points of its own. See `pixel_covariance`.
+    """
+    if not _has_points(calibration) or _views_behind(calibration):
+        return None
+    at = _AtMinimum(calibration)
+    m, camera, shared = at.opened()
+    return pixel_covariance(m, camera, at.variance, points, shared, view)
 
 
 def _has_points(calibration: Calibration) -> bool:

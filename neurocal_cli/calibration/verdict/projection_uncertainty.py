@@ -14,7 +14,6 @@ mean of -M B^-1 C^T over the views and cov(e) that of M B^-1 M^T; M converts a v
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.cross_validation import Minimum
 from neurocal_cli.adjustment.leave_out import inverse_or_nan
@@ -63,46 +62,70 @@ def projection_uncertainty(
     Pixels of a wide lens that are much farther out than the angle [rad] of the `farthest` point lie beyond
     its image circle.
     """
-    free = np.flatnonzero(m.free)
-    gain, motion = _motions(m, camera_columns(len(m.free) - 5)[free])
-    by_camera, by_point, rays = _derivatives(camera, pixels, m.views.pixel_scale, farthest)
-    if m.state.square:
-        by_camera[:, :, 0] += by_camera[:, :, 2]
-    by_camera = by_camera[:, :, free]
+    motions = _motions(m)
+    rays = camera.seen_points(pixels)
+    if farthest is not None:
+        rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)
+    by_camera, by_point = _derivatives(m, camera, rays)
     std = np.empty((len(depths), len(pixels)))
     for k, depth in enumerate(depths):
-        p = depth * rays
-        moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
-        by_motion = by_point / depth @ moved  # (G, 2, 6)
-        J = by_camera + by_motion @ gain
+        J, by_motion = _moving(motions, depth * rays, by_camera, by_point / depth)
         # The traces of J cov J^T.
         of_camera = (J @ shared * J).sum(axis=(1, 2))
-        std[k] = np.sqrt(of_camera + variance * (by_motion @ motion * by_motion).sum(axis=(1, 2)))
+        std[k] = np.sqrt(of_camera + variance * (by_motion @ motions[1] * by_motion).sum(axis=(1, 2)))
     return ProjectionUncertainty(pixels, depths, std)
 
 
-def _motions(m: Minimum, shared: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Gain G (6, f) and cov(e) (6, 6) of the motion, in world units, for residuals of unit variance."""
+def pixel_covariance(
+    m: Minimum, camera: Camera, variance: float, points: Array, shared: Array, view: str | None = None
+) -> Array:
+    """Covariance (N, 2, 2) [px^2] of the pixels of points (N, 3) in the camera's frame [world unit].
+
+    The points are fixed to the target of a view, or, as above, to the targets of all views. The other
+    parameters are those of `projection_uncertainty`.
+    """
+    motions = _motions(m, None if view is None else m.views.names.index(view))
+    J, by_motion = _moving(motions, points, *_derivatives(m, camera, points))
+    of_camera = J @ shared @ np.swapaxes(J, 1, 2)
+    return np.asarray(of_camera + variance * (by_motion @ motions[1] @ np.swapaxes(by_motion, 1, 2)))
+
+
+def _moving(
+    motions: tuple[Array, Array], points: Array, by_camera: Array, by_point: Array
+) -> tuple[Array, Array]:
+    """Derivatives of pixels by the camera and the motion it causes (N, 2, f), and by a motion (N, 2, 6)."""
+    n = len(points)
+    moved = np.concatenate([-cross_matrix(points), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
+    by_motion = by_point @ moved
+    return by_camera + by_motion @ motions[0], by_motion
+
+
+def _motions(m: Minimum, view: int | None = None) -> tuple[Array, Array]:
+    """Gain G (6, f) and cov(e) (6, 6) of the motion, in world units, for residuals of unit variance.
+
+    The motion is the mean of all views', or that of a single view.
+    """
+    shared = camera_columns(len(m.free) - 5)[np.flatnonzero(m.free)]
     if not m.free_poses:
         return np.zeros((6, len(shared))), np.zeros((6, 6))
-    V, scale = m.views.n_views, m.views.scale[:, None, None]
-    B_inverse = inverse_or_nan(m.normal[:, POSE, POSE])
-    C = m.normal[:, shared, POSE]
+    taken = slice(None) if view is None else slice(view, view + 1)
+    scale, normal = m.views.scale[taken, None, None], m.normal[taken]
+    V = len(normal)
+    B_inverse = inverse_or_nan(normal[:, POSE, POSE])
+    C = normal[:, shared, POSE]
     M = np.zeros((V, 6, 6))
     M[:, :3, :3] = np.eye(3)
-    M[:, 3:, :3] = scale * cross_matrix(m.state.t)
+    M[:, 3:, :3] = scale * cross_matrix(m.state.t[taken])
     M[:, 3:, 3:] = scale * np.eye(3)
     gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
     motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
     return gain, motion
 
 
-def _derivatives(
-    camera: Camera, pixels: Array, scale: float, farthest: float | None
-) -> tuple[Array, Array, Array]:
-    """Derivatives of pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
-    rays = camera.seen_points(pixels)
-    if farthest is not None:
-        rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)
-    by_camera, by_point = camera.project_jacobian(rays)
-    return by_camera * np.array([scale] * 5 + [1.0] * (by_camera.shape[2] - 5)), by_point, rays
+def _derivatives(m: Minimum, camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Derivatives of the pixels of points (N, 3) by the free parameters, normalised, and by the points."""
+    by_camera, by_point = camera.project_jacobian(points)
+    by_camera = by_camera * np.array([m.views.pixel_scale] * 5 + [1.0] * (by_camera.shape[2] - 5))
+    if m.state.square:
+        by_camera[:, :, 0] += by_camera[:, :, 2]
+    return by_camera[:, :, np.flatnonzero(m.free)], by_point

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import count
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
-from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.calibrate import Lens, calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.zoom.mlfn import Schedule
 from neurocal_cli.calibration.zoom.parameter_networks import Budget, fit_committee
@@ -268,7 +269,9 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
     """One setting; without distortion where its points do not determine it."""
     try:
-        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
+        return calibrate(
+            points, distortion=cast("Lens", model), outliers="keep", target="given", skew=skew, seed=seed
+        )
     except DegenerateGeometryError:
         if model == "none":
             raise

@@ -15,6 +15,7 @@ the pixels and the prior of the target.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from neurocal_cli.adjustment.board.information import labelled, point_terms
 from neurocal_cli.adjustment.board.posterior import prior_covariance
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.calibration.calibrate import calibrate
+from neurocal_cli.calibration.calibrate import Lens, calibrate
 from neurocal_cli.calibration.common_target import common_target
 from neurocal_cli.calibration.zoom.settings import LensPoints, PixelData, Tables
 from neurocal_cli.camera.geometry import Array
@@ -51,7 +52,9 @@ def lens_target(
         progress("finding the target", k / len(some))
         points = replace(lens.points.select(lens.point_setting == s), world_std=None)
         try:
-            cameras.append(calibrate(points, distortion=distortion, target="given", skew=skew, seed=seed))
+            cameras.append(
+                calibrate(points, distortion=cast("Lens", distortion), target="given", skew=skew, seed=seed)
+            )
         except NeurocalError:
             continue
     return common_target(cameras, choice) if len(cameras) >= _FEWEST else None

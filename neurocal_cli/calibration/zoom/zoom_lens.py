@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.observability import MEANINGLESS
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
+from neurocal_cli.calibration.presented import Summarised
 from neurocal_cli.calibration.zoom.parameter_networks import LensNets, are_cameras
 from neurocal_cli.calibration.zoom.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.calibration.zoom.settings import (
@@ -31,7 +32,7 @@ _LEAST_INFORMATION = 0.02  # least share of a direction of the target's offsets 
 
 
 @frozen_dataclass(eq=False)
-class ZoomLens:
+class ZoomLens(Summarised):
     """A camera with a calibrated zoom lens.
 
     Attributes
@@ -103,6 +104,18 @@ class ZoomLens:
     target: Target | None = None
     target_coupling: Array | None = None
     free_pose_px: float = np.nan
+
+    _summary = ("commands.show.zoom_report", "lens_report")
+
+    def __repr__(self) -> str:
+        ranges = (
+            f"{name} {low:g} to {high:g}"
+            for name, low, high in zip(self.controls, self.low, self.high, strict=True)
+        )
+        return (
+            f"ZoomLens of {len(self.settings)} settings, {', '.join(ranges)}: distortion {self.model}, rms "
+            f"{self.rmse_px:.4g} px; see .summary()"
+        )
 
     @property
     def low(self) -> Array:

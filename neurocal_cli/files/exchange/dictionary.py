@@ -18,9 +18,10 @@ import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.camera_tree import camera_from_tree, has_matrix, matrix_data, to_ros
+from neurocal_cli.files.camera_tree import camera_from_tree, has_matrix, matrix_data
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.files.exchange.neurocal import as_rig
 from neurocal_cli.files.file_storage import storage_text

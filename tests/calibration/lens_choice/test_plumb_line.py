@@ -368,13 +368,12 @@ def detected(real_files: RealFiles) -> Detected:
     @cache
     def points(pattern: str, cols: int, rows: int, square: float) -> Correspondences:
         from neurocal_cli.detection.batch import DetectionOptions, detect_files
-        from neurocal_cli.detection.detect import gather
 
         board = Board.single(cols, rows, square)
         paths = [str(path) for path in real_files(pattern)]
         outcomes = detect_files(paths, DetectionOptions(board, "midpoints", None, False, True), 1)
         found = {f"v{n}": o.detection for n, o in enumerate(outcomes) if o.detection is not None}
-        return gather(found, board.unit)
+        return Correspondences.from_detections(found, board.unit)
 
     return points
 

@@ -40,6 +40,27 @@ def test_without_noise_points_are_exact(method: str, lens: str, kind: str) -> No
     assert not found.behind.any()
 
 
+def test_a_rig_stands_for_its_cameras_and_their_pose() -> None:
+    from support.places import SAMPLES
+
+    from neurocal_cli import Rig, calibrate_stereo, read_points
+
+    left, right = (read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right"))
+    rig: Rig = calibrate_stereo(left, right, skew=False, distortion="none", target="given")
+    parts = triangulate(rig.left, rig.right, rig.pose, left.pixels, right.pixels)
+    whole = triangulate(rig, left.pixels, right.pixels)
+    np.testing.assert_array_equal(whole.points, parts.points)
+    found = whole.space_covariance(rig.sigma)
+    assert whole.covariance is not None
+    assert found.shape == (len(left), 3, 3)
+    np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
+    for k, (i, j) in enumerate(PAIRS):
+        np.testing.assert_allclose(found[:, i, j], rig.sigma**2 * whole.covariance[:, k])
+    assert (np.linalg.eigvalsh(found) > 0).all()
+    with pytest.raises(InputError, match="only the method optimal gives the covariance"):
+        triangulate(rig, left.pixels, right.pixels, method="linear").space_covariance(1.0)
+
+
 def opencv(scene: RigScene, left: Array, right: Array) -> Array:
     cv2 = pytest.importorskip("cv2")
     P = scene.cameras[0].A @ np.eye(3, 4), scene.cameras[1].A @ scene.rig.D

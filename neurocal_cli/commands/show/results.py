@@ -1,0 +1,113 @@
+"""The page and the pictures of any result, for Python."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from neurocal_cli.calibration.advice import advise
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
+from neurocal_cli.commands.show import CAMERA_PANELS
+from neurocal_cli.errors import InputError, UsageError, check_choice
+
+Result = Calibration | Rig | CameraRig | ZoomLens
+
+_KINDS = ("png", "svg", "pdf")
+
+
+class Picture(bytes):
+    """The bytes of a picture's file; a notebook shows a PNG."""
+
+    def __repr__(self) -> str:
+        return f"Picture of {len(self)} bytes"
+
+    def _repr_png_(self) -> bytes | None:
+        return bytes(self) if self.startswith(b"\x89PNG") else None
+
+
+def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> str:
+    """Make the HTML page of ``neurocal report``.
+
+    Parameters
+    ----------
+    result : Calibration, Rig, CameraRig or ZoomLens
+    photographs : dict of bytes by view, optional
+        JPEG files of the views of a Calibration.
+
+    Returns
+    -------
+    page : str
+        A whole page, which loads nothing from elsewhere.
+
+    Examples
+    --------
+    >>> Path("report.html").write_text(report(camera), encoding="utf-8")  # doctest: +SKIP
+    """
+    from neurocal_cli.commands.show.html_page import Origin, versions
+    from neurocal_cli.commands.show.html_reports import (
+        calibration_page,
+        camera_rig_page,
+        lens_page,
+        rig_page,
+    )
+
+    origin = Origin({}, versions=versions())
+    if isinstance(result, Calibration):
+        return calibration_page(result, origin, photographs)
+    if photographs:
+        raise UsageError("only the page of a Calibration shows photographs; leave them out")
+    if isinstance(result, Rig):
+        return rig_page(result, origin)
+    return camera_rig_page(result, origin) if isinstance(result, CameraRig) else lens_page(result, origin)
+
+
+def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture:
+    """Draw the picture of the option ``--plot``.
+
+    Parameters
+    ----------
+    result : Calibration, Rig, CameraRig or ZoomLens
+    panel : str, optional
+        One panel of a camera or a pair: residuals, coverage, uncertainty, scatter, poses, learning, views; or
+        ``next``, the views of a camera to take next. Default: all panels on a page.
+    kind : {"png", "svg", "pdf"}
+
+    Returns
+    -------
+    picture : bytes
+        Of the file; a notebook shows it.
+
+    Raises
+    ------
+    UsageError
+        There is no such panel or kind.
+    NeurocalError
+        matplotlib is not installed.
+    """
+    check_choice("kind", kind, _KINDS)
+    if isinstance(result, Calibration) and panel == "next":
+        from neurocal_cli.commands.show.advice import draw_advice
+
+        return Picture(draw_advice(advise(result), result, kind))
+    panels = CAMERA_PANELS if isinstance(result, (Calibration, Rig)) else ()
+    if panel is not None:
+        if not panels:
+            raise UsageError("this result has a single picture; leave out panel")
+        check_choice("panel", panel, (*panels, "next") if isinstance(result, Calibration) else panels)
+    if isinstance(result, ZoomLens):
+        from neurocal_cli.commands.show.zoom_plots import draw_lens
+
+        return Picture(draw_lens(result, kind))
+    from neurocal_cli.commands.show.plot_pages import draw_camera, draw_camera_rig, draw_rig
+
+    if isinstance(result, CameraRig):
+        return Picture(draw_camera_rig(result, kind))
+    if isinstance(result, Rig):
+        return Picture(draw_rig(result, kind, panel))
+    if not len(result.points):
+        raise InputError("the calibration holds no points; give one that was not written with --lean")
+    from neurocal_cli.commands.show.camera_panels import Subject
+
+    return Picture(draw_camera(Subject.of(result), kind, panel))

@@ -1,0 +1,53 @@
+"""The grey image in which points are measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+
+_TO_GREY = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}  # by the number of channels
+
+
+def grey_image(image: NDArray[Any]) -> NDArray[Any]:
+    """Convert an image to grey, as OpenCV does: 0.299 R + 0.587 G + 0.114 B.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, 3 or 4) array
+        Colours in OpenCV's order, blue first. In the other order the edges of a black and white board are at
+        the same places.
+
+    Raises
+    ------
+    InputError
+        The array has another shape or type, no pixels, or pixels that are not finite.
+    """
+    image = np.asarray(image)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[..., 0]
+    colours = image.shape[2] if image.ndim == 3 else 0
+    if image.size == 0 or image.ndim not in (2, 3) or (colours and colours not in _TO_GREY):
+        raise InputError(
+            "an image must be a (height, width) array of grey values, or (height, width, 3) of colours, "
+            f"found the shape {image.shape}"
+        )
+    if image.dtype.kind == "f":
+        if not np.isfinite(image).all():
+            raise InputError(
+                "some pixels of the image are not finite numbers; replace them, for example by 0"
+            )
+        if colours:
+            image = image.astype(np.float32, copy=False)  # what OpenCV converts
+    elif image.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"an image must be of uint8, uint16 or floating-point numbers, found {image.dtype}; convert it, "
+            "for example with image.astype(np.uint8)"
+        )
+    if not colours:
+        return image
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), _TO_GREY[colours]))

@@ -1,0 +1,151 @@
+"""What results show of themselves in Python: a few lines, the command's summary, tables, pages, pictures."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import run
+from support.made_calibration import made_calibration
+from support.places import SAMPLES
+
+from neurocal_cli import (
+    Calibration,
+    CameraRig,
+    Rig,
+    calibrate,
+    calibrate_rig,
+    calibrate_stereo,
+    fit_lens,
+    plot,
+    read_lens_points,
+    read_points,
+    report,
+)
+from neurocal_cli.errors import InputError, UsageError
+
+
+@cache
+def camera() -> Calibration:
+    return calibrate(read_points(SAMPLES / "flat.csv"), distortion="k1", skew=False)
+
+
+@cache
+def rig() -> Rig:
+    left, right = (read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right"))
+    return calibrate_stereo(left, right, skew=False, distortion="none", target="given")
+
+
+@cache
+def camera_rig() -> CameraRig:
+    points = {f"cam{k}": read_points(SAMPLES / f"rig_cam{k}.csv") for k in range(3)}
+    return calibrate_rig(points, distortion="none", skew=False, target="given")
+
+
+def test_the_summary_is_what_the_command_prints() -> None:
+    words = "calibrate", SAMPLES / "flat.csv", "--distortion", "k1", "--no-skew"
+    assert camera().summary().strip() in run(*words).stderr
+    assert "baseline" in rig().summary()
+    assert "cam2" in camera_rig().summary()
+
+
+@pytest.mark.parametrize("result", [camera, rig, camera_rig])
+def test_a_result_is_printed_in_three_lines_at_most(result) -> None:
+    lines = repr(result()).splitlines()
+    assert 1 <= len(lines) <= 3
+    assert type(result()).__name__ in lines[0]
+    assert max(map(len, lines)) <= 140
+
+
+def test_the_lines_of_a_camera_have_its_values() -> None:
+    text = repr(camera())
+    for word in ("640 x 480 px", f"rms {camera().rmse_px:.4g} px", "distortion k1 [", "alpha_u ", " +- "):
+        assert word in text
+    assert "rms nan" not in text
+
+
+def test_points_and_targets_are_printed_in_a_line() -> None:
+    assert repr(camera().points) == (
+        f"Correspondences({len(camera().points)} points in {camera().points.n_views} views, image size "
+        "640 x 480 px, unit 'mm', with point)"
+    )
+
+
+@pytest.mark.parametrize("result", [camera, rig, camera_rig])
+def test_a_notebook_shows_the_verdict_and_a_table(result) -> None:
+    html = result()._repr_html_()
+    verdict = result().verdict
+    assert verdict is not None
+    assert f"<b>{verdict.word}</b>" in html
+    assert "<table" in html
+    assert "<script" not in html
+
+
+def test_a_notebook_shows_names_from_files_as_text() -> None:
+    from dataclasses import replace
+
+    html = replace(made_calibration(1), camera_name="<img src=x>")._repr_html_()
+    assert "<img" not in html
+
+
+@pytest.mark.parametrize("result", [camera, rig, camera_rig])
+def test_the_page_is_that_of_the_command(result) -> None:
+    page = report(result())
+    assert page.startswith("<!DOCTYPE html>")
+    assert page.count("<h2>") > 3
+
+
+def test_a_picture_is_of_all_panels_of_one_or_of_the_next_views() -> None:
+    alone = plot(camera(), "residuals")
+    assert alone.startswith(b"\x89PNG")
+    assert alone._repr_png_() == alone
+    assert plot(camera(), "residuals", kind="svg")._repr_png_() is None
+    assert plot(camera(), "next") != alone
+    for wrong in ({"panel": "nothing"}, {"kind": "gif"}):
+        with pytest.raises(UsageError, match="must be one of"):
+            plot(camera(), **wrong)
+    with pytest.raises(UsageError, match="leave out panel"):
+        plot(camera_rig(), "poses")
+    with pytest.raises(InputError, match="holds no points"):
+        plot(camera().lean)
+
+
+def test_converted_is_what_the_command_writes(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    assert (
+        run("calibrate", SAMPLES / "flat.csv", "--distortion", "k1", "--no-skew", "-o", file).exit_code == 0
+    )
+    for to in ("opencv", "kalibr", "json"):
+        made = camera().convert(to)
+        assert made.text == run("convert", file, "--to", to).stdout
+        assert made.warnings == ()
+    pair = rig().convert("ros")
+    assert set(pair.files) == {"left.yaml", "right.yaml"}
+    with pytest.raises(UsageError, match="several files"):
+        pair.text  # noqa: B018 - reading it is the test
+    with pytest.raises(UsageError, match="must be one of"):
+        camera().convert("nothing")  # type: ignore[arg-type]
+
+
+def test_what_a_conversion_loses_is_told() -> None:
+    skewed = made_calibration(3)
+    assert any("skew" in text for text in skewed.convert("opencv").warnings)
+    assert json.loads(skewed.convert("json").text)["image_width"] == 640
+    wide = calibrate(read_points(SAMPLES / "fisheye.csv"), distortion="fisheye", skew=False, target="given")
+    with pytest.raises(InputError, match="MATLAB has no distortion model fisheye"):
+        wide.convert("matlab")
+    assert wide.convert("matlab", force=True).warnings
+    np.testing.assert_array_equal(wide.cv2_fisheye_distortion, wide.distortion)
+
+
+@pytest.mark.slow
+def test_a_zoom_lens_is_shown_too() -> None:
+    lens = fit_lens(read_lens_points(SAMPLES / "zoom.csv"))
+    assert len(repr(lens).splitlines()) == 1
+    assert "verdict" in lens._repr_html_()
+    assert "zoom" in lens.summary()
+    assert plot(lens).startswith(b"\x89PNG")
+    assert "<svg" in report(lens)
