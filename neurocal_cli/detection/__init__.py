@@ -12,7 +12,8 @@ image -> pyramid -> saddle points           `finding.saddles`
 -> size of the board, if it is not given    `board_size`
 -> identity: the board's coordinates        `identity.identify` (`identity.placement`, `identity.ends`)
 -> edge fits to all pixels nearby           `fitting.grid_fit` (`grid_edges`, `initial_fit`,
-                                            `common_parameters`, `edge_fit`, `edge_profile`, `shading`)
+                                            `common_parameters`, `edge_fit`, `edge_profile`, `sharpening`,
+                                            `shading`)
 -> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.wide_map`, `fitting.map_fit`
 -> mid-points or vertices with covariance   `measuring` (`fitting.vertex_fit`)
 -> labelled points of an image              `detect`

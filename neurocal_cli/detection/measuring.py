@@ -73,6 +73,7 @@ def measure(
         index = np.zeros((0, 2), dtype=np.int64)
         return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
     fitted = fit_grid(grid_image)
+    grid_image = fitted.grid_image
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)

@@ -5,8 +5,8 @@ With z the distance from the edge in units of sigma_t, ``sigma_t^2 = psf^2 + 1/1
     E(z) = erf(z / sqrt 2) + phi(z) (a_3 He_3(z) + a_5 He_5(z))
 
 where phi is the normal density and He_k are Hermite polynomials (Gram-Charlier series). The coefficients
-describe the tails of the blur, the pixel's box (see `box_kurtosis`) and sharpening. Then a nonlinear
-response, due to gamma or clipping, maps the light x between the levels -1 and +1 to
+describe the tails of the blur, the pixel's box (see `box_kurtosis`) and weak sharpening (`sharpening`). Then
+a nonlinear response, due to gamma or clipping, maps the light x between the levels -1 and +1 to
 
     F(x) = x + (1 - x^2) (b_0 + b_1 x + b_2 x^2 + ...)
 

@@ -1,7 +1,8 @@
 """Fit all edges of a board in stages, from vertices known to half a pixel to the noise limit.
 
 The stages are: a map through the found vertices, offsets of the edges from moments, a first fit with
-independent levels, common parameters, a last fit, and the map through its edges.
+independent levels, common parameters, a last fit, and the map through its edges. If the edges show after the
+second stage that the camera has sharpened the image, this is undone, and the stages begin again.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from neurocal_cli.detection.fitting.shading import (
     fit_shading,
     square_levels,
 )
+from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
@@ -73,6 +75,7 @@ _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile
 class GridFit:
     """Fitted edges and their common parameters."""
 
+    grid_image: GridImage  # what was fitted: the image without the camera's sharpening
     lines: Lines
     fit: BatchFit
     map: MapFit
@@ -115,8 +118,8 @@ class GridFit:
         return max(self.map.excess - 1, 0.0) * upper_median(self.fit.covariance[self.good, OFFSET, OFFSET])
 
 
-def fit_grid(grid_image: GridImage) -> GridFit:
-    """Run all stages."""
+def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
+    """Run all stages, after sharpening by the camera is undone if `undo`."""
     vertices = grid_image.vertices
     start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     anchors = grid_image.anchors(_START_SIGMA)
@@ -127,7 +130,12 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
         shading = LocalShading.of(shading, dark, light)
-    mapped, sigma, levels = _by_moments(grid_image, found, shading)
+    mapped, sigma, levels, profile = _by_moments(grid_image, found, shading)
+    sharpening = find_sharpening(profile) if undo else None
+    if sharpening is not None:
+        image = sharpening.undone(grid_image.image, grid_image.grid)
+        floor = grid_image.floor * float((sharpening.inverse**2).sum())
+        return fit_grid(replace(grid_image, image=image, floor=floor), undo=False)
     first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
     return _last_fit(grid_image, first)
 
@@ -149,8 +157,8 @@ def _wide_if_better(
 
 def _by_moments(
     grid_image: GridImage, found: MapFit, shading: Shading
-) -> tuple[MapFit, float, tuple[Array, Array]]:
-    """Fit the map to offsets from moments, and estimate the blur [px] and the levels of each edge."""
+) -> tuple[MapFit, float, tuple[Array, Array], EdgeProfile | None]:
+    """Fit the map to offsets from moments; estimate the blur [px], the levels of each edge, the profile."""
     lines = grid_image.edges.lines(found.map)
     # Oblique crossing lines enter wide strips, so these are narrower.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
@@ -162,7 +170,8 @@ def _by_moments(
     sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     variance = np.full(len(offset), _MOMENT_SIGMA**2)
     observations = grid_image.observations(lines, offset, variance, np.ones((len(offset), 1)))
-    return fit_map(found.map, observations, found.shift), sigma, levels
+    profile = edge_profile(strips, offset, *levels)
+    return fit_map(found.map, observations, found.shift), sigma, levels, profile
 
 
 def _first_fit(
@@ -194,7 +203,8 @@ def _first_fit(
         # An uneven board departs from both maps.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
-    return GridFit(lines, fit, chosen, shifts, shading, PixelNoise(noise, noise, noise), good)
+    noises = PixelNoise(noise, noise, noise)
+    return GridFit(grid_image, lines, fit, chosen, shifts, shading, noises, good)
 
 
 def _may_be_wide(found: MapFit, vertices: Array) -> bool:
@@ -269,7 +279,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     # Where squares are blurred together, fits that failed may agree on such a shift.
     possible = np.abs(shifts.terms(lines) @ mapped.shift) < 0.5 * lines.width
     good = is_reliable(fit, np.where(possible, departure, np.inf))
-    return GridFit(lines, fit, mapped, shifts, shading, noise, good)
+    return GridFit(grid_image, lines, fit, mapped, shifts, shading, noise, good)
 
 
 def _shading(first: GridFit) -> Shading:
