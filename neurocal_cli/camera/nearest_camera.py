@@ -185,10 +185,13 @@ def _descended(
     first[:2] /= 1 + first[4] if model in WITH_XI else 1.0
     if not np.isfinite(error(first)).all():
         return None
-    with np.errstate(all="ignore"):
-        fit = least_squares(
-            error, first, slopes, x_scale="jac", method="trf", xtol=1e-12, ftol=1e-10, gtol=1e-15,
-            max_nfev=_STEPS,
-        )  # fmt: skip
+    try:
+        with np.errstate(all="ignore"):
+            fit = least_squares(
+                error, first, slopes, x_scale="jac", method="trf", xtol=1e-12, ftol=1e-10, gtol=1e-15,
+                max_nfev=_STEPS,
+            )  # fmt: skip
+    except ValueError:  # derivatives that are not finite, as where beta of eucm becomes 0
+        return None
     near = built(entries(fit.x))
     return None if near is None else (near, float(fit.cost))

@@ -13,6 +13,8 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
 # Options of back-propagation only, and their names in `BackpropOptions`.
@@ -65,8 +67,6 @@ class Estimation:
             raise UsageError("--type 3 does not change the given camera; leave out --skew")
         if self.type == "3" and self.no_skew:
             raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
-        if self.type == "3" and self.distortion not in ("auto", "none"):
-            raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
         if self.fix and self.method != "neuro":
             raise UsageError(f"--fix needs --method neuro, but the method is {self.method}; leave it out")
         if self.type == "3" and self.fix:
@@ -148,8 +148,10 @@ class Estimation:
         elif self.intrinsics is not None:
             from neurocal_cli.calibration.calibration import Calibration
 
-            points, camera = preparation.given_camera(self.intrinsics, points)
-            arguments["intrinsics"] = camera
+            points, arguments["intrinsics"] = self._known(points)
+            camera = arguments["intrinsics"]
+            if self.distortion != "none":
+                arguments["distortion"] = "auto"
             if not (isinstance(camera, Calibration) and camera.known_covariance[0]):
                 _note_exact(f"{self.intrinsics} does not say how accurate its camera is, so it")
         elif self.extrinsics is not None:
@@ -158,6 +160,18 @@ class Estimation:
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
             _note_exact("each given pose")
         return points, arguments
+
+    def _known(self, points: Correspondences) -> tuple[Correspondences, Camera | Calibration]:
+        """The known camera; --distortion names its model if the file does not."""
+        from neurocal_cli.camera.camera import camera_of
+        from neurocal_cli.camera.distortion import MODELS
+
+        assert self.intrinsics is not None
+        given = self.distortion if self.distortion in MODELS and self.distortion != "none" else None
+        points, camera = preparation.given_camera(self.intrinsics, points, given)
+        if self.distortion not in ("auto", "none", camera_of(camera).distortion.model):
+            raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
+        return points, camera
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
         """The image centre of type 2: from the option, the points' header, or the middle of the image."""

@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.streams import note, print_summary, say, warn
-from neurocal_cli.errors import InputError, UsageError, plural
+from neurocal_cli.errors import FormatError, InputError, UsageError, plural
 from neurocal_cli.files.reading import repeatable_stdin
 from neurocal_cli.files.writing import check_places, make_folder, write_whole
 
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 @options.argument(
     "files",
     "FILE...",
-    "A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
-    "JSON or .npz dictionary; - is standard input. Two files are the left and the right camera of ROS or "
-    "mrcal, or the two files of OpenCV's stereo sample. Points are files of neurocal, or corners in "
-    "a dictionary of OpenCV or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, "
-    "then u v of each view.",
+    "A camera or a rig of any program listed below, or a JSON or .npz dictionary; - is standard input. Two "
+    "files are the left and the right camera of ROS, mrcal or EuRoC, the files of OpenCV's stereo sample, "
+    "or .npy files of the matrix and the coefficients. Points are tables, corners in a dictionary of OpenCV "
+    "or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, then u v of each view.",
     nargs=-1,
     required=True,
 )
 @options.choice(
     "--to",
-    "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt",
+    "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt nerfstudio anipose orb-slam vins basalt "
+    "euroc open3d metashape gyroflow",
     "Format to write.",
     without="required",
     to="target",
@@ -46,6 +46,18 @@ if TYPE_CHECKING:
     options.MODELS,
     "Write the nearest camera of this distortion model, and say how many pixels it is off.",
     without="the camera's own",
+)
+@options.choice(
+    "--distortion",
+    options.MODELS,
+    "Distortion model of the coefficients in FILE, if the file does not say.",
+    without="as the file says",
+)
+@options.choice(
+    "--what",
+    "camera points",
+    "What to convert of a file that holds both a camera and points.",
+    without="the camera",
 )
 @options.flag(
     "--force",
@@ -66,6 +78,8 @@ def convert(
     files: tuple[str, ...],
     target: str,
     model: str | None,
+    distortion: str | None,
+    what: str | None,
     force: bool,
     board: options.BoardOptions,
     image_size: tuple[int, int] | None,
@@ -90,6 +104,13 @@ def convert(
       npz       the same for NumPy
       dlt       11 rows of DLT coefficients, a column for each camera of a
                 rig (X, Y, Z as in the first view), or for each view
+      nerfstudio, anipose, orb-slam, vins, basalt, euroc, open3d,
+      metashape, gyroflow
+                the files of these programs
+
+    \b
+    Read as well: OpenVINS, OKVIS, SVO, KITTI, BoofCV, ZED, caliscope,
+    freemocap, instant-ngp, PhotonVision, RealSense, Bouguet's toolbox.
 
     If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
     differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs
@@ -111,6 +132,10 @@ def convert(
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
       neurocal convert camera.yaml --to dlt -o dlt.csv
+      echo '{"K": [[280, 0, 319], [0, 280, 239], [0, 0, 1]],
+          "D": [0.09, 0.005, -0.005, -0.002]}' > front.json
+      neurocal convert front.json --distortion fisheye --to neurocal \\
+          -o front.yaml
       neurocal calibrate sample_data/fisheye.csv --no-skew -o fisheye.yaml
       neurocal convert fisheye.yaml --to ros --model rational --json \\
           -o rational.yaml
@@ -120,6 +145,7 @@ def convert(
       neurocal convert corners.vnl --board board.yaml --to neurocal -o again.csv
       neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
           -o corners.npz
+      neurocal convert corners.npz --what points --to json -o corners.json
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(*files, board.file)
     preparation.check_summary(as_json, output)
@@ -131,7 +157,7 @@ def convert(
     from neurocal_cli.files.exchange.camera_set import CameraSet
 
     with repeatable_stdin() if "-" in files else nullcontext():
-        found = _read(files, target_board, board.unit, image_size)
+        found = _read(files, target_board, board.unit, image_size, distortion, what)
     if isinstance(found, CameraSet):
         summary = _write_cameras(found, target, model, force, output)
     elif model is None:
@@ -146,26 +172,41 @@ def convert(
 
 
 def _read(
-    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
+    files: tuple[str, ...],
+    board: Board | None,
+    unit: str | None,
+    size: tuple[int, int] | None,
+    distortion: str | None,
+    what: str | None,
 ) -> Correspondences | CameraSet:
     """The points of the files or, if they hold none, the cameras; with values that the files lack."""
     from neurocal_cli.files.exchange.colmap import is_folder
     from neurocal_cli.files.exchange.corners import read_corners
 
     notes: list[str] = []
-    points = None if is_folder(files[0]) else read_corners(files, board, notes, unit)
+    warnings: list[str] = []
+    points = None
+    if what != "camera" and not is_folder(files[0]):
+        points = read_corners(files, board, notes, unit, what)
     note(*notes)
     if points is not None:
+        options.note_unused("on points", "distortion")
         if size is not None and points.image_size not in (None, size):
             raise InputError("the image size of the file is another; leave out --image-size")
         return points if size is None else replace(points, image_size=size)
+    if what == "points":
+        raise FormatError("holds no points; leave out --what", files[0])
     if board is not None:
         raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
     if len(files) > 2:
-        raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
+        raise UsageError(f"there are {len(files)} files; give one, or the two of one rig")
     from neurocal_cli.files.exchange.reading import read_cameras
 
-    return _completed(read_cameras(files), unit, size)
+    notes = []
+    cameras = read_cameras(files, notes, warnings, distortion=distortion, size=size)
+    note(*notes)
+    warn(*(warnings if size is None else ()))  # they are about the size
+    return _completed(cameras, unit, size)
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
@@ -176,10 +217,11 @@ def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | Non
         cameras = replace(cameras, unit=unit)
     if size is not None:
         for camera in cameras.cameras:
-            if camera.image_size is not None and camera.image_size != size:
-                width, height = camera.image_size
+            # The sides that a file has in the other order may be exchanged.
+            if camera.image_size not in (None, size, size[::-1]):
+                width, height = camera.image_size or size
                 raise InputError(f"the image size of the file is {width} {height}; leave out --image-size")
-        if any(camera.image_size is None for camera in cameras.cameras):
+        if any(camera.image_size != size for camera in cameras.cameras):
             sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
             cameras = replace(cameras, cameras=sized, origin=None)
     return cameras
@@ -206,6 +248,7 @@ def _write_cameras(
     from neurocal_cli.files.exchange.reading import FORMATS
 
     wanted = FORMATS[target]
+    assert wanted.text is not None  # all of these are written
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
     if set(contents) == {""}:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -63,23 +64,45 @@ def compute_in_one_thread() -> None:
 
 
 def given_points(*names: str) -> Correspondences:
-    """Read points, and report rows of their files that were left out."""
-    from neurocal_cli.files.points_csv import ids_at_two_places, read_points
+    """Read points, also those of other programs with their places, and report rows that were left out."""
+    from neurocal_cli.files.points_csv import POINTS, ids_at_two_places, read_points
+    from neurocal_cli.files.reading import repeatable_stdin
 
     notes: list[str] = []
-    points = read_points(names, notes=notes)
+    with repeatable_stdin() if "-" in names else nullcontext():
+        points = None
+        if not names[0].lower().endswith((".csv", ".txt", ".tsv")):
+            from neurocal_cli.files.exchange.corners import read_corners
+
+            advice = POINTS.instead.removeprefix("; ")
+            points = read_corners(names, None, notes, what="points", advice=advice)
+        if points is None:
+            points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))
     return points
 
 
-def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera | Calibration]:
-    """Read a known camera of the points' image size; give the points its image size if they have none.
-
-    Of a neurocal file it is a Calibration without poses and points, but with its covariance.
-    """
+def known_camera(path: str, distortion: str | None = None) -> Camera | Calibration:
+    """Read a known camera, and tell what its file leaves in doubt; see `read_given_camera`."""
     from neurocal_cli.files.exchange.reading import read_given_camera
 
-    camera = read_given_camera(path)
+    notes: list[str] = []
+    warnings: list[str] = []
+    camera = read_given_camera(path, notes, warnings, distortion)
+    note(*notes)
+    warn(*warnings)
+    return camera
+
+
+def given_camera(
+    path: str, points: Correspondences, distortion: str | None = None
+) -> tuple[Correspondences, Camera | Calibration]:
+    """Read a known camera of the points' image size; give the points its image size if they have none.
+
+    Of a neurocal file it is a Calibration without poses and points, but with its covariance. `distortion` is
+    the model of the coefficients of a file that does not say it.
+    """
+    camera = known_camera(path, distortion)
     if camera.image_size is not None:
         if points.image_size is None:
             points = replace(points, image_size=camera.image_size)

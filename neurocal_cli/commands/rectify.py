@@ -114,7 +114,11 @@ def rectify(
     from neurocal_cli.calibration.rig.rectification import rectified_pair
     from neurocal_cli.files.exchange.reading import read_cameras
 
-    found = _pair(read_cameras([rig]), rig, cameras)
+    notes: list[str] = []
+    warnings: list[str] = []
+    found = _pair(read_cameras([rig], notes, warnings), rig, cameras)
+    note(*notes)
+    warn(*warnings)
     work = _Work(found, rectified_pair(found, alpha), interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:

@@ -233,14 +233,14 @@ def _scene(
 
         board = read_board(board_file)
     if camera_file is not None:
+        from neurocal_cli.camera.camera import camera_of
         from neurocal_cli.files.calibration_tree import read_calibration
-        from neurocal_cli.files.exchange.reading import read_intrinsics
 
         own = board_file is None and views is None and camera_file != "-"
         if own:
             with suppress(FormatError):
                 return scenes.calibrated_scene(read_calibration(camera_file)), False
-        camera = read_intrinsics(camera_file)
+        camera = camera_of(preparation.known_camera(camera_file))
         if own:
             note(f"{camera_file} holds no points of its own; the paper's boards are used")
     count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)

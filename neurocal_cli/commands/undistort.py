@@ -120,8 +120,8 @@ def undistort(
     if not files and options.typed("output"):
         raise UsageError("-o has no effect without FILE; give FILE, or leave out -o")
     preparation.check_summary(as_json, new_camera, maps, output if files else None)
+    from neurocal_cli.camera.camera import camera_of
     from neurocal_cli.camera.undistortion import chosen_view
-    from neurocal_cli.files.exchange.reading import read_intrinsics
 
     paths = find_images(files) if files else ()
     if not any(map(is_image, paths)):
@@ -131,7 +131,7 @@ def undistort(
     results = *zip(paths, outputs, strict=True), ("the new camera", new_camera), ("the tables", maps)
     _check_distinct((camera, *paths), results)
     preparation.check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
-    original = read_intrinsics(camera)
+    original = camera_of(preparation.known_camera(camera))
     view = partial(chosen_view, original, alpha, shape, fov, new_size=size)
     work = _Undistorting(original, view, interpolation, folder, original.image_size)
     failed = work.correct_all(paths, outputs)

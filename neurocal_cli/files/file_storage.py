@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,6 +17,8 @@ from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import DEEPEST, TOO_DEEP, number, parse_yaml, plain_value, quoted
 
+# Comments of JSON, outside texts, which are found first; with the commas before a closing bracket.
+_COMMENT = re.compile(r'("(?:[^"\\]|\\.)*")|//[^\n]*|/\*.*?\*/|,(?=\s*[}\]])', re.DOTALL)
 _PER_LINE = 4  # numbers; OpenCV's reader refuses lines of more than some thousand characters
 
 
@@ -26,14 +29,16 @@ def read_tree(path: str | Path) -> Field:
 
 def parse_tree(text: str, source: str) -> Field:
     """Read the text of a YAML, JSON or XML file; see `read_tree`."""
-    parse = {"<": _parse_xml, "{": _parse_json}.get(text.lstrip()[:1], parse_yaml)
-    return Field(parse(text, source), source)
+    parse = {"<": _parse_xml, "{": _parse_json, "[": _parse_json, "/": _parse_json}
+    return Field(parse.get(text.lstrip()[:1], parse_yaml)(text, source), source)
 
 
 def _parse_json(text: str, source: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refuse)
     except json.JSONDecodeError:
+        if (plain := _COMMENT.sub(lambda found: found[1] or "", text)) != text:
+            return _parse_json(plain, source)
         return parse_yaml(text, source)  # a flow mapping may be YAML; its parser names the line
     except (ValueError, RecursionError) as error:
         problem = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
@@ -60,6 +65,8 @@ def _parse_xml(text: str, source: str) -> Any:
         raise FormatError(f"is not valid XML ({error.msg}); correct it", source, error.position[0]) from error
     except (ValueError, LookupError) as error:  # the stated encoding is unknown or not UTF-8
         raise FormatError("is not XML in UTF-8; save it as UTF-8", source) from error
+    if root.tag == "calibration":  # Agisoft's
+        return {root.tag: _element_value(root, source, DEEPEST)}
     if root.tag != "opencv_storage":
         raise FormatError(
             f"is <{root.tag[:40]}> and not OpenCV's <opencv_storage>; give another file", source

@@ -31,12 +31,29 @@ OPTIONAL = {
 }
 """Names of the optional columns, by their attribute of `Correspondences`."""
 _SETTINGS = ("zoom", "focus")
+# Names of columns in use elsewhere, in lower case without punctuation.
+_WORLD = ("{0}world", "world{0}", "{0}w", "obj{0}", "object{0}", "objloc{0}", "{0}3d", "{0}object")
+_IMAGE = (
+    "imgloc{1}", "img{1}", "image{1}", "pixel{1}", "{1}pixel", "{1}img", "{1}image", "{0}pixel", "pixel{0}",
+    "{0}px", "{1}px", "{1}2d",
+)  # fmt: skip
 POINTS = Schema(
     kind="points",
     required=(*PLACE, *PIXEL),
-    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
-    labels=frozenset({"view", "point"}),
+    optional=("view", "point", "camera", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
+    labels=frozenset({"view", "point", "camera"}),
     headerless=True,
+    aliases={
+        **{axis: tuple(form.format(axis.lower()) for form in _WORLD) for axis in PLACE},
+        **{
+            name: tuple(form.format(name, axis) for form in _IMAGE)
+            for name, axis in zip(PIXEL, "xy", strict=True)
+        },
+        "view": ("syncindex", "image", "img", "imagename", "filename", "frame"),
+        "point": ("keypointid", "pointid", "cornerid", "corner"),
+        "camera": ("camid", "cameraid", "cam", "port"),
+        "time": ("frametime",),
+    },
     instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 
@@ -139,6 +156,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     for table in tables:
         table.note_unknown(notes)
     _check_settings(tables, notes)
+    _check_one_camera(tables)
     several = len(tables) > 1
     views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
     owners = _owners(tables, views) if several and views else None
@@ -253,6 +271,23 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
                     "`neurocal lens fit`"
                 )
         notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
+
+
+def _check_one_camera(tables: list[Table]) -> None:
+    """Refuse the points of several cameras, which one camera cannot fit."""
+    columns = [
+        (table, dict.fromkeys(table.labels["camera"].tolist()))
+        for table in tables
+        if "camera" in table.labels
+    ]
+    named = {name: table for table, names in columns for name in names}
+    if len(named) > 1:
+        told = ", ".join(name[:20] for name in named)
+        raise FormatError(
+            f"holds points of {len(named)} cameras ({told[:80]}); give it to neurocal rig, or the rows of "
+            "one camera",
+            next(iter(named.values())).source,
+        )
 
 
 def _covariance(tables: list[Table]) -> Array | None:

@@ -34,10 +34,9 @@ def read_rig_points(
     InputError
         A file holds several cameras, but a name is given for it.
     """
-    schema = replace(POINTS, optional=(*POINTS.optional, "camera"), labels=POINTS.labels | {"camera"})
     tables: dict[str, list[Table]] = {}
     for name, path in files:
-        table = read_table(path, schema)
+        table = read_table(path, POINTS)
         for camera, part in _by_camera(table, name):
             tables.setdefault(camera, []).append(part)
     remarks: list[str] = [] if notes is None else notes

@@ -122,7 +122,8 @@ def _plain_lines(data: bytes, source: str, schema: Schema) -> bytes:
 
 
 def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Table:
-    return read_in_bulk(data, source, schema, layout) or read_line_by_line(data, source, schema, layout)
+    table = read_in_bulk(data, source, schema, layout) or read_line_by_line(data, source, schema, layout)
+    return replace(table, numbers={**table.numbers, "Z": np.zeros(len(table))}) if layout.flat else table
 
 
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +23,7 @@ is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmat
 _METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances|undistorted)\s*:(.*)", re.DOTALL)
 _KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
 _ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
+_CALISCOPE = {"imglocx", "imglocy", "objlocx", "objlocy"}  # its columns, in px and m
 _COMMAS = 1.6  # values over those expected; u,v and most of X,Y,Z have decimals, labels have none
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
@@ -36,6 +37,9 @@ class Schema:
     optional: tuple[str, ...] = ()
     labels: frozenset[str] = frozenset()  # the columns that contain text; all others contain numbers
     headerless: bool = False  # whether a file may have the required columns without a header
+    aliases: Mapping[str, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # plain names of columns, the best first
     instead: str = ""  # advice for files of another kind
 
     @property
@@ -123,10 +127,11 @@ class Layout:
     offset: int  # of the first byte below the header
     line: int  # number of the last line above that byte
     metadata: Metadata = field(default_factory=Metadata)
+    flat: bool = False  # whether Z is 0 and no column
 
     def unknown(self, schema: Schema) -> tuple[str, ...]:
         """Names of columns that are not in the schema."""
-        return tuple(name for name in self.names if name not in schema.known)
+        return tuple(name for name in self.names if name and name not in schema.known)
 
 
 def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
@@ -147,11 +152,41 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
                 for text in filter(is_decimal_comma, fields):
                     point = text[:40].replace(",", ".")
                     raise InputError(f"{text[:40]!r} has a decimal comma; write {point}")
-                _check_names(fields, schema)
-                return Layout(separator, tuple(fields), end, number, metadata)
+                columns, unit = _renamed(fields, schema)
+                metadata.unit = metadata.unit or unit
+                # caliscope leaves out Z of a flat board, or leaves it empty.
+                below = data[end : data.find(b"\n", end)].decode("utf-8", "replace")
+                rows = split_fields(below, separator) if set(map(plain, fields)) >= _CALISCOPE else []
+                flat = bool(rows) and (
+                    "Z" not in columns or rows[min(columns.index("Z"), len(rows) - 1)] == ""
+                )
+                if flat and "Z" in columns:
+                    columns[columns.index("Z")] = ""
+                _check_names([*columns, "Z"] if flat else columns, schema)
+                return Layout(separator, tuple(columns), end, number, metadata, flat)
     raise FormatError(
         f"is empty: there are no {schema.kind}; give a header {','.join(schema.required)} and rows", source
     )
+
+
+def plain(name: str) -> str:
+    """A name in lower-case letters and digits."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _renamed(names: list[str], schema: Schema) -> tuple[list[str], str | None]:
+    """Names of columns as the schema has them, from those in use elsewhere, and the world's unit."""
+    units = {name: re.fullmatch(r"(\S+?)\s*[\[(](\w+)[\])]", name) for name in names}
+    stated = {match[2] for match in units.values() if match and match[1] in ("X", "Y", "Z")}
+    new = [match[1] if match and match[1] in schema.known else name for name, match in units.items()]
+    if len(new) < len(names):  # a name twice, which is refused later
+        return list(names), None
+    for column, forms in schema.aliases.items():
+        places = [k for form in forms for k, name in enumerate(new) if plain(name) == form]
+        if column not in new and places:
+            new[places[0]] = column
+    caliscope = set(map(plain, names)) >= _CALISCOPE
+    return new, next(iter(stated)) if len(stated) == 1 else "m" if caliscope else None
 
 
 def split_fields(line: str, separator: str | None) -> list[str]:

@@ -59,6 +59,7 @@ _ROWS = re.compile(
     r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
     re.MULTILINE,
 )
+_OPENCV = re.compile(r"%YAML:[^\n]*\n")
 _LABELS = frozenset(("view", "point"))
 _CUT = "!neurocal/rows"  # tag of a scalar that replaces rows which were cut out
 
@@ -168,7 +169,10 @@ def parse_yaml(text: str, source: str) -> Any:
     if source == "<stdin>" and not text.strip():
         raise FormatError("is empty; check the command before it", source)
     text = text.replace("\r\n", "\n")
+    if (cut := _OPENCV.match(text)) is not None:  # OpenCV needs no blank after a colon
+        text = cut[0] + re.sub(r"(?m)^( *[A-Za-z_][\w.-]*):(?=[^\s:/\\])", r"\1: ", text[cut.end() :])
     text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which YAML parsers refuse
+    text = re.sub(r"\n---[ \t]*\s*\Z", "\n", text)  # rostopic echo ends each message so
     text, tables = _cut_rows(text)
     try:
         return _assemble(text, tables, source)

@@ -89,7 +89,8 @@ def test_a_board_for_points_that_have_their_places_is_said_not_to_be_used() -> N
     assert result.exit_code == 0
     assert f"note: {FLAT}: has the places of its points, so the board is not used\n" in result.stderr
     result = run("convert", FLAT, "--to", "neurocal", "--unit", "m")
-    assert f"note: {FLAT}: is in mm, and m is not used\n" in result.stderr
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert f"Error: {FLAT}: is in mm, not m; leave out --unit\n" in result.stderr
 
 
 OPTIONS = (

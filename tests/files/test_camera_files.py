@@ -51,9 +51,9 @@ OPENCV_XML = """\
     600. 0.5 320. 0. 610. 240. 0. 0.
     1.</data></cameraMatrix>
 <distCoeffs type_id="opencv-matrix">
-  <rows>1</rows> <cols>4</cols> <dt>d</dt>
+  <rows>1</rows> <cols>5</cols> <dt>d</dt>
   <data>
-    -1e-01 2.0e-02 0. 0.</data></distCoeffs>
+    -1e-01 2.0e-02 0. 0. 0.</data></distCoeffs>
 </opencv_storage>
 """
 
@@ -144,7 +144,7 @@ def test_a_ros_file_is_read(read):
 
 
 def test_matrices_may_be_nested_lists_and_numbers_may_lack_a_point(read):
-    camera = read(f"K: {K}\nD: [-1e-01, 2e-02, 0, 0]\n")
+    camera = read(f"K: {K}\nD: [-1e-01, 2e-02, 0, 0, 0]\n")
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
     assert camera.distortion.coefficients.tolist() == [-0.1, 0.02, 0, 0, 0]
 
@@ -180,7 +180,7 @@ def test_a_neurocal_file_gives_its_camera_and_its_poses(tmp_path):
 FAULTS = {
     "": ": is not a camera file",
     "a: 1\n": ": holds no camera matrix; give a file with the key camera_matrix",
-    "left: {}\nright: {}\n": ": is a stereo rig; give the file of one camera",
+    "left: {}\nright: {}\nstereo: {}\n": ": is a stereo rig; give the file of one camera",
     "K: [1, 2, 3]\n": ": K must be 9 numbers, found a list of 3",
     "K: [[1, 2], [3, 4]]\n": ": K must be 3 x 3 numbers",
     "K: big\n": ": K must be n finite numbers, found 'big'",

@@ -26,6 +26,7 @@ from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intr
 
 SIZE = (640, 480)
 READ = {name: target for name, target in FORMATS.items() if name != "dlt"}  # a DLT is written only
+RIGS = [name for name, target in READ.items() if target.most_cameras > 1]
 HOLDS = {name: target.models for name, target in READ.items()}
 POSES = {
     f"view{k}.png": Pose.from_euler(0.1 * k, 3.0 - 0.2 * k, -0.3, np.array([k, -2.0, 700.0 + k]))
@@ -85,9 +86,10 @@ def test_a_camera_comes_back_from_each_format_as_it_was(target: str, model: str,
         same(read_intrinsics(written(given, target, tmp_path, ending)[0]), given.cameras[0])
 
 
-@pytest.mark.parametrize("target", READ)
+@pytest.mark.parametrize("target", RIGS)
 def test_a_rig_comes_back_from_each_format_as_it_was(target: str, tmp_path: Path) -> None:
-    left, right = lens("k1k2p1p2", name="left"), lens("none", name="right")
+    right = lens("none", name="right")
+    left = lens(next(m for m in ("k1k2p1p2", "plumb_bob", "rational") if m in HOLDS[target]), name="left")
     given = CameraSet((left, replace(right, intrinsics=Intrinsics(700, 690, 300, 250))), (RIGHT,), unit="mm")
     found = read_back(written(given, target, tmp_path))
     for one, other in zip(found.cameras, given.cameras, strict=True):
@@ -121,7 +123,7 @@ def test_a_chain_of_four_cameras_goes_through_kalibr_colmap_and_mrcal(tmp_path: 
 @given(
     turn=st.tuples(*[st.floats(-3.1, 3.1)] * 3),
     shift=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
-    target=st.sampled_from([n for n in READ if n not in ("neurocal", "ros")]),
+    target=st.sampled_from([n for n in RIGS if n not in ("neurocal", "ros")]),
 )
 def test_any_pose_between_two_cameras_comes_back(
     turn: tuple[float, float, float],
@@ -257,7 +259,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
     target: str, start: float, length: int, junk: bytes, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.getbasetemp() / "damaged"
-    (place,) = written(CameraSet((lens("none"),)), target, folder)
+    (place,) = written(CameraSet((lens(HOLDS[target][0]),)), target, folder)
     data = place.read_bytes()
     k = int(start * len(data))
     place.write_bytes(data[:k] + junk + data[k + length :])

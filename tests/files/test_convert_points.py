@@ -134,11 +134,11 @@ def test_the_table_of_mrcal_has_levels_gaps_and_outliers(tmp_path: Path) -> None
     lines = ["## made by mrgingham", "# filename x y level"]
     for name in ("a/1.png", "a/2.png"):
         lines += [f"{name} {k}.5 {k}.25 {k % 3}" for k in range(18)] + [f"{name} - - -", f"{name} 3 4 -1"]
-    lines.append("a/3.png - - -")
+    lines += ["a/3.png 1 2 0", "a/3.png - - -"]
     (tmp_path / "corners.vnl").write_text("\n".join(lines))
     with pytest.raises(FormatError, match="different numbers of corners"):
         read_corners([tmp_path / "corners.vnl"], BOARD, [])
-    lines[-1] = "a/3.png - -"  # no board in this image
+    lines[-2:] = ["a/3.png - - -", "a/4.png - -"]  # no board in these images
     (tmp_path / "corners.vnl").write_text("\n".join(lines))
     found = read_corners([tmp_path / "corners.vnl"], BOARD, [])
     assert found is not None

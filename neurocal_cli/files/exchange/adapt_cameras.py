@@ -53,8 +53,8 @@ def adapt_cameras(
     """
     if len(cameras.cameras) > target.most_cameras:
         raise InputError(
-            f"a file of {target.program} holds {target.most_cameras} cameras at most, and there are "
-            f"{len(cameras.cameras)}; write another format"
+            f"a file of {target.program} holds {plural(target.most_cameras, 'camera')} at most, and there "
+            f"are {len(cameras.cameras)}; write another format"
         )
     if target.needs_size and any(camera.image_size is None for camera in cameras.cameras):
         raise InputError(f"a file of {target.program} needs the size of the images; give --image-size W H")
@@ -87,6 +87,13 @@ def adapt_cameras(
         )
     if n_views:
         remarks.append(f"a file of {target.program} has no place for the poses of {plural(n_views, 'view')}")
+    if cameras.rectified is not None and not target.rectified:
+        R, P = cameras.rectified
+        plain = np.column_stack([cameras.cameras[0].A, np.zeros(3)])
+        if not (np.array_equal(R, np.eye(3)) and np.array_equal(P, plain)):
+            remarks.append(
+                f"a file of {target.program} has no place for the rectification R, P of the ROS file"
+            )
     found = replace(cameras, cameras=tuple(adapted), origin=None if changed or not own else origin)
     return AdaptedCameras(found, tuple(losses), tuple(remarks), tuple(moved))
 
@@ -113,7 +120,7 @@ def _adapted(
             f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
         )
         return _straightened(near.camera), near, what
-    nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
+    nearest = _nearest(camera, target, points)
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
     # Prefer a simpler model if it is nearly as good.
     most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
@@ -127,6 +134,18 @@ def _adapted(
     if not force:
         raise InputError(f"{camera.name}: {what}; give --force to write it, or calibrate with this model")
     return near.camera, near, what
+
+
+def _nearest(camera: Camera, target: Format, points: Array | None) -> list[NearestCamera]:
+    """The nearest camera of each model of a format that has one; if none has, the last one's InputError."""
+    found = []
+    for model in target.models:
+        try:
+            found.append(nearest_camera(camera, model, target.skew, points))
+        except InputError:
+            if model == target.models[-1] and not found:
+                raise
+    return found
 
 
 def _straightened(camera: Camera) -> Camera:

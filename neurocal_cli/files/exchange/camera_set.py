@@ -5,8 +5,9 @@ SciPy gets copies of rotations, because older versions refuse read-only arrays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
+
+if TYPE_CHECKING:
+    from neurocal_cli.files.exchange.document import Document
 
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 
@@ -32,6 +36,8 @@ class CameraSet:
     unit: str | None = None  # of the translations; None if the file does not state it
     origin: Calibration | Rig | CameraRig | None = None  # the whole contents of a neurocal file
     program: str = "OpenCV"  # that wrote the file, for messages
+    # Of a ROS file, as it is: rotation (3, 3) into the rectified frame, and projection (3, 4) from there.
+    rectified: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
         if len(self.relative) != len(self.cameras) - 1:
@@ -71,17 +77,45 @@ class CameraSet:
 
 @frozen_dataclass
 class Format:
-    """Capabilities of a file format, and the function that writes cameras which fit it."""
+    """A file format: what it is like, how it is recognised and read, and how cameras that fit it are written.
+
+    A format without `text` is read only, one without `read` is written only.
+    """
 
     program: str  # name for messages
-    models: tuple[str, ...]  # our names of its distortion models, the simplest first
+    models: tuple[str, ...] = ()  # our names of its distortion models, the simplest first
     # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
-    text: Callable[[CameraSet, str], Mapping[str, str | bytes]]
+    text: Callable[[CameraSet, str], Mapping[str, str | bytes]] | None = None
+    matches: Callable[[Document], object] | None = None
+    read: Callable[[Document], CameraSet] | None = None
+    files: str = ""  # its files, for the documentation
     skew: bool = False  # whether its programs support skew
     poses: bool = False  # whether it contains the poses of views
     most_cameras: int = 2
     metres: bool = False  # whether lengths are in metres
     needs_size: bool = False  # whether the image size must be known
+    rectified: bool = False  # whether it contains the rectification of a camera
+    first_pixel: float = 0.0  # coordinate of the centre of the first pixel
+    frame: str = ""  # what the poses of its cameras are relative to
+
+
+def mounted(
+    cameras: Sequence[Camera],
+    poses: Sequence[Pose | None],
+    program: str,
+    unit: str | None = "m",
+    frame: str = "body",
+) -> CameraSet:
+    """Cameras with their poses, from one frame to each; that of a single camera is its view named `frame`."""
+    first = poses[0]
+    if len(cameras) == 1:
+        views = {} if first is None else {frame: first}
+        return CameraSet(tuple(cameras), (), views, unit, program=program)
+    known = [pose for pose in poses if pose is not None]
+    relative: tuple[Pose, ...] = ()
+    if len(known) == len(cameras):
+        relative = tuple(after(pose, inverse(known[0])) for pose in known[1:])
+    return CameraSet(tuple(cameras), relative, unit=unit, program=program)
 
 
 def to_vector(R: Array) -> Array:

@@ -1,4 +1,6 @@
-"""COLMAP's text models: ``cameras.txt``, and in its folder ``images.txt``, ``rigs.txt`` and ``frames.txt``.
+"""COLMAP's models: ``cameras.txt``, and in its folder ``images.txt``, ``rigs.txt`` and ``frames.txt``.
+
+A binary model has the same files with the extension ``.bin``, which are read as the lines of the text ones.
 
 The centre of the top-left pixel is (1/2, 1/2), so principal points are larger than ours by half a pixel. The
 pose of an image maps the world to its camera. The pose of a rig's sensor maps the rig's frame, which is that
@@ -8,7 +10,11 @@ of its reference camera, to the sensor.
 from __future__ import annotations
 
 import os
+import re
+import struct
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -18,28 +24,33 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_quaternion, to_quaternion
+from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.failures import value_failures
-from neurocal_cli.files.reading import read_text
+from neurocal_cli.files.reading import read_bytes, read_text
 from neurocal_cli.files.yaml_text import number
 
 _HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
+_Lines = list[tuple[int, list[str]]]  # of a file: number and words
 
-# Our model, number of focal lengths, and for each of our coefficients the index of COLMAP's, or None for 0.
-_MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
-    "SIMPLE_PINHOLE": ("none", 1, ()),
-    "PINHOLE": ("none", 2, ()),
-    "SIMPLE_RADIAL": ("k1", 1, (0,)),
-    "RADIAL": ("k1k2", 1, (0, 1)),
-    "OPENCV": ("k1k2p1p2", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": ("rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0, None, None, None)),
-    "RADIAL_FISHEYE": ("fisheye", 1, (0, 1, None, None)),
-    # Since version 4.
-    "SIMPLE_FISHEYE": ("fisheye", 1, (None, None, None, None)),
-    "FISHEYE": ("fisheye", 2, (None, None, None, None)),
-    "EUCM": ("eucm", 2, (0, 1)),
+# COLMAP's number of the model, our model, number of focal lengths, and for each of our coefficients the index
+# of COLMAP's, or None for 0.
+_MODELS: dict[str, tuple[int, str, int, tuple[int | None, ...]]] = {
+    "SIMPLE_PINHOLE": (0, "none", 1, ()),
+    "PINHOLE": (1, "none", 2, ()),
+    "SIMPLE_RADIAL": (2, "k1", 1, (0,)),
+    "RADIAL": (3, "k1k2", 1, (0, 1)),
+    "OPENCV": (4, "k1k2p1p2", 2, (0, 1, 2, 3)),
+    "OPENCV_FISHEYE": (5, "fisheye", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0, None, None, None)),
+    "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1, None, None)),
+    # Since version 4, whose numbers of these are not used here.
+    "SIMPLE_FISHEYE": (-1, "fisheye", 1, (None, None, None, None)),
+    "FISHEYE": (-1, "fisheye", 2, (None, None, None, None)),
+    "EUCM": (-1, "eucm", 2, (0, 1)),
 }
+_OTHERS = {7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
+_LINE = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 _NAMES = {
     "none": "PINHOLE",
     "k1k2p1p2": "OPENCV",
@@ -56,36 +67,116 @@ def is_folder(name: str) -> bool:
 
 def read_folder(folder: str) -> CameraSet:
     """Read the cameras of a model with their relative poses and the poses of the images."""
-    path = os.path.join(folder, "cameras.txt")
-    if not os.path.exists(path):
-        if os.path.exists(os.path.join(folder, "cameras.bin")):
-            raise FormatError(
-                "is a binary model; convert it with colmap model_converter --output_type TXT", folder
-            )
+    lines, source = _file(folder, "cameras")
+    if lines is None:
         raise FormatError(
-            "is a folder without COLMAP's cameras.txt; give a camera file, or the two of a rig", folder
+            "is a folder without COLMAP's cameras.txt or cameras.bin; give a camera file, or the two of a "
+            "rig",
+            folder,
         )
-    text, source = read_text(path)
     with value_failures(source):
-        cameras = _cameras(text, source)
+        cameras = _cameras(lines, source)
         relative = _rig(folder, list(cameras))
         found = CameraSet(tuple(cameras.values()), relative, program="COLMAP")
         return replace(found, poses=_poses(folder, next(iter(cameras))))
 
 
-def parse(text: str, source: str) -> CameraSet:
-    """Read ``cameras.txt`` with one camera."""
-    return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
+def is_cameras(document: Document) -> bool:
+    """Whether this is ``cameras.txt`` or ``cameras.bin``."""
+    data = document.data
+    if len(data) < 48 or document.is_text:
+        return bool(_LINE(document.text))
+    count, _, model, width, height = struct.unpack_from("<QiiQQ", data)
+    return bool(0 < count < 10_000 and 0 <= model < 30 and 0 < width < 10**6 and 0 < height < 10**6)
 
 
-def _lines(text: str) -> list[tuple[int, list[str]]]:
-    rows = [(k, line.split()) for k, line in enumerate(text.splitlines(), start=1)]
-    return [(k, words) for k, words in rows if words and not words[0].startswith("#")]
+def read_file(document: Document) -> CameraSet:
+    """Read ``cameras.txt`` or ``cameras.bin`` with one camera."""
+    source = document.source
+    lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
+    return CameraSet(tuple(_cameras(lines, source).values()), program="COLMAP")
 
 
-def _cameras(text: str, source: str) -> dict[int, Camera]:
+def _file(folder: str, name: str) -> tuple[_Lines | None, str]:
+    """Lines of one file of a model, text or binary, and its name; None if there is none."""
+    path = os.path.join(folder, name)
+    if os.path.exists(f"{path}.txt"):
+        text, source = read_text(f"{path}.txt")
+        return _lines(text, every=name == "images"), source
+    if os.path.exists(f"{path}.bin"):
+        data, source = read_bytes(f"{path}.bin")
+        return _unpacked(data, name, source), source
+    return None, folder
+
+
+def _lines(text: str, every: bool = False) -> _Lines:
+    rows = [(k, line) for k, line in enumerate(text.split("\n"), start=1) if not line.startswith("#")]
+    if every:  # each image has two lines: its pose, and its points, which may be empty
+        rows = rows[::2]
+        return [(k, line.split(maxsplit=9)) for k, line in rows if line.strip()]
+    return [(k, line.split()) for k, line in rows if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _unpacked(data: bytes, name: str, source: str) -> _Lines:
+    """The lines of a binary file, counted from 1."""
+    place = 0
+
+    def take(form: str) -> tuple[Any, ...]:
+        nonlocal place
+        values = struct.unpack_from(f"<{form}", data, place)
+        place += struct.calcsize(f"<{form}")
+        return values
+
+    def cameras() -> Iterator[object]:
+        names = {number: model for model, (number, *_) in _MODELS.items() if number >= 0}
+        one, model, width, height = take("iiQQ")
+        if model not in names:
+            other = _OTHERS.get(model, f"number {model}")
+            raise FormatError(
+                f"the camera model {other} is not known; use one of {', '.join(names.values())}", source
+            )
+        _, _, focal, places = _MODELS[names[model]]
+        yield from (one, names[model], width, height)
+        yield from take(f"{focal + 2 + len([p for p in places if p is not None])}d")
+
+    def images() -> Iterator[object]:
+        nonlocal place
+        yield from take("i7di")
+        end = data.index(b"\0", place)
+        yield data[place:end].decode()
+        place = end + 1
+        (count,) = take("Q")
+        place += 24 * count
+
+    def rigs() -> Iterator[object]:
+        one, count = take("II")
+        yield from (one, count)
+        for k in range(count):
+            kind, sensor = take("iI")
+            yield from (("CAMERA" if kind == 0 else "OTHER"), sensor)
+            if k:
+                (known,) = take("B")
+                yield known
+                yield from take("7d") if known else ()
+
+    reader = {"cameras": cameras, "images": images, "rigs": rigs}[name]
+    try:
+        (count,) = take("Q")
+        if count > len(data):
+            raise ValueError
+        rows = [(k, [str(word) for word in reader()]) for k in range(1, count + 1)]
+        if place != len(data):
+            raise ValueError
+    except (struct.error, ValueError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"is a damaged {name}.bin of COLMAP; write it again", source) from error
+    return rows
+
+
+def _cameras(lines: _Lines, source: str) -> dict[int, Camera]:
     cameras = {}
-    for k, words in _lines(text):
+    for k, words in lines:
         if not words[0].isdecimal():
             raise FormatError("is not the line of a camera; correct it", source, k)
         cameras[int(words[0])] = _camera(words, source, k)
@@ -97,7 +188,7 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
     if model not in _MODELS:
         known = ", ".join(_MODELS)
         raise FormatError(f"the camera model {model[:40]!r} is not known; use one of {known}", source, line)
-    ours, focal, places = _MODELS[model]
+    _, ours, focal, places = _MODELS[model]
     try:
         size = int(words[2]), int(words[3])
         values = np.array(words[4:], dtype=float)
@@ -114,11 +205,9 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
 
 def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
     """Poses of the further cameras relative to the first one."""
-    path = os.path.join(folder, "rigs.txt")
-    if len(ids) == 1 or not os.path.exists(path):
+    rows, source = _file(folder, "rigs")
+    if len(ids) == 1 or rows is None:
         return ()
-    text, source = read_text(path)
-    rows = _lines(text)
     if len(rows) != 1:
         raise FormatError("holds several rigs; give a model with one", source)
     line, words = rows[0]
@@ -141,17 +230,9 @@ def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
 
 def _poses(folder: str, camera: int) -> dict[str, Pose]:
     """Poses of the images of one camera."""
-    path = os.path.join(folder, "images.txt")
-    if not os.path.exists(path):
-        return {}
-    text, source = read_text(path)
-    # Each image has two lines: its pose, and its points, which may be empty.
-    rows = [(k, line) for k, line in enumerate(text.split("\n"), start=1) if not line.startswith("#")]
+    rows, source = _file(folder, "images")
     poses = {}
-    for k, line in rows[::2]:
-        words = line.split(maxsplit=9)
-        if not words:
-            continue
+    for k, words in rows or ():
         try:
             if int(words[8]) == camera:
                 poses[words[9].strip()] = _pose(np.array(words[1:8], dtype=float))
@@ -209,4 +290,15 @@ def _seven(pose: Pose) -> str:
     return " ".join(map(number, [*to_quaternion(pose.R), *pose.t]))
 
 
-FORMAT = Format("COLMAP", tuple(_NAMES), _text, poses=True, most_cameras=99, needs_size=True)
+FORMAT = Format(
+    "COLMAP",
+    tuple(_NAMES),
+    _text,
+    is_cameras,
+    read_file,
+    files="cameras.txt and the rest of a text model; cameras.bin and the rest of a binary one",
+    poses=True,
+    most_cameras=99,
+    needs_size=True,
+    first_pixel=0.5,
+)

@@ -3,7 +3,8 @@
 * A dictionary (FileStorage, JSON, ``.npz``, ``.mat``) with image points of each view and board points;
 * a single ``.npy`` array of image points;
 * mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
-* text files of numbers: one with the board points, and one for each view.
+* text files of numbers: one with the board points, and one for each view;
+* tables of points, and ``calib_data.mat`` of Bouguet's toolbox.
 
 If the files have no board points, the board must be given. MATLAB counts pixels from 1, and corners along the
 columns of the board. Kalibr has no file of corners: it detects them in a bag in each run.
@@ -20,15 +21,17 @@ from typing import Any
 
 import numpy as np
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.camera_tree import image_size
-from neurocal_cli.files.exchange.dictionary import arrays_of
-from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, read_variables, unit_of
+from neurocal_cli.files.exchange.document import arrays_of
+from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.file_storage import parse_tree
-from neurocal_cli.files.points_csv import read_points
+from neurocal_cli.files.points_csv import POINTS, read_points
 from neurocal_cli.files.reading import decode, read_bytes
+from neurocal_cli.files.table import read_table
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.points import Correspondences
@@ -42,33 +45,47 @@ _WORLD = (
     "WorldPoints", "world_points",
 )  # fmt: skip
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
-_TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
+# A header with names of X and v, or a first row of five numbers.
+_TABLE = re.compile(
+    r"\A\ufeff?(?:#[^\n]*\n|\s*\n)*(?:[^\n#:{<]*(?:\bX\b|x_?world|world_?x|obj)[^\n:]*(?:\bv\b|img|pix|v_?px|image)"
+    r"|(?:[-+0-9.eE]+[ \t]*[,;\t ][ \t]*){4}[-+0-9.eE]+[ \t]*\r?(?:\n|\Z))",
+    re.IGNORECASE,
+)
 _KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
 _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 
 
 def read_corners(
-    paths: Sequence[str | Path], board: Board | None, notes: list[str], unit: str | None = None
+    paths: Sequence[str | Path],
+    board: Board | None,
+    notes: list[str],
+    unit: str | None = None,
+    what: str | None = None,
+    advice: str = "give --cols, --rows and --square, or --board",
 ) -> Correspondences | None:
     """Read points from files of any program; None if the first file has no points.
 
     The files are one, or board points and then a file for each view; stdin has to be repeatable
-    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not. Remarks
-    about ignored columns are appended to `notes`.
+    (`repeatable_stdin`). `board` gives the board points, and `unit` theirs, if the files do not; without them
+    the error ends in `advice`. Remarks about ignored columns are appended to `notes`. A file with a camera as
+    well is left to it, unless `what` is "points".
     """
     names = [str(path) for path in paths]
     data, source = read_bytes(names[0])
+    given = _Given(board, unit, what == "points", advice, notes)
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
         try:
             array = np.load(io.BytesIO(data), allow_pickle=False)
         except (ValueError, OSError, EOFError) as error:
             raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
-        return _corners(Field({"corners": array.tolist()}, source), board, unit)
+        if array.shape == (3, 3):
+            return None  # a camera matrix
+        return _corners(Field({"corners": array.tolist()}, source), given)
     if data.startswith(b"PK\x03\x04"):
-        return _corners(Field(arrays_of(data, source), source), board, unit)
+        return _corners(Field(arrays_of(data, source, []), source), given)
     if data.startswith(b"MATLAB 5.0 MAT-file"):
-        return _matlab(data, source, board, unit)
-    if b"\0" in data:
+        return _matlab(data, source, given)
+    if b"\0" in data or data.startswith(b"\x80"):
         return None
     text = decode(data, source)
     if _KALIBR.match(text):
@@ -78,32 +95,54 @@ def read_corners(
             source,
         )
     if _VNL.match(text):
-        return _vnl(text, source, board)
+        return _vnl(text, source, given)
     if _NUMBERS.match(text):
-        return _separate(names, board, unit)
+        return _separate(names, given)
     if _TABLE.match(text):
-        points = read_points(names, notes=notes)
-        if board is not None:
-            notes.append(f"{source}: has the places of its points, so the board is not used")
-        elif unit not in (None, points.unit):
-            notes.append(f"{source}: is in {points.unit}, and {unit} is not used")
-        return points
+        return _table_of(names, given)
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
-    if named or text.lstrip()[:1] in ("{", "<", "%"):
-        return _corners(parse_tree(text, source), board, unit)
+    if named or text.lstrip().startswith(("{", "[", "<", "%YAML", "/")):
+        return _corners(parse_tree(text, source), given)
     return None
 
 
+@frozen_dataclass
+class _Given:
+    """What the caller says: the board, its unit, whether points are wanted, the advice without a board."""
+
+    board: Board | None
+    unit: str | None
+    points: bool
+    advice: str
+    notes: list[str]
+
+
+def _table_of(names: list[str], given: _Given) -> Correspondences:
+    points = read_points(names, notes=given.notes)
+    stated = all(read_table(name, POINTS).metadata.unit for name in names)
+    if given.board is not None:
+        given.notes.append(f"{points.source}: has the places of its points, so the board is not used")
+    if given.unit in (None, points.unit):
+        return points
+    if stated:
+        raise FormatError(f"is in {points.unit}, not {given.unit}; leave out --unit", points.source)
+    return replace(points, unit=str(given.unit))
+
+
 def _corners(
-    root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
+    root: Field, given: _Given, first: float = 0.0, down: bool = False, board: Board | None = None
 ) -> Correspondences | None:
     """Read the points of a dictionary, if it has any; `first` is the coordinate of its first pixel.
 
     Without board points, `down` tells that the corners run along the columns of the board.
     """
-    field = root.first(_IMAGE)
+    field = root.first(_IMAGE) if isinstance(root.value, dict) else None
     if field is None:
         return None
+    if not given.points and LooseKeys(root).has_camera():
+        given.notes.append(f"{root.source}: holds points as well as a camera; --what points converts these")
+        return None
+    board = given.board or board
     pixels = _stack(field, 2) - first
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
@@ -111,24 +150,23 @@ def _corners(
         names = root["view_names"].names(views)
     places = root.first(_WORLD)
     world = None if places is None else _stack(places, 3)
-    stated = root["unit"].text() if "unit" in root else unit
+    stated = root["unit"].text() if "unit" in root else given.unit
     ids = root.read("points", Field.texts)
     if world is None:
-        world, ids = _of_board(board, pixels.shape[1], field, down)
+        world, ids = _of_board(board, pixels.shape[1], field, given.advice, down)
         stated = board.unit if board else stated
     if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
         field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
     points = _assembled(world, pixels, names, ids, stated, root.source)
-    return replace(points, image_size=image_size(root))
+    return replace(points, image_size=LooseKeys(root).image_size())
 
 
-def _of_board(board: Board | None, count: int, field: Field, down: bool = False) -> tuple[Array, list[str]]:
+def _of_board(
+    board: Board | None, count: int, field: Field, advice: str, down: bool = False
+) -> tuple[Array, list[str]]:
     """Vertices (1, N, 3) of a board of one plane, and their ids, along its rows or down its columns."""
     if board is None:
-        field.refuse(
-            f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
-            "--rows and --square, or --board"
-        )
+        field.refuse(f"{field.path} has {count} corners a view, but not their places on the board; {advice}")
     if len(board.planes) != 1 or board.planes[0].cols * board.planes[0].rows != count:
         sizes = " and ".join(f"{plane.cols} x {plane.rows}" for plane in board.planes)
         field.refuse(
@@ -152,12 +190,16 @@ def _stack(field: Field, width: int) -> Array:
         if len(data) % (rows * cols):
             field.fail(f"{rows} x {cols} points")
         value = data.reshape(rows, cols, -1)
+    if isinstance(value, list) and value and isinstance(value[0], dict):  # a matrix for each view
+        return np.concatenate([_stack(entry, width) for entry in field.items()])
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         field.fail("the same number of points in each view, as numbers")
-    if array.ndim == 1 and array.size % 3 == 0 and width == 3:  # OpenCV writes vectors of points flat
-        array = array.reshape(1, -1, 3)
+    if array.ndim == 1 and array.size % width == 0:  # OpenCV writes vectors of points flat
+        array = array.reshape(1, -1, width)
+    if array.ndim == 2 and array.shape[1] > 3 and array.shape[1] % width == 0:  # and vectors of these
+        array = array.reshape(len(array), -1, width)
     if array.ndim == 4:  # (V, N, 1, 2), as OpenCV's functions return them, or (V, 1, N, 2)
         array = array.reshape(len(array), -1, array.shape[-1])
     if array.ndim == 3 and array.shape[1] == 1 and array.shape[-1] in (2, 3) and array.shape[0] > 1:
@@ -191,15 +233,17 @@ def _assembled(
         )
 
 
-def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
+def _matlab(data: bytes, source: str, given: _Given) -> Correspondences | None:
     tree = read_variables(data, source)
+    if not given.points and ("fc" in tree or not {*STRUCTS, "K"}.isdisjoint(tree)):
+        return None
     field = next((name for name in _IMAGE if name in tree), None)
     if field is None:
-        return None
+        return _bouguet(tree, source, given)
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
     root = Field(plain, source)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
-        root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
+        root.value["image_size"] = [int(side) for side in np.ravel(root.value.pop("ImageSize"))[::-1]]
     root.value.setdefault("unit", unit_of(tree))
     stack = np.asarray(tree[field], dtype=float)
     if stack.ndim == 4:  # M x 2 x P x cameras
@@ -208,7 +252,34 @@ def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> 
         )
     if stack.ndim == 3:  # M x 2 x P
         root.value[field] = np.moveaxis(stack, 2, 0).tolist()
-    return _corners(root, board or _matlab_board(tree, unit, source), unit, first=FIRST_PIXEL, down=True)
+    return _corners(root, given, FIRST_PIXEL, down=True, board=_matlab_board(tree, given.unit, source))
+
+
+def _bouguet(tree: dict[str, Any], source: str, given: _Given) -> Correspondences | None:
+    """Points of Bouguet's toolbox: x_1, X_1, ... of the active images, in pixels from 0."""
+    numbers = [int(name[2:]) for name in tree if re.fullmatch(r"x_\d{1,4}", name) and f"X_{name[2:]}" in tree]
+    active = np.ravel(tree.get("active_images", np.ones(max(numbers, default=0))))
+    world, pixels, views = [], [], []
+    for k in sorted(numbers):
+        x, X = (np.asarray(tree[f"{name}_{k}"], dtype=float) for name in "xX")
+        if x.ndim != 2 or x.shape[0] != 2 or X.shape != (3, x.shape[1]) or not np.isfinite(x).all():
+            continue  # NaN where the image was left out
+        if k <= len(active) and active[k - 1]:
+            world.append(X.T)
+            pixels.append(x.T)
+            views += [str(k)] * x.shape[1]
+    if not views:
+        return None
+    size = tuple(int(np.ravel(tree[name])[0]) for name in ("nx", "ny") if np.size(tree.get(name, ())) == 1)
+    with value_failures(source):
+        return Correspondences(
+            np.concatenate(world),
+            np.concatenate(pixels),
+            np.array(views),
+            (size[0], size[1]) if len(size) == 2 else None,
+            unit=given.unit or "unknown",
+            source=source,
+        )
 
 
 def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board | None:
@@ -227,7 +298,7 @@ def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board 
     return Board((plane,), "mm" if "squareSizeInMM" in tree else unit or "unknown")
 
 
-def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
+def _vnl(text: str, source: str, given: _Given) -> Correspondences:
     """Read mrcal's table; ``-`` means a corner was not found, and each level doubles sigma."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
@@ -236,22 +307,25 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
             continue
         corners = rows.setdefault(words[0], [])
         if "-" in words[1:3]:
-            if len(words) > 3:
-                corners.append((np.nan, np.nan, 0.0))
+            corners.append((np.nan, np.nan, 0.0))
             continue
         try:
             level = float(words[3]) if len(words) > 3 and words[3] != "-" else 0.0
             corners.append((float(words[1]), float(words[2]), level))
         except (ValueError, IndexError) as error:
             raise FormatError("is not a line 'filename x y level'; correct it", source, number) from error
-    seen = {name: corners for name, corners in rows.items() if corners}
+    # A single line without a corner means that the board was not found.
+    seen = {name: corners for name, corners in rows.items() if len(corners) > 1 or np.isfinite(corners[0][0])}
+    if not seen:
+        raise FormatError("has no detected corner; give another file", source)
     counts = {len(corners) for corners in seen.values()}
     if len(counts) != 1:
         raise FormatError(
             "the images have different numbers of corners; write all of them, - for none", source
         )
     stack = np.array(list(seen.values()))
-    world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
+    board = given.board
+    world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"), given.advice)
     # A negative level marks a corner that mrcal considers an outlier.
     pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
     found = np.isfinite(pixels).all(axis=2)
@@ -262,9 +336,10 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
     return replace(points, covariance=np.column_stack([sigma**2, 0 * sigma, sigma**2]))
 
 
-def _separate(names: list[str], board: Board | None, unit: str | None) -> Correspondences | None:
+def _separate(names: list[str], given: _Given) -> Correspondences | None:
     """Read files of numbers: board points X Y Z, unless a board is given, and u v of each view."""
     tables = [_table(name) for name in names]
+    board, unit = given.board, given.unit
     if tables[0].shape[1] == 3 or board is None:
         if len(tables) == 1:
             raise FormatError("holds places alone; give the files of the pixels after it", names[0])
@@ -273,7 +348,7 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
         world[0, :, : places.shape[1]] = places
         ids, stated = None, unit
     else:
-        world, ids = _of_board(board, len(tables[0]), Field(None, names[0], "the file"))
+        world, ids = _of_board(board, len(tables[0]), Field(None, names[0], "the file"), given.advice)
         stated = board.unit
     for name, table in zip(names, tables, strict=True):
         if table.shape != (world.shape[1], 2):

@@ -17,63 +17,140 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import rectify
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.camera_tree import camera_from_tree, has_matrix, matrix_data
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
+from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_rig
 from neurocal_cli.files.file_storage import storage_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import nested
 
-_SIDES = (("1", "2"), ("_left", "_right"), ("L", "R"), ("_l", "_r"))
-_ROTATIONS, _TRANSLATIONS = ("R", "R_stereo", "rotation"), ("T", "t", "T_stereo", "translation")
-_MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
+_DEEPEST = 4  # mappings within each other
+# Share of the image's side by which the principal point is far from the middle, and far outside the image.
+_OFF, _OUTSIDE = 0.2, 1.0
+_SIDES = (
+    ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
+    ("camera0", "camera1"), ("camera1", "camera2"), ("cameraleft", "cameraright"),
+)  # fmt: skip
+_ROTATIONS = ("r", "rstereo", "stereor", "rotation", "rotationmatrix")
+_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector")
 
 
-def is_part(root: Field) -> bool:
-    """Whether the tree is one of the two files of OpenCV's stereo sample: the cameras, or their pose."""
-    cameras = _sides(root) is not None
-    return cameras != (root.first(_TRANSLATIONS) is not None) and (cameras or not has_matrix(root))
+def is_part(document: Document) -> bool:
+    """Whether this is one of the two files of OpenCV's stereo sample: the cameras, or their pose."""
+    if not document.tree:
+        return False
+    keys = LooseKeys(document.root)
+    cameras = _sides(keys) is not None
+    return cameras != (keys.find(_TRANSLATIONS) is not None) and (cameras or not keys.has_camera())
 
 
-def from_tree(root: Field) -> CameraSet:
+def read(document: Document) -> CameraSet:
     """Read one camera or two."""
+    return from_tree(document.root, document)
+
+
+def from_tree(root: Field, document: Document) -> CameraSet:
+    """Read one camera or two from a dictionary, or from the only one in it that holds a camera."""
+    root = _within(root)
     unit = root.read("unit", Field.text)
-    sides = _sides(root)
+    keys = LooseKeys(root, document.distortion, document.notes)
+    sides = _sides(keys)
     if sides is None:
-        return CameraSet((camera_from_tree(root),), (), _poses(root), unit)
-    cameras = tuple(camera_from_tree(root, side, whole=False) for side in sides)
-    R, t = root.first(_ROTATIONS), root.first(_TRANSLATIONS)
+        one = next((side for pair in _SIDES[:3] for side in pair if keys.has_camera(side)), "")
+        camera = keys.camera("" if keys.has_camera() else one)
+        keys.refuse_unread()
+        note_size(camera, document)
+        return CameraSet((camera,), (), _poses(root), unit)
+    cameras = tuple(keys.camera(side) for side in sides)
+    keys.refuse_unread()
+    for camera in cameras:
+        note_size(camera, document)
+    R, t = keys.find(_ROTATIONS), keys.find(_TRANSLATIONS)
     if R is None or t is None:
         raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
 
-def arrays_of(data: bytes, source: str) -> dict[str, Any]:
-    """Read the arrays of an ``.npz`` file as nested lists; Python objects are refused."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
-                raise FormatError("unpacks to more than 500 MB; give a file of cameras or points", source)
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {name: arrays[name].tolist() for name in arrays.files}
-    except FormatError:
-        raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        if "pickle" in str(error) or "Object arrays" in str(error):
-            raise FormatError(
-                "holds Python objects, which are not read; save each view's corners as numbers", source
-            ) from error
-        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
+def note_size(camera: Camera, document: Document) -> None:
+    """Append a warning if the principal point is far outside the image, or its sides are exchanged."""
+    if camera.image_size is None:
+        return
+    width, height = camera.image_size
+    u0, v0 = camera.A[:2, 2]
+
+    def off(w: int, h: int) -> float:
+        return float(max(abs(u0 - (w - 1) / 2) / w, abs(v0 - (h - 1) / 2) / h))
+
+    place = f"{document.source}: the principal point ({u0:.6g}, {v0:.6g})"
+    if off(width, height) > _OFF and off(height, width) < 0.5 * off(width, height):
+        document.warnings.append(
+            f"{place} is far from the middle of an image of {width} x {height}, and near that of {height} x "
+            f"{width}; if the file has height and width, give --image-size {height} {width}"
+        )
+    elif off(width, height) > _OUTSIDE:
+        document.warnings.append(
+            f"{place} is far outside an image of {width} x {height}; check the image size, and whether the "
+            "images were cropped"
+        )
 
 
-def _sides(root: Field) -> tuple[str, str] | None:
+def _within(root: Field) -> Field:
+    """The mapping that holds the camera: the root, or the only one in it that does, with the other keys."""
+    for _ in range(_DEEPEST):
+        if isinstance(root.value, list) and len(root.value) == 1:
+            root = Field(root.value[0], root.source)
+        if not isinstance(root.value, dict):
+            raise InputError(
+                "is not a camera file; give one of the formats that neurocal convert --help lists"
+            )
+        keys = LooseKeys(root)
+        if keys.has_camera() or _sides(keys) is not None or any(keys.has_camera(side) for side in "12lr"):
+            break
+        inner = [key for key, value in root.value.items() if isinstance(value, dict) and _holds_camera(value)]
+        listed = [key for key, value in root.value.items() if isinstance(value, list) and len(value) == 1]
+        listed = [
+            key
+            for key in listed
+            if isinstance(root.value[key][0], dict) and _holds_camera(root.value[key][0])
+        ]
+        if len(inner) > 1:
+            names = ", ".join(str(key)[:20] for key in inner)
+            raise InputError(
+                f"holds several cameras ({names}), and their relative poses in no form that is known; save "
+                "the keys of one camera as a file"
+            )
+        if not inner and not listed:
+            break
+        key = (*inner, *listed)[0]
+        below = root.value[key][0] if listed and not inner else root.value[key]
+        others = {name: value for name, value in root.value.items() if name != key and name not in below}
+        root = Field({**others, **below}, root.source)
+    return root
+
+
+def _holds_camera(tree: dict[str, Any], depth: int = _DEEPEST) -> bool:
+    keys = LooseKeys(Field(tree, ""))
+    if keys.has_camera() or _sides(keys) is not None:
+        return True
+    return depth > 0 and any(isinstance(v, dict) and _holds_camera(v, depth - 1) for v in tree.values())
+
+
+def _sides(keys: LooseKeys) -> tuple[str, str] | None:
     """Suffixes of the keys of the two cameras; None if there are no two cameras."""
-    return next((pair for pair in _SIDES if all(has_matrix(root, side) for side in pair)), None)
+    found = [pair for pair in _SIDES if all(map(keys.has_camera, pair))]
+    if len(found) > 1 and {"0", "1", "2"} <= {side for pair in found for side in pair}:
+        keys.root.refuse(
+            "holds three cameras or more in one dictionary; save the keys of one or two as a file"
+        )
+    return found[0] if found else None
 
 
 def _poses(root: Field) -> dict[str, Pose]:
@@ -93,9 +170,11 @@ def _poses(root: Field) -> dict[str, Pose]:
 
 
 def _flat(field: Field) -> Array:
-    """Flat array of the numbers in nested lists of any depth, or in a matrix."""
+    """Flat array of the numbers in nested lists of any depth, in a matrix, or in a list of matrices."""
     if isinstance(field.value, dict):
         return matrix_data(field, -1)
+    if isinstance(field.value, list) and field.value and isinstance(field.value[0], dict):
+        return np.concatenate([matrix_data(entry, 3) for entry in field.items()])
     try:
         values = np.array(field.value, dtype=float).ravel()
     except (TypeError, ValueError):
@@ -165,6 +244,29 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
 
 
 _ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
-OPENCV = Format("OpenCV", _ALL, _opencv, poses=True)
-JSON = Format("JSON", _ALL, lambda set_, _: {"": json_text(entries(set_))}, skew=True, poses=True)
-NPZ = Format("NumPy", _ALL, lambda set_, _: {"": npz_bytes(entries(set_))}, skew=True, poses=True)
+
+
+def _anything(document: Document) -> bool:
+    return bool(document.tree) or isinstance(document.root.value, list)
+
+
+OPENCV = Format(
+    "OpenCV",
+    _ALL,
+    _opencv,
+    _anything,
+    read,
+    files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
+    poses=True,
+)
+JSON = Format(
+    "JSON", _ALL, lambda set_, _: {"": json_text(entries(set_))}, files="dictionary", skew=True, poses=True
+)
+NPZ = Format(
+    "NumPy",
+    _ALL,
+    lambda set_, _: {"": npz_bytes(entries(set_))},
+    files=".npz; .npy of the matrix, and of the coefficients",
+    skew=True,
+    poses=True,
+)

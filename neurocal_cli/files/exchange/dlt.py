@@ -52,4 +52,6 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": "\n".join([*rows, ""])}
 
 
-FORMAT = Format("DLT", ("none",), _text, skew=True, poses=True, most_cameras=99)
+FORMAT = Format(
+    "DLT", ("none",), _text, files="11 rows, written only", skew=True, poses=True, most_cameras=99
+)

@@ -13,7 +13,9 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
+from neurocal_cli.files.exchange.camera_keys import transform
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse, mounted
+from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import flow, text
 
@@ -37,22 +39,40 @@ _WRITTEN = {
 }
 
 
-def is_tree(root: Field) -> bool:
-    """Whether the tree is a camchain, or the part of one camera."""
-    return "cam0" in root or "camera_model" in root
+def matches(document: Document) -> bool:
+    """Whether this is a camchain, or the part of one camera."""
+    tree = document.tree
+    first = tree.get("cam0", tree)
+    return isinstance(first, dict) and {"camera_model", "intrinsics"} <= set(first)
 
 
-def from_tree(root: Field) -> CameraSet:
-    """Read a chain of cameras."""
+def read(document: Document) -> CameraSet:
+    """Read a chain of cameras; those of OpenVINS may have their poses into the IMU alone."""
+    root = document.root
     if "cam0" not in root:
         return CameraSet((_camera(root, "camera"),), unit="m", program="Kalibr")
-    cameras, relative = [_camera(root["cam0"], "cam0")], [Pose(np.eye(3), np.zeros(3))]
-    while f"cam{len(cameras)}" in root:
-        name = f"cam{len(cameras)}"
-        T = root[name]["T_cn_cnm1"].array(4, 4)
-        relative.append(after(Pose(T[:3, :3], T[:3, 3]), relative[-1]))
-        cameras.append(_camera(root[name], name))
-    return CameraSet(tuple(cameras), tuple(relative[1:]), unit="m", program="Kalibr")
+    count = next(k for k in range(len(document.tree) + 1) if f"cam{k}" not in root)
+    names = [f"cam{k}" for k in range(count)]
+    cameras = [_camera(root[name], name) for name in names]
+    chained = [Pose(np.eye(3), np.zeros(3))]
+    for name in names[1:]:
+        if "T_cn_cnm1" not in root[name]:
+            imu = [_from_imu(root[one]) for one in names]
+            if None not in imu:
+                return mounted(cameras, imu, "Kalibr")
+        chained.append(after(transform(root[name]["T_cn_cnm1"]), chained[-1]))
+    return (
+        mounted(cameras, chained, "Kalibr")
+        if count > 1
+        else CameraSet(tuple(cameras), unit="m", program="Kalibr")
+    )
+
+
+def _from_imu(part: Field) -> Pose | None:
+    """Pose from the IMU to a camera: Kalibr's T_cam_imu, or the inverse of OpenVINS's T_imu_cam."""
+    if "T_cam_imu" in part:
+        return transform(part["T_cam_imu"])
+    return inverse(transform(part["T_imu_cam"])) if "T_imu_cam" in part else None
 
 
 def _camera(field: Field, name: str) -> Camera:
@@ -107,4 +127,14 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 
 
 _HELD = ("none", "k1k2p1p2", *_WRITTEN)
-FORMAT = Format("Kalibr", _HELD, _text, most_cameras=99, metres=True, needs_size=True)
+FORMAT = Format(
+    "Kalibr",
+    _HELD,
+    _text,
+    matches,
+    read,
+    files="camchain.yaml, also of OpenVINS, YAML",
+    most_cameras=99,
+    metres=True,
+    needs_size=True,
+)

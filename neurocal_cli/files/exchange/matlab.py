@@ -25,9 +25,10 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
+from neurocal_cli.files.exchange.document import Document, assignments
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
-_STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
+STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
@@ -39,10 +40,25 @@ _DEEPEST = 12
 _MOST_BYTES = 500_000_000  # unpacked
 
 
-def read_mat(data: bytes, source: str) -> CameraSet:
+def matches(document: Document) -> object:
+    """Whether this is a ``.mat`` file, a script of Bouguet's toolbox, or a struct of MATLAB in JSON."""
+    struct = document.tree.get("cameraParams", document.tree)
+    return (
+        document.data.startswith(b"MATLAB 5.0 MAT-file")
+        or re.search(r"^\s*fc(_left)?\s*=\s*\[", document.text, re.MULTILINE)
+        or (isinstance(struct, dict) and "IntrinsicMatrix" in struct)
+    )
+
+
+def read(document: Document) -> CameraSet:
     """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
-    tree = read_variables(data, source)
-    for name in _STRUCTS:
+    if document.data.startswith(b"MATLAB"):
+        tree = read_variables(document.data, document.source)
+    elif document.tree:
+        tree = dict(document.tree)
+    else:
+        tree = assignments(document.text)
+    for name in STRUCTS:
         if isinstance(tree.get(name), dict):
             tree = tree[name]
             break
@@ -59,9 +75,14 @@ def read_mat(data: bytes, source: str) -> CameraSet:
         return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
     if "IntrinsicMatrix" in tree or "K" in tree:
         return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
+    if any(re.fullmatch(r"x_\d+", name) for name in tree):
+        raise InputError(
+            "holds points of Bouguet's toolbox, and no camera; give it to convert without --what"
+        )
     raise InputError(
-        "holds no camera that can be read; in MATLAB save a struct: "
-        "cameraParams = toStruct(cameraParams); save('camera.mat', 'cameraParams', '-v7')"
+        "holds no camera that can be read, and objects of MATLAB's classes can be read by MATLAB only; "
+        "there, save a struct: cameraParams = toStruct(cameraParams); "
+        "save('camera.mat', 'cameraParams', '-v7')"
     )
 
 
@@ -277,4 +298,15 @@ def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
     }
 
 
-FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), _text, skew=True, poses=True, needs_size=True)
+FORMAT = Format(
+    "MATLAB",
+    ("none", "k1k2p1p2", "plumb_bob"),
+    _text,
+    matches,
+    read,
+    files=".mat with a struct; Calib_Results.mat and .m of Bouguet's toolbox, whose first pixel is 0",
+    skew=True,
+    poses=True,
+    needs_size=True,
+    first_pixel=1.0,
+)

@@ -16,6 +16,7 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
+from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import number
 
@@ -29,13 +30,14 @@ _BY_LENGTH = {len(MODELS[model]): model for model in _NAMES}
 _START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
 
 
-def is_text(text: str) -> bool:
-    """Whether a text is a camera model."""
-    return bool(_START.match(text)) and "'lensmodel'" in text
+def matches(document: Document) -> bool:
+    """Whether this is a camera model."""
+    return bool(_START.match(document.text)) and "'lensmodel'" in document.text
 
 
-def parse(text: str, source: str) -> CameraSet:
+def read(document: Document) -> CameraSet:
     """Read a camera model."""
+    text, source = document.text, document.source
     try:
         tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
@@ -92,4 +94,14 @@ def _model(camera: Camera, pose: Pose) -> str:
     )
 
 
-FORMAT = Format("mrcal", tuple(_NAMES), _text, most_cameras=99, needs_size=True)
+FORMAT = Format(
+    "mrcal",
+    tuple(_NAMES),
+    _text,
+    matches,
+    read,
+    files=".cameramodel",
+    most_cameras=99,
+    needs_size=True,
+    frame="reference, of a single camera",
+)

@@ -24,6 +24,7 @@ from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.camera_rig_yaml import camera_rig_from_field, format_camera_rig
 from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.rig_yaml import format_rig, rig_from_field
 from neurocal_cli.files.tree_fields import Field
@@ -34,6 +35,8 @@ _UNKNOWN = "unknown"  # unit of lengths if no file states it
 
 def from_tree(root: Field, whole: bool) -> CameraSet:
     """Read a calibration or a rig, with poses and points only if `whole`."""
+    if "neurocal_lens" in root:
+        raise InputError("is a zoom lens; give its camera at one setting, from neurocal lens camera")
     if "neurocal" not in root:
         if not whole:
             kind = "rig" if "rig" in root else "stereo rig"
@@ -152,4 +155,26 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
 
 
-FORMAT = Format("neurocal", tuple(MODELS), _text, skew=True, poses=True, most_cameras=99)
+def matches(document: Document) -> bool:
+    """Whether this is a calibration or a rig of neurocal."""
+    tree = document.tree
+    rig = "cameras" in tree and "rig" in tree
+    return "neurocal" in tree or rig or ("stereo" in tree and "left" in tree) or "neurocal_lens" in tree
+
+
+def read(document: Document) -> CameraSet:
+    """Read a calibration or a rig."""
+    return from_tree(document.root, whole=True)
+
+
+FORMAT = Format(
+    "neurocal",
+    tuple(MODELS),
+    _text,
+    matches,
+    read,
+    files="its own, YAML or JSON",
+    skew=True,
+    poses=True,
+    most_cameras=99,
+)

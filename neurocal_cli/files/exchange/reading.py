@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.nearest_camera import with_model
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.camera_tree import boofcv_camera
-from neurocal_cli.files.exchange import colmap, dictionary, dlt, kalibr, matlab, mrcal, neurocal, ros
+from neurocal_cli.files.exchange import (
+    capture,
+    colmap,
+    dictionary,
+    dlt,
+    kalibr,
+    matlab,
+    mrcal,
+    neurocal,
+    odometry,
+    photographs,
+    ros,
+)
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
+from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.failures import source_of, value_failures
-from neurocal_cli.files.file_storage import parse_tree
-from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field
 
 # Formats that `convert` writes, by the values of its option ``--to``.
@@ -30,90 +43,213 @@ FORMATS: dict[str, Format] = {
     "json": dictionary.JSON,
     "npz": dictionary.NPZ,
     "dlt": dlt.FORMAT,
+    "nerfstudio": photographs.NERFSTUDIO,
+    "anipose": capture.ANIPOSE,
+    "orb-slam": odometry.ORB_SLAM,
+    "vins": odometry.VINS,
+    "basalt": odometry.BASALT,
+    "euroc": odometry.EUROC,
+    "open3d": photographs.OPEN3D,
+    "metashape": photographs.METASHAPE,
+    "gyroflow": photographs.GYROFLOW,
 }
-_COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
+# Formats that are read, the most specific first; the last takes any dictionary of a camera.
+READ: tuple[Format, ...] = (
+    neurocal.FORMAT,
+    matlab.FORMAT,
+    colmap.FORMAT,
+    mrcal.FORMAT,
+    capture.ANIPOSE,
+    capture.ZED,
+    odometry.KITTI,
+    odometry.EUROC,
+    kalibr.FORMAT,
+    capture.BOOFCV,
+    odometry.ORB_SLAM,
+    odometry.VINS,
+    odometry.BASALT,
+    odometry.OKVIS,
+    odometry.SVO,
+    photographs.NERFSTUDIO,
+    photographs.METASHAPE,
+    photographs.GYROFLOW,
+    photographs.OPEN3D,
+    ros.FORMAT,
+    dictionary.OPENCV,
+)
+_ORI = re.compile(r"\s*".join([r"(?:\s*[-+.\deE]+){3}"] * 5) + r"(?:\s+[-+.\deE]+){6}\s*\Z").match
+
+# What is known and cannot be read: how to tell it, what it is, and what to do.
+_REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
+    (
+        lambda d: d.data.startswith(b"\x89HDF"),
+        "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7",
+    ),
+    (
+        lambda d: (
+            d.data[:1] == b"\x80" and d.data[1:2] in (b"\2", b"\3", b"\4", b"\5") and d.data.endswith(b".")
+        ),
+        "is a pickle of Python, which can run code and is not read; in Python load it, and save its numbers "
+        "by numpy.savez('camera.npz', K=matrix, D=coefficients)",
+    ),
+    (
+        lambda d: d.data.startswith(b"#ROSBAG"),
+        "is a ROS bag; give a camera_info file, as rostopic echo prints it",
+    ),
+    (
+        lambda d: d.data.startswith(b"SQLite format 3"),
+        "is a database; of COLMAP, give the folder of a model with cameras.txt or cameras.bin",
+    ),
+    (
+        lambda d: "polynomial coefficients for the DIRECT mapping" in d.text[:200],
+        "is a camera of OCamCalib, whose polynomial is no model here; calibrate its images as fisheye or "
+        "omnidir",
+    ),
+    (
+        lambda d: re.match(r"Calibration results\s*\n=+", d.text),
+        "is a report of Kalibr; give its camchain for the cameras",
+    ),
+    (
+        lambda d: "CalibrationInformation" in d.tree,
+        "is the raw calibration of an Azure Kinect, of its sensors and not of images; save the intrinsics of "
+        "the mode that you use, as its SDK gives them",
+    ),
+    (
+        lambda d: re.search(r"<document\b", d.text[:300]),
+        "is a project of Metashape; save the calibration itself: Tools, Camera Calibration, Save",
+    ),
+    (
+        lambda d: re.search(r"<lensdatabase\b", d.text[:2000]),
+        "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
+    ),
+    (
+        lambda d: not d.tree and len(d.text) < 2000 and _ORI(d.text),
+        "is an orientation of OpenPTV, in mm of the sensor; calibrate from its points",
+    ),
+)
 
 
-def read_cameras(paths: Sequence[str | Path]) -> CameraSet:
+def read_cameras(
+    paths: Sequence[str | Path],
+    notes: list[str] | None = None,
+    warnings: list[str] | None = None,
+    *,
+    distortion: str | None = None,
+    size: tuple[int, int] | None = None,
+) -> CameraSet:
     """Read the cameras of a file of a known program, or of two files that belong together.
 
-    One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder that
-    holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left and the
-    right camera of ROS or mrcal, or the two files of OpenCV's stereo sample.
+    Two are the left and the right camera of ROS, mrcal or EuRoC, the two files of OpenCV's stereo sample, or
+    a ``.npy`` of the matrix and one of the coefficients.
+
+    Parameters
+    ----------
+    paths : sequence of paths
+        One or two; a folder is a model of COLMAP, ``-`` is standard input.
+    notes, warnings : list of str, optional
+        Remarks about what was read, and doubts about it, are appended.
+    distortion : str, optional
+        The distortion model, one of `MODELS`, where a file has coefficients and does not say of which model.
+    size : (width, height), optional
+        Of the images, where a file has cameras of several.
+
+    Raises
+    ------
+    FormatError
+        No known format, or one that contradicts itself or does not tell enough; the message says what to do.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:
         raise InputError(f"there are {len(names)} files; give one, or the two of one rig")
-    opened = [_opened(name) for name in names]
-    trees = [one for one in opened if isinstance(one, Field)]
-    if len(trees) == 2 and "-" not in names and all(map(dictionary.is_part, trees)):
-        first, second = trees
-        merged = Field({**first.value, **second.value}, f"{first.source}, {second.source}")
-        with value_failures(merged.source):
-            return dictionary.from_tree(merged)
-    cameras = [_cameras(one, whole=True) for one in opened]
+    told = [] if notes is None else notes, [] if warnings is None else warnings
+    if any(map(colmap.is_folder, names)):
+        cameras = [colmap.read_folder(name) for name in names if colmap.is_folder(name)]
+        if len(names) == 1:
+            return cameras[0]
+    documents = [Document(name, *told, distortion, size) for name in names]
+    if len(documents) == 2 and "-" not in names:
+        merged = _merged(documents)
+        if merged is not None:
+            return merged
+    cameras = [_read(document) for document in documents]
     return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
 
-def read_intrinsics(path: str | Path) -> Camera:
+def read_intrinsics(
+    path: str | Path,
+    notes: list[str] | None = None,
+    warnings: list[str] | None = None,
+    distortion: str | None = None,
+) -> Camera:
     """Read a single camera without its poses, from any file of `read_cameras`."""
-    return _single(path)[1].cameras[0]
+    return _single(path, notes, warnings, distortion)[1].cameras[0]
 
 
-def read_given_camera(path: str | Path) -> Camera | Calibration:
+def read_given_camera(
+    path: str | Path,
+    notes: list[str] | None = None,
+    warnings: list[str] | None = None,
+    distortion: str | None = None,
+) -> Camera | Calibration:
     """Read a single camera without its poses; of a neurocal file also the covariance of its parameters."""
-    opened, found = _single(path)
-    if isinstance(opened, Field) and found.program == "neurocal":
-        return neurocal.without_points(opened, found)
+    document, found = _single(path, notes, warnings, distortion)
+    if document is not None and found.program == "neurocal":
+        return neurocal.without_points(document.root, found)
     return found.cameras[0]
 
 
-def _single(path: str | Path) -> tuple[CameraSet | Field, CameraSet]:
-    opened = _opened(str(path))
-    found = _cameras(opened, whole=False)
+def _single(
+    path: str | Path, notes: list[str] | None, warnings: list[str] | None, distortion: str | None
+) -> tuple[Document | None, CameraSet]:
+    name = str(path)
+    if colmap.is_folder(name):
+        document, found = None, colmap.read_folder(name)
+    else:
+        document = Document(
+            name, [] if notes is None else notes, [] if warnings is None else warnings, distortion
+        )
+        found = _read(document, whole=False)
     if len(found.cameras) > 1:
         raise FormatError("is a rig; give the file of one camera", source_of(path))
-    return opened, found
+    return document, found
 
 
-def _opened(name: str) -> CameraSet | Field:
-    """Read the cameras of a file, or its tree if it is YAML, XML or JSON."""
-    if colmap.is_folder(name):
-        return colmap.read_folder(name)
-    data, source = read_bytes(name)
-    if data.startswith(b"\x89HDF"):
-        raise FormatError("is a MATLAB file of version 7.3; save it with -v7", source)
+def _read(document: Document, whole: bool = True) -> CameraSet:
+    with value_failures(document.source):
+        for refused, problem in _REFUSED:
+            if refused(document):
+                raise InputError(problem)
+        for one in READ:
+            if one.matches is None or one.read is None or not one.matches(document):
+                continue
+            own = not whole and one is neurocal.FORMAT
+            found = neurocal.from_tree(document.root, whole) if own else one.read(document)
+            for camera in found.cameras:
+                model = document.distortion
+                if model is not None and with_model(camera.distortion, model) is None:
+                    raise InputError(
+                        f"states its distortion model, {camera.distortion.model}; leave out --distortion"
+                    )
+            return found
+    raise FormatError(
+        "is not a camera file; give one of the formats that neurocal convert --help lists", document.source
+    )
+
+
+def _merged(documents: Sequence[Document]) -> CameraSet | None:
+    """The camera or the rig of two files with a part each; None if they have none."""
+    first, second = documents
+    source = f"{first.source}, {second.source}"
+    if all(document.data.startswith(b"\x93NUMPY") for document in documents):
+        arrays = [np.array(document.tree["K"]) for document in documents]
+        matrix = next((k for k, array in enumerate(arrays) if array.shape == (3, 3)), 0)
+        tree = {"K": arrays[matrix].tolist(), "D": arrays[1 - matrix].ravel().tolist()}
+    elif all(map(dictionary.is_part, documents)):
+        tree = {**first.tree, **second.tree}
+    else:
+        return None
     with value_failures(source):
-        if data.startswith(b"PK\x03\x04"):
-            return dictionary.from_tree(Field(dictionary.arrays_of(data, source), source))
-        if data.startswith(b"MATLAB 5.0 MAT-file"):
-            return matlab.read_mat(data, source)
-        text = decode(data, source, "a camera file")
-        if _COLMAP(text):
-            return colmap.parse(text, source)
-        if mrcal.is_text(text):
-            return mrcal.parse(text, source)
-        return parse_tree(text, source)
-
-
-def _cameras(opened: CameraSet | Field, whole: bool) -> CameraSet:
-    if isinstance(opened, CameraSet):
-        return opened
-    root = opened
-    with value_failures(root.source):
-        if not isinstance(root.value, dict):
-            raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
-        if (
-            "neurocal" in root
-            or ("left" in root and "right" in root)
-            or ("cameras" in root and "rig" in root)
-        ):
-            return neurocal.from_tree(root, whole)
-        if kalibr.is_tree(root):
-            return kalibr.from_tree(root)
-        if "pinhole" in root:
-            return CameraSet((boofcv_camera(root),), program="BoofCV")
-        return ros.from_tree(root) if ros.is_tree(root) else dictionary.from_tree(root)
+        return dictionary.from_tree(Field(tree, source), first)
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:
@@ -121,15 +257,15 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
     for part, name in zip((left, right), names, strict=True):
         if len(part.cameras) != 1:
             raise FormatError("holds several cameras itself; give it alone", name)
-    if left.program != right.program or left.program not in ("ROS", "mrcal"):
+    if left.program == right.program == "ROS":
+        return ros.joined(left, right)
+    # Poses are relative to one world, body or IMU.
+    common = set(left.poses) & set(right.poses)
+    if left.program != right.program or left.program not in ("mrcal", "EuRoC") or len(common) != 1:
         raise InputError(
             f"{names[0]} and {names[1]} do not give the relative pose of the cameras; give two files of "
             "ROS or of mrcal, or the file of the rig"
         )
-    if left.program == "ROS":
-        return ros.joined(left, right)
-    # mrcal's poses are relative to one world.
-    first, second = (part.poses[mrcal.REFERENCE] for part in (left, right))
-    return replace(
-        left, cameras=(left.cameras[0], right.cameras[0]), relative=(after(second, inverse(first)),), poses={}
-    )
+    (frame,) = common
+    pose = after(right.poses[frame], inverse(left.poses[frame]))
+    return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})

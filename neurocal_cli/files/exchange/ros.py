@@ -6,52 +6,120 @@ cameras parallel. Therefore R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.camera_tree import camera_from_tree, format_camera_info, matrix_data
+from neurocal_cli.files.camera_tree import format_camera_info, matrix_data
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.exchange.dictionary import note_size
+from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_rig
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, is_number
 
-_RECTIFIED = "rectified"  # key in `poses` for rectification matrix and t / f of a camera of a pair
-
-
-def is_tree(root: Field) -> bool:
-    """Whether the tree is a camera_info file."""
-    return "camera_matrix" in root and "rectification_matrix" in root
+_TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
+_LABEL = re.compile(r"\s*\[?([A-Za-z][\w /.-]*)\]?\s*").fullmatch
 
 
-def from_tree(root: Field) -> CameraSet:
+def matches(document: Document) -> object:
+    """Whether this is a camera_info file, a message as ``rostopic echo`` prints it, or ost.txt."""
+    tree = document.tree
+    info = "camera_matrix" in tree and {"rectification_matrix", "projection_matrix"} & set(tree)
+    message = {"K", "P"} <= set(tree) or {"k", "p", "distortion_model"} <= set(tree)
+    return info or (message and "distortion_model" in tree) or _TEXT.search(document.text[:5000])
+
+
+def read(document: Document) -> CameraSet:
     """Read the camera, with its pose in a rectified pair if it has one."""
-    camera, poses = camera_from_tree(root), {}
-    if "projection_matrix" in root:
-        R = matrix_data(root["rectification_matrix"], 9).reshape(3, 3)
-        P = matrix_data(root["projection_matrix"], 12).reshape(3, 4)
-        if P[0, 0] > 0 and P[1, 1] > 0:
-            poses[_RECTIFIED] = Pose(R, np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0]))
-    return CameraSet((camera,), (), poses, "m", program="ROS")
+    root = _ost(document) if _TEXT.search(document.text[:5000]) else document.root
+    keys = LooseKeys(root, document.distortion, document.notes)
+    camera = keys.camera()
+    R, P = (
+        keys.find((long, short)) for long, short in (("rectificationmatrix", "r"), ("projectionmatrix", "p"))
+    )
+    keys.refuse_unread()
+    note_size(camera, document)
+    rectified = None
+    if P is not None:
+        rotation = np.eye(3) if R is None else matrix_data(R, 9).reshape(3, 3)
+        projection = matrix_data(P, 12).reshape(3, 4)
+        # ROS's drivers write zeros where nothing is known.
+        if projection[0, 0] > 0 and projection[1, 1] > 0:
+            rectified = rotation if rotation.any() else np.eye(3), projection
+    if root.get("binning_x", 0).integer() > 1 or root.get("binning_y", 0).integer() > 1:
+        document.notes.append(f"{document.source}: has binning; the camera is that of the images before it")
+    return CameraSet((camera,), (), {}, "m", program="ROS", rectified=rectified)
+
+
+def _ost(document: Document) -> Field:
+    """The tree of ost.txt or ost.ini, in which a line names the numbers below it."""
+    tree: dict[str, Any] = {}
+    name = ""
+    for line in document.text.splitlines():
+        line = line.partition("#")[0].strip()
+        if _LABEL(line) and not is_number(line):
+            if line.startswith("["):
+                if line != "[image]":
+                    tree["camera_name"] = line.strip("[]")
+            else:
+                name = line
+        elif line:
+            tree.setdefault(name, []).extend(line.split())
+    known = {
+        "camera matrix": 9,
+        "distortion": -1,
+        "rectification": 9,
+        "projection": 12,
+        "width": 1,
+        "height": 1,
+    }
+    root = Field(
+        {key: value for key, value in tree.items() if key in known or key == "camera_name"}, document.source
+    )
+    read = {key: root[key].array(count) for key, count in known.items() if key in root}
+    return Field(
+        {
+            "camera_name": tree.get("camera_name", "camera"),
+            "image_width": int(read["width"][0]) if "width" in read else 0,
+            "image_height": int(read["height"][0]) if "height" in read else 0,
+            "camera_matrix": read["camera matrix"].tolist(),
+            "distortion_model": "rational_polynomial" if len(read.get("distortion", ())) > 5 else "plumb_bob",
+            "distortion_coefficients": root["distortion"].array(-1).tolist(),
+            **({"rectification_matrix": read["rectification"].tolist()} if "rectification" in read else {}),
+            **({"projection_matrix": read["projection"].tolist()} if "projection" in read else {}),
+        },
+        document.source,
+    )
 
 
 def joined(left: CameraSet, right: CameraSet) -> CameraSet:
     """Join the cameras of two files to a rig; an InputError if they are no rectified pair."""
-    first, second = (part.poses.get(_RECTIFIED) for part in (left, right))
-    if first is None or second is None or not second.t.any() or first.t.any():
+    shifts = []
+    for part in (left, right):
+        if part.rectified is not None:
+            P = part.rectified[1]
+            shifts.append(np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0]))
+    if len(shifts) < 2 or not shifts[1].any() or shifts[0].any():
         raise InputError(
             "the two ROS files are no pair: the right camera's projection_matrix must hold the baseline, and "
             "the left one's none; give the left camera first, or the file of the rig"
         )
-    pose = Pose(second.R.T @ first.R, second.R.T @ second.t)
-    return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
+    assert left.rectified is not None
+    assert right.rectified is not None
+    first, second = left.rectified[0], right.rectified[0]
+    pose = Pose(second.T @ first, second.T @ shifts[1])
+    return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), rectified=None)
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     if len(cameras.cameras) == 1:
-        return {"": format_camera_info(cameras.cameras[0])}
+        return {"": format_camera_info(cameras.cameras[0], cameras.rectified)}
     rectified = rectify(as_rig(replace(cameras, origin=None)))
     if rectified is None:
         raise InputError("ROS's files need images of one known size; give --image-size")
@@ -62,4 +130,14 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     }
 
 
-FORMAT = Format("ROS", ("none", "plumb_bob", "rational", "fisheye"), _text, metres=True, needs_size=True)
+FORMAT = Format(
+    "ROS",
+    ("none", "plumb_bob", "rational", "fisheye"),
+    _text,
+    matches,
+    read,
+    files="camera_info YAML, a message printed by rostopic echo, ost.txt, ost.ini",
+    metres=True,
+    needs_size=True,
+    rectified=True,
+)

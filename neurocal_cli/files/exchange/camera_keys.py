@@ -1,0 +1,244 @@
+"""Tables of the keys of one camera in a program's files, by which it is read and written.
+
+A path is a chain of keys joined by ``/``; numbers index lists. A path of several numbers ends in the form in
+which they are written: ``:list``, ``:matrix`` of nested rows, ``:data`` in ``{rows, cols, data}``, or
+``:column``. Any form is read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.nearest_camera import with_model
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.files.tree_fields import Field
+
+_COEFFICIENT = re.compile(r"(?:.*\.)?([kps]\d)$").match
+_POLYNOMIAL = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted")
+
+
+@frozen_dataclass
+class Lens:
+    """A distortion model of a program: its names, ours, and the places of our coefficients in order."""
+
+    words: tuple[str, ...]  # the first is written; case and punctuation do not count
+    ours: str
+    places: tuple[str, ...]  # a path for each coefficient, or one for the list of all
+    intrinsics: tuple[str, ...] = ()  # if they are at other places than those of other lenses
+
+
+@frozen_dataclass(eq=False)
+class CameraKeys:
+    """Where a program's files have the parts of one camera."""
+
+    program: str
+    intrinsics: tuple[str, ...]  # fx, fy, cx, cy, or one path of them or of the camera matrix
+    lenses: tuple[Lens, ...]  # of several with one name, the last has the coefficients of the others
+    model: str = ""  # path of the name of the lens; without it, the first lens
+    size: tuple[str, ...] = ()  # width and height, or one path of both
+    name: str = ""
+    skew: str = ""
+    first_pixel: float = 0.0  # coordinate of the centre of the first pixel
+    constants: Mapping[str, Any] = field(default_factory=dict)  # written as they are
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Our names of the models that can be written, the simplest first."""
+        ours = [lens.ours for lens in self.lenses]
+        plain = [] if ours[0] not in _POLYNOMIAL or "none" in ours else ["none"]
+        return tuple(dict.fromkeys([*plain, *ours]))
+
+    def camera(self, root: Field, name: str = "camera") -> Camera:
+        """Read a camera."""
+        lens = self._lens(root)
+        values = [at(root, path) for path in lens.intrinsics or self.intrinsics]
+        if len(values) == 1:
+            entries = numbers(values[0])
+            if len(entries) not in (4, 9):
+                values[0].fail("four numbers or a 3 x 3 matrix")
+            K = _matrix(*entries) if len(entries) == 4 else entries.reshape(3, 3).copy()
+        else:
+            K = _matrix(*(value.number() for value in values))
+        if self.skew and (skew := find(root, self.skew)) is not None:
+            K[0, 1] = skew.number()
+        K[:2, 2] -= self.first_pixel
+        if self.name and (stated := find(root, self.name)) is not None:
+            name = stated.text()
+        return Camera(Intrinsics.from_matrix(K), self._distortion(root, lens), self.image_size(root), name)
+
+    def image_size(self, root: Field) -> tuple[int, int] | None:
+        """Width and height; None if they are not there, or 0."""
+        fields = [find(root, path) for path in self.size]
+        known = [entry for entry in fields if entry is not None]
+        if not known or len(known) < len(self.size):
+            return None
+        entries = list(known[0].items()) if len(known) == 1 else known
+        if len(entries) != 2:
+            known[0].fail("two whole numbers, width and height")
+        width, height = (entry.integer() for entry in entries)
+        return (width, height) if width and height else None
+
+    def _lens(self, root: Field) -> Lens:
+        stated = find(root, self.model) if self.model else None
+        if stated is None:
+            return self._last(self.lenses[0])
+        word = _plain(stated.text())
+        for lens in self.lenses:
+            if word in map(_plain, lens.words):
+                return self._last(lens)
+        known = ", ".join(dict.fromkeys(lens.words[0] for lens in self.lenses))
+        raise InputError(
+            f"the model {stated.text()[:40]!r} of {self.program} is not known; calibrate it as one of {known}"
+            ", or with neurocal from the points"
+        )
+
+    def _last(self, lens: Lens) -> Lens:
+        """The lens of the same names with the most coefficients."""
+        return [other for other in self.lenses if other.words == lens.words][-1]
+
+    def _distortion(self, root: Field, lens: Lens) -> Distortion:
+        count = len(MODELS[lens.ours])
+        if count and len(lens.places) == 1 < count:
+            found = find(root, lens.places[0])
+            values = np.zeros(0) if found is None else numbers(found)
+            fewest = 0 if lens.ours in _POLYNOMIAL else count
+            if found is not None and not fewest <= len(values):
+                found.fail(f"{count} numbers")
+            if found is None and fewest:
+                at(root, lens.places[0])
+        else:
+            fields = [find(root, path) for path in lens.places]
+            values = np.array([0.0 if entry is None else entry.number() for entry in fields])
+            self._refuse_others(root, lens)
+        if lens.ours in _POLYNOMIAL:
+            return Distortion(*from_ros("plumb_bob", np.pad(values, (0, max(0, 5 - len(values))))))
+        if len(values) != count:
+            raise InputError(
+                f"the model {lens.words[0]} has {count} coefficients, found {len(values)}; correct it"
+            )
+        return Distortion(lens.ours, values)
+
+    def _refuse_others(self, root: Field, lens: Lens) -> None:
+        """Refuse a coefficient beside those of the lens."""
+        for folder in dict.fromkeys(place.rpartition("/")[0] for place in lens.places):
+            parent = root if not folder else find(root, folder)
+            known = {place.rpartition("/")[2] for place in (*lens.places, *lens.intrinsics)}
+            stem = {place.rpartition(".")[0] for place in known}
+            for key, value in (parent.value if parent and isinstance(parent.value, dict) else {}).items():
+                alike = _COEFFICIENT(key) and key.rpartition(".")[0] in stem and key not in known
+                if alike and isinstance(value, (int, float)) and value:
+                    raise InputError(
+                        f"the coefficient {key} is not known in {self.program}'s model {lens.words[0]}; "
+                        "calibrate it without, or with neurocal from the points"
+                    )
+
+    def tree(self, camera: Camera) -> dict[str, Any]:
+        """The tree of a camera, whose model is one of `models`."""
+        fitting = (lens for lens in self.lenses if with_model(camera.distortion, lens.ours) is not None)
+        lens = next(fitting)
+        distortion = with_model(camera.distortion, lens.ours)
+        assert distortion is not None
+        a, skew, b, u0, v0 = camera.entries
+        u0, v0 = u0 + self.first_pixel, v0 + self.first_pixel
+        tree: dict[str, Any] = {}
+        for path, value in self.constants.items():
+            put(tree, path, value)
+        if self.model:
+            put(tree, self.model, lens.words[0])
+        if self.name:
+            put(tree, self.name, camera.name)
+        if self.size:
+            _put_all(tree, self.size, camera.image_size or (0, 0))
+        paths = lens.intrinsics or self.intrinsics
+        if paths[0].endswith((":matrix", ":data")):
+            put(tree, paths[0], _matrix(a, b, u0, v0, skew))
+        else:
+            _put_all(tree, paths, [a, b, u0, v0])
+        if self.skew:
+            put(tree, self.skew, skew)
+        _put_all(tree, lens.places, distortion.coefficients.tolist())
+        return tree
+
+
+def _put_all(tree: dict[str, Any], paths: tuple[str, ...], values: Any) -> None:
+    if len(paths) == 1 < len(values):
+        put(tree, paths[0], np.array(values) if ":" in paths[0] and "list" not in paths[0] else list(values))
+    else:
+        for path, value in zip(paths, values, strict=True):
+            put(tree, path, value)
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
+    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _plain(word: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", word.lower())
+
+
+def find(root: Field, path: str) -> Field | None:
+    """Value at a path; None if it is not there, or null."""
+    here = root
+    for key in path.partition(":")[0].split("/"):
+        if isinstance(here.value, list) and key.isdecimal() and int(key) < len(here.value):
+            here = Field(here.value[int(key)], here.source, f"{here.path}[{key}]")
+        elif key in here:
+            here = here[key]
+        else:
+            return None
+    return here
+
+
+def at(root: Field, path: str) -> Field:
+    """Value at a path; a FormatError names the first key that is missing."""
+    here = root
+    for key in path.partition(":")[0].split("/"):
+        if isinstance(here.value, list):
+            found = find(here, key)
+            if found is None:
+                here.fail(f"a list of {int(key) + 1} or more")
+            here = found
+        else:
+            here = here[key]
+    return here
+
+
+def numbers(entry: Field) -> Array:
+    """Numbers in a list, in nested lists or in ``{rows, cols, data}``, in one row."""
+    if isinstance(entry.value, dict) and "rows" not in entry.value:
+        return entry["data"].array(-1)
+    return matrix_data(entry, -1)
+
+
+def transform(entry: Field) -> Pose:
+    """A pose from its matrix of 4 x 4 or 3 x 4 numbers, in any form."""
+    values = numbers(entry)
+    if len(values) not in (12, 16):
+        entry.fail("4 x 4 numbers")
+    T = values.reshape(-1, 4)
+    return Pose(T[:3, :3], T[:3, 3])
+
+
+def put(tree: dict[str, Any], path: str, value: Any) -> None:
+    """Set the value at a path, in the form that its end names."""
+    path, _, form = path.partition(":")
+    *folders, key = path.split("/")
+    for folder in folders:
+        tree = tree.setdefault(folder, {})
+    if form in ("data", "column"):
+        matrix = np.atleast_2d(value) if form == "data" else np.reshape(value, (-1, 1))
+        value = {"rows": matrix.shape[0], "cols": matrix.shape[1], "data": matrix.ravel().tolist()}
+    elif isinstance(value, np.ndarray):
+        value = value.tolist()
+    tree[key] = value

@@ -1,0 +1,153 @@
+"""A file of another program as its recognisers see it: its bytes, its text and the tree of its keys.
+
+The tree is that of YAML, JSON (also with comments), OpenCV's and Agisoft's XML, TOML, sections of
+``key=value``, or NumPy's files.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+import zipfile
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.errors import FormatError
+from neurocal_cli.files.file_storage import parse_tree
+from neurocal_cli.files.reading import decode, read_bytes
+from neurocal_cli.files.tree_fields import Field, is_number
+
+_MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
+_SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
+_ASSIGNMENT = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*;", re.MULTILINE)
+
+
+class Document:
+    """A file, or standard input, and what the caller says about it.
+
+    Parameters
+    ----------
+    name : str
+        Path, or ``-``.
+    notes, warnings : list of str
+        Remarks about what was read, and doubts about it, are appended.
+    distortion : str, optional
+        Our name of the distortion model, if the file does not say it.
+    size : (width, height), optional
+        Of the images, to choose among the cameras of several resolutions.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        notes: list[str],
+        warnings: list[str],
+        distortion: str | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        self.data, self.source = read_bytes(name)
+        self.notes, self.warnings = notes, warnings
+        self.distortion, self.size = distortion, size
+
+    @cached_property
+    def is_text(self) -> bool:
+        """Whether the bytes may be text."""
+        return b"\0" not in self.data and not self.data.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04"))
+
+    @cached_property
+    def text(self) -> str:
+        """The text, "" of a binary file."""
+        return decode(self.data, self.source, "a camera file") if self.is_text else ""
+
+    @cached_property
+    def root(self) -> Field:
+        """The tree of the file; a FormatError says what is wrong with it."""
+        if self.data.startswith(b"PK\x03\x04"):
+            return Field(arrays_of(self.data, self.source, self.notes), self.source)
+        if self.data.startswith(b"\x93NUMPY"):
+            return Field({"K": _array(self.data, self.source).tolist()}, self.source)
+        text = decode(self.data, self.source, "a camera file")
+        if _SECTION(text):
+            return Field(_sections(text, self.source), self.source)
+        return parse_tree(text, self.source)
+
+    @cached_property
+    def tree(self) -> dict[str, Any]:
+        """The tree as a mapping; empty if there is none, or if it cannot be read."""
+        try:
+            value = self.root.value
+        except FormatError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+
+def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
+    """Read the arrays of an ``.npz`` file as nested lists; Python objects are left out, with a note."""
+    tree: dict[str, Any] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+                raise FormatError("unpacks to more than 500 MB; give a file of cameras or points", source)
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            for name in arrays.files:
+                try:
+                    tree[name] = arrays[name].tolist()
+                except ValueError as error:
+                    if "Object arrays" not in str(error):
+                        raise
+                    notes.append(
+                        f"{source}: {name[:40]} holds Python objects, which can run code and are not read; "
+                        "save it as an array of numbers"
+                    )
+    except FormatError:
+        raise
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
+    return tree
+
+
+def _array(data: bytes, source: str) -> np.ndarray[Any, Any]:
+    try:
+        return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
+    except (ValueError, OSError, EOFError) as error:
+        raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+
+
+def _sections(text: str, source: str) -> dict[str, Any]:
+    """Read TOML, or the sections of an INI file."""
+    if sys.version_info >= (3, 11):
+        import tomllib
+
+        try:
+            return tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError):
+            pass
+    import configparser
+
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        line = getattr(error, "lineno", None)
+        raise FormatError("is neither TOML nor sections of key = value; correct it", source, line) from error
+    return {
+        name: {key: float(value) if is_number(value) else value for key, value in parser[name].items()}
+        for name in parser.sections()
+    }
+
+
+def assignments(text: str) -> dict[str, Any]:
+    """Variables of a MATLAB script that assigns numbers: arrays of one column, or matrices."""
+    found: dict[str, Any] = {}
+    for name, value in _ASSIGNMENT.findall(re.sub(r"%[^\n]*", "", text)):
+        rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", value.strip("[]"))]
+        rows = [row for row in rows if row]
+        try:
+            found[name] = np.array(rows, dtype=float)
+        except ValueError:  # ragged, or no numbers
+            continue
+    return found

@@ -1,0 +1,416 @@
+"""Read a camera from a dictionary by the many names that programs and people give to its parts.
+
+Names are compared without case and punctuation, with or without the name of one camera of two before or after
+them (``cameraMatrix1``, ``left_K``). Nothing is guessed: four coefficients that may be those of an ordinary
+lens or of a fisheye are refused, and so are numbers that may be the distortion and were not read, because a
+camera without its distortion looks right but is wrong.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import checked_size
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.files.failures import one_line, value_failures
+from neurocal_cli.files.tree_fields import Field, is_number
+
+# The first are written here and by ROS and OpenCV; in OpenCV's stereo sample the left camera has M1 and D1.
+_MATRIX = (
+    "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
+    "cameraintrinsic", "intrinsic", "camintrinsics", "cammatrix", "cammtx", "cameramtx", "kmatrix", "kmat",
+    "matrix", "intrinsicmat", "intrinsicparameters", "calibrationmatrix", "intrinsicparams", "camerak",
+    "cameramat", "kk", "m1",
+)  # fmt: skip
+_COEFFICIENTS = (
+    "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "distortioncoeffs",
+    "distortioncoeff", "distortioncoefs", "distortioncoef", "distortioncoefficient", "distcoefficients",
+    "distortion", "distortions", "dist", "d", "kc", "coefs", "coeffs", "coef", "coefficients",
+    "distortionparameters", "distortionparams", "distparams", "distortionvector", "distortionmatrix",
+    "distvec", "lensdistortion", "cameradistortion", "distmtx", "distmatrix", "camdist", "disto", "distcof",
+    "distcoffs", "distortioncoefficents", "distortionvalues", "opencvdistortion", "d1",
+)  # fmt: skip
+_ENTRIES = (
+    ("fx", "flx", "focalx", "fu"),
+    ("fy", "fly", "focaly", "fv"),
+    ("cx", "ppx", "u0", "pu"),
+    ("cy", "ppy", "v0", "pv"),
+)
+_RADIAL = ("radialdistortion", "radial", "radialcoefficients", "radialdistortioncoefficients", "radialcoeffs")
+_TANGENTIAL = (
+    "tangentialdistortion", "tangential", "tangentialcoefficients", "tangentialdistortioncoefficients",
+    "tangentialcoeffs",
+)  # fmt: skip
+_WIDTH = ("imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex")
+_HEIGHT = ("imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey")
+_SIZE = (
+    "imagesize", "imgsize", "resolution", "size", "dim", "dims", "imageresolution", "imagedimensions",
+    "dimensions", "framesize", "calibdimension", "cameraresolution", "imsize", "calibrationresolution",
+)  # fmt: skip
+_SHAPE = ("imageshape", "imgshape", "shape")  # NumPy's: height and width
+_NAME = ("cameraname",)
+
+# Keys whose text names the distortion model; an unknown word is refused in the first, ignored in the others.
+_MODEL = ("distortionmodel", "distmodel", "distortiontype", "disttype", "distortion")
+_KIND = (
+    "cameramodel", "calibrationmodel", "opencvmodel", "model", "cameratype", "projection", "projectionmodel",
+    "lensmodel", "lenstype", "modeltype", "type", "calibrationtype", "projectiontype", "lens",
+)  # fmt: skip
+_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye", "usefisheye", "useopencvfisheye")  # true or false
+_UNKNOWN = "unknown"
+# What the words mean, the first that is found; "" says nothing that a coefficient could contradict.
+_WORDS = (
+    (r"inverse|fov|atan|division|ocam|scaramuzza|thinprismfisheye|cahv|splined|ftheta|orthogr|stereogr|equisolid"
+     r"|equirect|spheric|cylind|panoram", _UNKNOWN),
+    (r"doublesphere|^ds$", "double_sphere"),
+    (r"eucm|extendedunified", "eucm"),
+    (r"omni|mei$|unified", "omnidir"),
+    (r"fisheye|kannala|^kb\d?$|equidist|^equi$", "equidistant"),
+    (r"rational", "rational_polynomial"),
+    (r"thinprism", "thin_prism"),
+    (r"^tilted", "tilted"),
+    (r"^rich$", "rich"),
+    (r"plumb|radtan|radialtang|brown|conrady|radial|polynom|standard", "plumb_bob"),
+    (r"^pinhole|perspective|^normal$|^opencv$|^cv2$|^regular$|^cv2calibratecamera$", "pinhole"),
+)  # fmt: skip
+_ALIKE = ("plumb_bob", "rational_polynomial", "thin_prism", "tilted", "pinhole")
+
+# Names of numbers that may be a distortion, and of some that are none.
+_SUSPECT = re.compile(r"dist(?!an|rib)|^kc|coef|radial|tangent")
+_SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")
+_HARMLESS = re.compile(
+    r"std|err|undist|newcam|uncert|sigma|limit|rms|perview|roi|optimal|thresh|flag|aspect|fix|rect|^est|valid"
+)
+_NO_LIST = re.compile(
+    r"roi|quat|rot|^q\d?$|rect|crop|box|board|pattern|size|color|time|pose|trans|orient|^[rtp]\d?$"
+)
+_LENGTHS = (4, 5, 8, 12, 14)
+
+
+def plain(name: str) -> str:
+    """A name in lower-case letters and digits."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def means(word: str) -> str | None:
+    """ROS's name of the distortion model that a word names, ``unknown``, or None if it names none."""
+    return next((model for pattern, model in _WORDS if re.search(pattern, plain(word))), None)
+
+
+def _is_numbers(value: Any) -> bool:
+    if isinstance(value, dict):
+        return "data" in value
+    if isinstance(value, (list, tuple)):
+        return bool(value) and all(map(_is_numbers, value))
+    if isinstance(value, str):
+        return is_number(value) is not None
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, dict):
+        return _count(value.get("data", []))
+    return sum(map(_count, value)) if isinstance(value, (list, tuple)) else 1
+
+
+def _is_matrix(value: Any) -> bool:
+    return not isinstance(value, (int, float, str)) and _is_numbers(value) and _count(value) == 9
+
+
+def _has_entries(value: Any) -> bool:
+    """Whether a mapping has fx, fy, cx and cy under one of their names."""
+    if not isinstance(value, dict):
+        return False
+    names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
+    return all(not names.isdisjoint(entry) for entry in _ENTRIES)
+
+
+class LooseKeys:
+    """The keys of a mapping by their plain names, and those that were read.
+
+    `distortion` is the model of the coefficients if the file does not say it, and `notes` are appended to.
+    """
+
+    def __init__(self, root: Field, distortion: str | None = None, notes: list[str] | None = None) -> None:
+        self.root, self.distortion = root, distortion
+        self.notes = [] if notes is None else notes
+        self.names: dict[str, list[str]] = {}
+        for key in root.value:
+            self.names.setdefault(plain(str(key)), []).append(key)
+        self.read: set[str] = set()
+
+    def find(
+        self, names: Iterable[str], side: str = "", fits: Callable[[Any], bool] = lambda _: True
+    ) -> Field | None:
+        """Value of the first of these names that is there and fits; a second one that differs is refused."""
+        forms = [form for name in names for form in ((name + side, side + name) if side else (name,))]
+        keys = [
+            key
+            for form in dict.fromkeys(forms)
+            for key in self.names.get(form, [])
+            if key in self.root and fits(self.root.value[key])
+        ]
+        if not keys:
+            return None
+        first = self.root[keys[0]]
+        for other in keys[1:]:
+            if _is_numbers(first.value) and _is_numbers(self.root.value[other]):
+                if _flat(self.root.value[other]) != _flat(first.value):
+                    self.root.refuse(f"{keys[0]} and {other} differ, and both may be meant; remove one")
+                self.read.add(other)
+        self.read.add(keys[0])
+        return first
+
+    def has_camera(self, side: str = "") -> bool:
+        """Whether there is a camera matrix, or its entries, under their usual names."""
+        matrix = any(
+            _is_matrix(self.root.value[key]) or (key != "k" and _has_entries(self.root.value[key]))
+            for name in _MATRIX
+            for form in ((name + side, side + name) if side else (name,))
+            for key in self.names.get(form, [])
+        )
+        return matrix or (not side and _has_entries(self.root.value))
+
+    def camera(self, side: str = "", name: str = "camera") -> Camera:
+        """Read the camera, or that of one side."""
+        intrinsics = self._intrinsics(side)
+        distortion = self._distortion(side)
+        stated = self.find(_NAME, side, lambda value: isinstance(value, (str, int)))
+        return Camera(
+            intrinsics, distortion, self.image_size(side), name if stated is None else stated.text()
+        )
+
+    def image_size(self, side: str = "") -> tuple[int, int] | None:
+        """Width and height [px]; None if they are unknown."""
+        sides = (side, "") if side else ("",)
+        width, height = (
+            next((field for s in sides if (field := self.find(names, s)) is not None), None)
+            for names in (_WIDTH, _HEIGHT)
+        )
+        if width is not None and height is not None:
+            size = width.integer(), height.integer()
+        else:
+            turned = False
+            field = next((f for s in sides if (f := self.find(_SIZE, s)) is not None), None)
+            if field is None:
+                turned, field = True, self.find(_SHAPE)
+            if field is None:
+                return None
+            if isinstance(field.value, dict) and "data" not in field.value:
+                return LooseKeys(field).image_size()
+            if isinstance(field.value, str):
+                numbers: list[float] = [int(n) for n in re.findall(r"\d+", field.value)]
+            else:
+                numbers = _flat(field.value)
+            if len(numbers) != 2 and not (turned and len(numbers) == 3):
+                field.fail("two whole numbers, width and height")
+            values = [Field(n, field.source, field.path).integer() for n in numbers]
+            size = (values[1], values[0]) if turned else (values[0], values[1])
+        if 0 in size:
+            return None
+        with value_failures(self.root.source):
+            return checked_size(size)
+
+    def refuse_unread(self) -> None:
+        """Refuse numbers that may be the distortion and were not read."""
+        for key, value in self.root.value.items():
+            name = plain(str(key))
+            if key in self.read or _HARMLESS.search(name) or not _is_numbers(value):
+                continue
+            numbers = _flat(value)
+            if isinstance(value, (list, dict)):
+                listed = len(numbers) in _LENGTHS and not _NO_LIST.search(name)
+                guess = not self.coefficients_read and listed and any(n != int(n) for n in numbers)
+                suspect = guess or _SUSPECT.search(name) is not None
+            else:
+                suspect = _SUSPECT_NUMBER.fullmatch(name) is not None
+            if suspect and any(numbers):
+                raise InputError(
+                    f"the key {str(key)[:60]!r} may be the distortion, and is not a known name of it; rename "
+                    "it to distortion_coefficients, or remove it"
+                )
+
+    coefficients_read = False
+
+    def _intrinsics(self, side: str) -> Intrinsics:
+        field = self.find(_MATRIX, side, lambda value: _is_matrix(value) or _has_entries(value))
+        if field is None and not side and _has_entries(self.root.value):
+            field = self.root
+        if field is None:
+            field = self.find(
+                [n for n in _MATRIX if len(n) > 1 or not side], side, lambda value: value is not None
+            )
+        if field is None:
+            keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
+            raise InputError(
+                "holds no camera matrix; give a file with the key camera_matrix, cameraMatrix or K"
+                f"{f' (its keys are {one_line(keys)})' if keys else ''}"
+            )
+        if isinstance(field.value, dict) and _has_entries(field.value):
+            entries = self if field is self.root else LooseKeys(field)
+            values = []
+            for names in _ENTRIES:
+                entry = entries.find(names, "", lambda value: not isinstance(value, (dict, list)))
+                assert entry is not None  # `_has_entries`
+                values.append(entry.number())
+            skew = entries.find(("skew", "s"), "", _is_numbers)
+            fx, fy, cx, cy = values
+            K = np.array([[fx, 0.0 if skew is None else skew.number(), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        elif (
+            isinstance(field.value, list)
+            and len(field.value) == 4
+            and plain(field.path).endswith("intrinsics")
+        ):
+            fx, fy, cx, cy = field.array(4)
+            K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        else:
+            K = matrix_data(field, 9).reshape(3, 3)
+        if not K.any():
+            raise InputError(f"{field.path} is 0: the camera is not calibrated; calibrate it first")
+        if K[2, 2] != 1:
+            raise InputError(
+                f"{field.path}: its last entry must be 1, found {K[2, 2]:g}; divide the matrix by it"
+            )
+        try:
+            return Intrinsics.from_matrix(K)
+        except InputError as error:
+            raise InputError(f"{field.path}: {error}; correct it") from error
+
+    def _stated_model(self, side: str) -> str | None:
+        """ROS's name of the distortion model that the file states; None if it states none."""
+        stated: dict[str, str] = {}
+        for names in (_MODEL, _KIND):
+            for s in dict.fromkeys((side, "")):
+                field = self.find(names, s, lambda value: isinstance(value, str))
+                if field is None:
+                    continue
+                word = field.text()
+                model = means(word) if word.strip() else "plumb_bob" if names is _MODEL else None
+                if names is _MODEL and model is None:
+                    model = "none" if plain(word) in ("none", "nodistortion") else word
+                if model is not None:
+                    stated.setdefault(model, field.text())
+                    break
+        for name in () if side and stated else _FISHEYE:
+            field = self.find((name,), "", lambda v: v in (0, 1, True, False, "true", "false", "0", "1"))
+            if field is not None:
+                yes = field.value in (1, True, "true", "1")
+                stated.setdefault("equidistant" if yes else "plumb_bob", f"{field.path} {field.value}")
+        strong = [model for model in stated if model != "pinhole"]
+        kinds = {"plumb_bob" if model in _ALIKE else model for model in strong}
+        if len(kinds) > 1:
+            words = " and ".join(repr(stated[model][:40]) for model in strong)
+            raise InputError(f"names two distortion models, {words}; remove the one that is not meant")
+        if strong:
+            return next((model for model in strong if model != "plumb_bob"), strong[0])
+        return "plumb_bob" if stated else None
+
+    def _distortion(self, side: str) -> Distortion:
+        xi = self.find(("xi",), side, _is_numbers)
+        coefficients, named = self._coefficients(side)
+        model = self._stated_model(side)
+        if coefficients is None:
+            if xi is not None:
+                raise InputError(
+                    "has xi of an omnidirectional camera without its distortion; add D, or zeros"
+                )
+            return Distortion()
+        self.coefficients_read = True
+        if model == _UNKNOWN:
+            if coefficients.any():
+                raise InputError(
+                    "its distortion model is not known here; calibrate with OpenCV's model or its fisheye, "
+                    "or with neurocal from the points"
+                )
+            return Distortion()
+        if model == "none":
+            if coefficients.any():
+                raise InputError("states that there is no distortion, and has coefficients of it; remove one")
+            return Distortion()
+        if xi is not None:
+            return _omnidirectional(xi, coefficients, "omnidir" if model is None else model)
+        if model is None and self.distortion is not None:
+            return _given(self.distortion, coefficients)
+        if model is None and len(coefficients) == 4 and coefficients.any() and not named:
+            raise InputError(
+                "has four distortion coefficients, and does not say whether they are k1, k2, p1, p2 of an "
+                "ordinary lens or k1 to k4 of a fisheye; give --distortion k1k2p1p2 or --distortion fisheye"
+            )
+        return Distortion(*from_ros(model or "plumb_bob", coefficients))
+
+    def _coefficients(self, side: str) -> tuple[Array | None, bool]:
+        """Coefficients in OpenCV's order, and whether their names tell that p1 and p2 are among them."""
+        field = self.find(_COEFFICIENTS, side, lambda v: not isinstance(v, (str, int, float)))
+        if field is not None:
+            if isinstance(field.value, dict) and "data" not in field.value:
+                inner = LooseKeys(field)
+                found = inner._coefficients("")
+                inner.refuse_unread()
+                return found
+            return matrix_data(field, -1), False
+        radial = self.find(_RADIAL, side, _is_numbers)
+        if radial is not None:
+            tangential = self.find(_TANGENTIAL, side, _is_numbers)
+            k = (
+                matrix_data(radial, -1)
+                if not isinstance(radial.value, (int, float))
+                else np.array([radial.number()])
+            )
+            p = np.zeros(2) if tangential is None else matrix_data(tangential, 2)
+            if len(k) not in (1, 2, 3, 6):
+                radial.fail("2, 3 or 6 numbers")
+            return np.array([*[*k, 0.0][:2], *p, *k[2:]]), True
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        values = {}
+        for name in names:
+            entry = self.find((name,), side, lambda v: _is_numbers(v) and not isinstance(v, (list, dict)))
+            if entry is not None:
+                values[name] = entry.number()
+        if not values:
+            return None, False
+        if "k4" in values and not {"p1", "p2", "k5", "k6"} & set(values):  # as in a fisheye
+            return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
+        full = [values.get(name, 0.0) for name in names]
+        return np.array(full if any(full[5:]) else full[:5]), True
+
+
+def _flat(value: Any) -> list[float]:
+    """The numbers in nested lists, or in a matrix."""
+    if isinstance(value, dict):
+        return _flat(value.get("data", []))
+    if isinstance(value, (list, tuple)):
+        return [number for entry in value for number in _flat(entry)]
+    return [float(value)] if _is_numbers(value) else [float("nan")]
+
+
+def _omnidirectional(xi: Field, coefficients: Array, model: str) -> Distortion:
+    """Distortion of OpenCV's omnidirectional camera, whose xi is a separate key."""
+    value = xi.number() if isinstance(xi.value, (int, float)) else float(matrix_data(xi, 1)[0])
+    if model != "omnidir" or len(coefficients) != 4:
+        raise InputError(
+            f"has xi of an omnidirectional camera, and {len(coefficients)} coefficients of the distortion "
+            f"model {model[:40]!r}; give k1, k2, p1, p2, and omnidir or no model"
+        )
+    return Distortion("omnidir", np.array([value, *coefficients]))
+
+
+def _given(model: str, coefficients: Array) -> Distortion:
+    """Coefficients of the model that the caller names, in OpenCV's order."""
+    names = MODELS[model]
+    fewest = len(names) if model in WIDE else 0
+    if len(coefficients) < fewest or coefficients[len(names) :].any():
+        raise InputError(
+            f"has {len(coefficients)} distortion coefficients, and {model} has {len(names)}; give another "
+            "--distortion"
+        )
+    return Distortion(model, coefficients[: len(names)])

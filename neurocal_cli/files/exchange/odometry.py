@@ -1,0 +1,325 @@
+"""Formats of visual odometry and of its data sets: ORB-SLAM, VINS, EuRoC, Basalt, OKVIS, SVO and KITTI.
+
+Where a program states the pose of each camera in a body, the poses between the cameras follow; the pose of a
+single camera becomes its view ``body``. The centre of the first pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, find, transform
+from neurocal_cli.files.exchange.camera_set import (
+    CameraSet,
+    Format,
+    from_quaternion,
+    inverse,
+    mounted,
+    to_quaternion,
+)
+from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.tree_texts import (
+    EIGHT,
+    FIVE,
+    K4,
+    RADTAN,
+    json_text,
+    one,
+    single,
+    under,
+    yaml_text,
+)
+from neurocal_cli.files.tree_fields import Field
+
+# ORB-SLAM2 and 3.
+
+
+def _orb(camera: str) -> CameraKeys:
+    return CameraKeys(
+        "ORB-SLAM",
+        under(camera, "fx", "fy", "cx", "cy"),
+        (
+            Lens(("PinHole", "Rectified"), "k1k2p1p2", under(camera, *RADTAN)),
+            Lens(("PinHole", "Rectified"), "plumb_bob", under(camera, *FIVE)),
+            Lens(("KannalaBrandt8",), "fisheye", under(camera, *K4)),
+        ),
+        model="Camera.type",
+        size=("Camera.width", "Camera.height"),
+    )
+
+
+def _read_orb(document: Document) -> CameraSet:
+    root = document.root
+    if "LEFT.K" in root:
+        document.notes.append(
+            f"{document.source}: Camera.fx to Camera.cy are of the rectified images; LEFT.K, RIGHT.K and the "
+            "rest of the original cameras are not read"
+        )
+    first = _orb("Camera1." if "Camera1.fx" in root else "Camera.").camera(root)
+    if "Camera2.fx" not in root:
+        return CameraSet((first,), program="ORB-SLAM")
+    second = _orb("Camera2.").camera(root, "right")
+    poses = [Pose(np.eye(3), np.zeros(3)), inverse(transform(root["Stereo.T_c1_c2"]))]
+    return mounted([replace(first, name="left"), second], poses, "ORB-SLAM")
+
+
+def _is_orb(document: Document) -> bool:
+    return "Camera.fx" in document.tree or "Camera1.fx" in document.tree
+
+
+ORB_SLAM = Format(
+    "ORB-SLAM",
+    _orb("Camera.").models,
+    single(_orb("Camera."), lambda tree: yaml_text(tree, "%YAML:1.0\n---\n")),
+    _is_orb,
+    _read_orb,
+    files="settings of ORB-SLAM2 and 3, YAML",
+    most_cameras=1,
+)
+
+# VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.
+_D, _P = "distortion_parameters/", "projection_parameters/"
+_VINS = CameraKeys(
+    "VINS",
+    under(_P, "fx", "fy", "cx", "cy"),
+    (
+        Lens(("PINHOLE",), "k1k2p1p2", under(_D, *RADTAN)),
+        Lens(
+            ("MEI",),
+            "omnidir",
+            ("mirror_parameters/xi", *under(_D, *RADTAN)),
+            under(_P, "gamma1", "gamma2", "u0", "v0"),
+        ),
+        Lens(
+            ("KANNALA_BRANDT",),
+            "fisheye",
+            under(_P, "k2", "k3", "k4", "k5"),
+            under(_P, "mu", "mv", "u0", "v0"),
+        ),
+    ),
+    model="model_type",
+    size=("image_width", "image_height"),
+    name="camera_name",
+)
+VINS = Format(
+    "VINS",
+    _VINS.models,
+    single(_VINS, lambda tree: yaml_text(tree, "%YAML:1.0\n---\n")),
+    lambda document: "model_type" in document.tree and "projection_parameters" in document.tree,
+    one(_VINS),
+    files="VINS-Mono, VINS-Fusion, camodocal: YAML",
+    most_cameras=1,
+)
+
+# EuRoC's sensor.yaml: T_BS maps the camera to the body.
+_EUROC = CameraKeys(
+    "EuRoC",
+    ("intrinsics:list",),
+    (
+        Lens(("radial-tangential", "radtan", "plumb_bob"), "k1k2p1p2", ("distortion_coefficients",)),
+        Lens(("equidistant", "equi"), "fisheye", ("distortion_coefficients",)),
+    ),
+    model="distortion_model",
+    size=("resolution",),
+    constants={"sensor_type": "camera", "camera_model": "pinhole"},
+)
+
+
+def _read_euroc(document: Document) -> CameraSet:
+    root = document.root
+    if (model := find(root, "camera_model")) is not None and model.text() != "pinhole":
+        model.fail("pinhole")
+    pose = inverse(transform(root["T_BS"])) if "T_BS" in root else None
+    return mounted([_EUROC.camera(root)], [pose], "EuRoC")
+
+
+EUROC = Format(
+    "EuRoC",
+    _EUROC.models,
+    single(_EUROC, yaml_text),
+    lambda document: (
+        document.tree.get("sensor_type") == "camera" or {"T_BS", "intrinsics"} <= set(document.tree)
+    ),
+    _read_euroc,
+    files="sensor.yaml of the EuRoC data set",
+    most_cameras=1,
+    needs_size=True,
+    frame="body",
+)
+
+# Basalt: lists of cameras, of their sizes, and of their poses into the IMU.
+_BASALT = CameraKeys(
+    "Basalt",
+    under("intrinsics/", "fx", "fy", "cx", "cy"),
+    (
+        Lens(("pinhole",), "none", ()),
+        Lens(("pinhole-radtan8",), "rational", under("intrinsics/", *EIGHT)),
+        Lens(("kb4",), "fisheye", under("intrinsics/", *K4)),
+        Lens(("ds",), "double_sphere", under("intrinsics/", "xi", "alpha")),
+        Lens(("eucm",), "eucm", under("intrinsics/", "alpha", "beta")),
+    ),
+    model="camera_type",
+)
+
+
+def _read_basalt(document: Document) -> CameraSet:
+    root = document.root.get("value0", document.tree)
+    sizes = [tuple(side.integer() for side in size.items()) for size in root["resolution"].items()]
+    cameras = [_BASALT.camera(one, f"cam{k}") for k, one in enumerate(root["intrinsics"].items())]
+    if len(sizes) != len(cameras) or any(len(size) != 2 for size in sizes):
+        root["resolution"].fail(f"width and height of {len(cameras)} cameras")
+    sized = [
+        replace(camera, image_size=(size[0], size[1])) for camera, size in zip(cameras, sizes, strict=True)
+    ]
+    poses: list[Pose | None] = [None] * len(cameras)
+    for k, entry in enumerate(root["T_imu_cam"].items() if "T_imu_cam" in root else ()):
+        q = [entry[key].number() for key in ("qw", "qx", "qy", "qz")]
+        t = np.array([entry[key].number() for key in ("px", "py", "pz")])
+        if k < len(poses) and any(q):
+            poses[k] = inverse(Pose(from_quaternion(np.array(q)), t))
+    return mounted(sized, poses, "Basalt", frame="imu")
+
+
+def _basalt_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    poses = []
+    for pose in map(inverse, cameras.mounted):
+        q, t = to_quaternion(pose.R).tolist(), pose.t.tolist()
+        poses.append(dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), [*t, *q[1:], q[0]], strict=True)))
+    tree = {
+        "T_imu_cam": poses,
+        "intrinsics": [_BASALT.tree(camera) for camera in cameras.cameras],
+        "resolution": [list(camera.image_size or (0, 0)) for camera in cameras.cameras],
+    }
+    return {"": json_text({"value0": tree})}
+
+
+BASALT = Format(
+    "Basalt",
+    _BASALT.models,
+    _basalt_text,
+    lambda document: (
+        {"intrinsics", "resolution"} <= set(document.tree.get("value0", document.tree) or ())
+        and "camera_type" in str(document.tree)[:100_000]
+    ),
+    _read_basalt,
+    files="calibration.json",
+    most_cameras=99,
+    metres=True,
+    needs_size=True,
+    frame="the IMU, of a single camera",
+)
+
+# OKVIS and SVO: lists of cameras with their poses into the body.
+_OKVIS = CameraKeys(
+    "OKVIS",
+    ("focal_length/0", "focal_length/1", "principal_point/0", "principal_point/1"),
+    (
+        Lens(("radialtangential",), "k1k2p1p2", ("distortion_coefficients",)),
+        Lens(("equidistant",), "fisheye", ("distortion_coefficients",)),
+        Lens(("radialtangential8",), "rational", ("distortion_coefficients",)),
+        Lens(("none",), "none", ()),
+    ),
+    model="distortion_type",
+    size=("image_dimension",),
+)
+_SVO = CameraKeys(
+    "SVO",
+    ("camera/intrinsics:column",),
+    (
+        Lens(("radial-tangential",), "k1k2p1p2", ("camera/distortion/parameters:column",)),
+        Lens(("equidistant",), "fisheye", ("camera/distortion/parameters:column",)),
+        Lens(("none",), "none", ()),
+    ),
+    model="camera/distortion/type",
+    size=("camera/image_width", "camera/image_height"),
+    name="camera/label",
+)
+
+
+def _listed(keys: CameraKeys, pose: str) -> Callable[[Document], CameraSet]:
+    def read(document: Document) -> CameraSet:
+        parts = list(document.root["cameras"].items())
+        poses = [inverse(transform(part[pose])) if pose in part else None for part in parts]
+        cameras = [keys.camera(part, f"cam{k}") for k, part in enumerate(parts)]
+        return mounted(cameras, poses, keys.program)
+
+    return read
+
+
+def _first_camera(document: Document) -> Mapping[str, Any]:
+    cameras = document.tree.get("cameras")
+    first = cameras[0] if isinstance(cameras, list) and cameras else {}
+    return first if isinstance(first, dict) else {}
+
+
+OKVIS = Format(
+    "OKVIS",
+    matches=lambda document: "focal_length" in _first_camera(document),
+    read=_listed(_OKVIS, "T_SC"),
+    files="its configuration, YAML",
+    most_cameras=99,
+    metres=True,
+    frame="body, of a single camera",
+)
+SVO = Format(
+    "SVO",
+    matches=lambda document: "camera" in _first_camera(document),
+    read=_listed(_SVO, "T_B_C"),
+    files="SVO, rpg_vikit, maplab: YAML",
+    most_cameras=99,
+    metres=True,
+    frame="body, of a single camera",
+)
+
+# KITTI: cameras of the recording, each posed relative to the first, and rectified ones of the odometry.
+_KITTI = CameraKeys("KITTI", ("K:matrix",), (Lens(("",), "plumb_bob", ("D",)),), size=("S",))
+
+
+def _kitti_lines(text: str) -> dict[str, list[float]]:
+    found = {}
+    for line in text.splitlines():
+        key, colon, rest = line.partition(":")
+        try:
+            found[key.strip()] = [float(word) for word in rest.split()] if colon else []
+        except ValueError:  # calib_time
+            continue
+    return found
+
+
+def _read_kitti(document: Document) -> CameraSet:
+    lines = _kitti_lines(document.text)
+    ids = sorted(key[2:] for key in lines if key.startswith("K_"))
+    if not ids:
+        return _rectified_kitti(document, lines)
+    cameras, poses = [], []
+    for k in ids:
+        part = Field({key: lines.get(f"{key}_{k}", []) for key in "SKDRT"}, document.source)
+        cameras.append(_KITTI.camera(part, f"image_{k}"))
+        poses.append(Pose(part["R"].array(9).reshape(3, 3), part["T"].array(3)))
+    return mounted(cameras, poses, "KITTI")
+
+
+def _rectified_kitti(document: Document, lines: Mapping[str, Sequence[float]]) -> CameraSet:
+    cameras, poses = [], []
+    for key in sorted(key for key in lines if key[:1] == "P" and key[1:].isdecimal()):
+        P = Field(list(lines[key]), document.source, key).array(12).reshape(3, 4)
+        cameras.append(
+            _KITTI.camera(Field({"K": P[:, :3].tolist(), "D": [0.0]}, document.source), f"image_{key[1:]}")
+        )
+        poses.append(Pose(np.eye(3), np.asarray(np.linalg.solve(P[:, :3], P[:, 3]), dtype=float)))
+    return mounted(cameras, poses, "KITTI")
+
+
+KITTI = Format(
+    "KITTI",
+    matches=lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),
+    read=_read_kitti,
+    files="calib_cam_to_cam.txt; calib.txt of the odometry",
+    most_cameras=99,
+    metres=True,
+)
