@@ -419,8 +419,9 @@ DIALECTS: dict[str, tuple[list[float], list[Any]]] = {
     '{"fl_x": 800, "fl_y": 801, "cx": 320.5, "cy": 240.5, "w": 640, "h": 480, "k1": -0.3, "k2": 0.1, '
     '"p1": 0.001, "p2": 0.002, "camera_model": "OPENCV", "frames": []}': (CAMERA, FIVE[:4]),
     '<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n  <projection>frame</projection>\n'
-    "  <width>640</width>\n  <height>480</height>\n  <f>801</f>\n  <cx>0.5</cx>\n  <cy>0.5</cy>\n  <b1>-1</b1>\n"
-    "  <k1>-0.3</k1>\n  <k2>0.1</k2>\n  <k3>0.05</k3>\n  <p1>0.002</p1>\n  <p2>0.001</p2>\n</calibration>\n": (CAMERA, FIVE),
+    "  <width>640</width>\n  <height>480</height>\n  <f>801</f>\n  <cx>0.5</cx>\n  <cy>0.5</cy>\n"
+    "  <b1>-1</b1>\n  <k1>-0.3</k1>\n  <k2>0.1</k2>\n  <k3>0.05</k3>\n  <p1>0.002</p1>\n"
+    "  <p2>0.001</p2>\n</calibration>\n": (CAMERA, FIVE),
     '{"IntrinsicMatrix": [[800, 0, 0], [0, 801, 0], [321, 241, 1]], "RadialDistortion": [-0.3, 0.1, 0.05], '
     '"TangentialDistortion": [0.001, 0.002], "ImageSize": [480, 640]}': (CAMERA, FIVE),
     "S_00: 640 480\nK_00: 800 0 320 0 801 240 0 0 1\n"

@@ -82,6 +82,10 @@ _ORI = re.compile(r"\s*".join([r"(?:\s*[-+.\deE]+){3}"] * 5) + r"(?:\s+[-+.\deE]
 # What is known and cannot be read: how to tell it, what it is, and what to do.
 _REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
     (
+        lambda d: {"projection", "f", "u0"} <= set(d.tree),
+        "is the file of an undistorted panorama; give the camera of the original images",
+    ),
+    (
         lambda d: d.data.startswith(b"\x89HDF"),
         "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7",
     ),
