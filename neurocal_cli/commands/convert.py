@@ -248,7 +248,6 @@ def _write_cameras(
     from neurocal_cli.files.exchange.reading import FORMATS
 
     wanted = FORMATS[target]
-    assert wanted.text is not None  # all of these are written
     adapted = adapt_cameras(cameras, wanted, force, model)
     contents = wanted.text(adapted.cameras, os.path.splitext(output)[1].lower())
     if set(contents) == {""}:

@@ -57,7 +57,6 @@ def write_result(
         from neurocal_cli.files.exchange.neurocal import camera_set
 
         adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
-        assert OPENCV.text is not None  # it is written
         write_whole(path, OPENCV.text(adapted.cameras, ending)[""])
         return (*adapted.losses, *adapted.remarks)
     by_rows = ending == ".json"  # JSON loads fast at any length

@@ -75,17 +75,21 @@ class CameraSet:
         )
 
 
+def _not_written(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
+    raise InputError(f"files like that of {cameras.program} are not written; choose another format")
+
+
 @frozen_dataclass
 class Format:
     """A file format: what it is like, how it is recognised and read, and how cameras that fit it are written.
 
-    A format without `text` is read only, one without `read` is written only.
+    One without `text` is not written, one without `read` not read.
     """
 
     program: str  # name for messages
     models: tuple[str, ...] = ()  # our names of its distortion models, the simplest first
     # From the cameras and the extension of the output, such as ".xml": the files by name, "" if there is one.
-    text: Callable[[CameraSet, str], Mapping[str, str | bytes]] | None = None
+    text: Callable[[CameraSet, str], Mapping[str, str | bytes]] = _not_written
     matches: Callable[[Document], object] | None = None
     read: Callable[[Document], CameraSet] | None = None
     files: str = ""  # its files, for the documentation
