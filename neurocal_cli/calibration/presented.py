@@ -10,7 +10,10 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.late_import import late
 from neurocal_cli.errors import UsageError
 
-Program = Literal["neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz", "dlt"]
+Program = Literal[
+    "neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz", "dlt", "nerfstudio",
+    "anipose", "orb-slam", "vins", "basalt", "euroc", "open3d", "metashape", "gyroflow",
+]  # fmt: skip
 
 
 @frozen_dataclass(eq=False)
