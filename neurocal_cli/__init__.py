@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.drift import Drift, find_drift
     from neurocal_cli.calibration.evaluation import evaluate_camera
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_rig
-    from neurocal_cli.calibration.rig.camera_rig import CameraRig
-    from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
     from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.rectification import rectify
     from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_camera_rig
+    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import triangulate
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.fit import fit_lens, fit_lens_cameras
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
     from neurocal_cli.files.calibration_tree import read_calibration
-    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
     from neurocal_cli.files.images import read_image
     from neurocal_cli.files.lens_points import read_lens_data, read_lens_points
     from neurocal_cli.files.lens_yaml import read_lens, write_lens
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from neurocal_cli.files.result_files import write_calibration, write_rig
     from neurocal_cli.files.rig_points import read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig
+    from neurocal_cli.files.stereo_yaml import read_stereo_rig
     from neurocal_cli.observations.board import Board
     from neurocal_cli.observations.points import Correspondences
     from neurocal_cli.observations.target import Target
@@ -60,7 +60,7 @@ _HOMES = {
     "Board": "observations.board",
     "Calibration": "calibration.calibration",
     "Camera": "camera.camera",
-    "CameraRig": "calibration.rig.camera_rig",
+    "Rig": "calibration.rig.rig",
     "Correspondences": "observations.points",
     "Detection": "detection.detect",
     "Distortion": "camera.distortion",
@@ -68,7 +68,7 @@ _HOMES = {
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
     "Pose": "camera.pinhole",
-    "Rig": "calibration.rig.rig",
+    "StereoRig": "calibration.rig.stereo_rig",
     "Target": "observations.target",
     "Verdict": "calibration.calibration",
     "ZoomLens": "calibration.zoom.zoom_lens",
@@ -79,25 +79,25 @@ _HOMES = {
     "camera_at": "calibration.zoom.zoom_lens",
     "detect_points": "detection.detect",
     "evaluate_camera": "calibration.evaluation",
-    "evaluate_camera_rig": "calibration.rig.rig_evaluation",
+    "evaluate_rig": "calibration.rig.rig_evaluation",
     "evaluate_lens": "calibration.zoom.evaluation",
-    "evaluate_rig": "calibration.rig.evaluation",
+    "evaluate_stereo_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
     "find_board": "detection.board_size",
     "find_drift": "calibration.drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",
-    "fit_rig": "calibration.rig.calibrate_stereo",
+    "fit_stereo": "calibration.rig.calibrate_stereo",
     "plot": "commands.show.results",
     "read_board": "files.board_yaml",
     "read_calibration": "files.calibration_tree",
-    "read_camera_rig": "files.camera_rig_yaml",
+    "read_rig": "files.rig_yaml",
     "read_image": "files.images",
     "read_lens": "files.lens_yaml",
     "read_lens_data": "files.lens_points",
     "read_lens_points": "files.lens_points",
     "read_points": "files.points_csv",
-    "read_rig": "files.rig_yaml",
+    "read_stereo_rig": "files.stereo_yaml",
     "read_rig_points": "files.rig_points",
     "rectify": "calibration.rig.rectification",
     "report": "commands.show.results",
@@ -115,7 +115,6 @@ __all__ = [
     "Board",
     "Calibration",
     "Camera",
-    "CameraRig",
     "Correspondences",
     "Detection",
     "Distortion",
@@ -124,6 +123,7 @@ __all__ = [
     "NeurocalError",
     "Pose",
     "Rig",
+    "StereoRig",
     "Target",
     "Verdict",
     "ZoomLens",
@@ -134,19 +134,18 @@ __all__ = [
     "camera_at",
     "detect_points",
     "evaluate_camera",
-    "evaluate_camera_rig",
     "evaluate_lens",
     "evaluate_rig",
     "evaluate_stereo",
+    "evaluate_stereo_rig",
     "find_board",
     "find_drift",
     "fit_lens",
     "fit_lens_cameras",
-    "fit_rig",
+    "fit_stereo",
     "plot",
     "read_board",
     "read_calibration",
-    "read_camera_rig",
     "read_image",
     "read_lens",
     "read_lens_data",
@@ -154,6 +153,7 @@ __all__ = [
     "read_points",
     "read_rig",
     "read_rig_points",
+    "read_stereo_rig",
     "rectify",
     "report",
     "triangulate",

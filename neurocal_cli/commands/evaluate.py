@@ -16,7 +16,7 @@ from neurocal_cli.errors import UsageError
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
-    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Method
     from neurocal_cli.observations.points import Correspondences
 
@@ -227,7 +227,7 @@ def stereo(
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
-    from neurocal_cli.commands.show.rig_report import (
+    from neurocal_cli.commands.show.stereo_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
@@ -283,17 +283,17 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
 
     named = [named_file(word) for word in points]
     preparation.check_one_stdin(file, *(name for _, name in named))
-    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_camera_rig
-    from neurocal_cli.commands.show.camera_rig_report import rig_evaluation_json, rig_evaluation_tables
+    from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
+    from neurocal_cli.commands.show.rig_report import rig_evaluation_json, rig_evaluation_tables
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
-    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
     from neurocal_cli.files.rig_points import read_rig_points
+    from neurocal_cli.files.rig_yaml import read_rig
 
-    found, notes = read_camera_rig(file), list[str]()
+    found, notes = read_rig(file), list[str]()
     given = read_rig_points(named, notes) if named else None
     note(*notes)
-    evaluation = evaluate_camera_rig(found, given)
+    evaluation = evaluate_rig(found, given)
     if evaluation.n_behind:
         warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
     if as_json:
@@ -304,15 +304,15 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
 
 def _evaluate_stereo(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: Method
-) -> tuple[StereoEvaluation, Rig | None]:
+) -> tuple[StereoEvaluation, StereoRig | None]:
     """Evaluate the rig of a file, or two calibrations, of which no rig is known."""
-    from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 
     if len(cameras) == 1:
-        from neurocal_cli.files.rig_yaml import read_rig
+        from neurocal_cli.files.stereo_yaml import read_stereo_rig
 
-        rig = read_rig(cameras[0])
-        return evaluate_rig(rig, points, method=method), rig
+        rig = read_stereo_rig(cameras[0])
+        return evaluate_stereo_rig(rig, points, method=method), rig
     from neurocal_cli.files.calibration_tree import read_calibration
 
     if points is None:

@@ -19,8 +19,8 @@ from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 
 _PICTURES = (".png", ".pdf", ".svg")
 
@@ -96,17 +96,17 @@ html_option = options.path(
 )
 
 
-def write_page(html: str | None, result: Calibration | Rig | CameraRig, *inputs: str | None) -> None:
+def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs: str | None) -> None:
     """Write the page about a result from these input files; does nothing without a name."""
     if html is None:
         return
     import hashlib
     import shlex
 
-    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.commands.show.html_page import Origin, versions
-    from neurocal_cli.commands.show.html_reports import calibration_page, camera_rig_page, rig_page
+    from neurocal_cli.commands.show.html_reports import calibration_page, rig_page, stereo_page
 
     files = {}
     for name in inputs:
@@ -115,8 +115,10 @@ def write_page(html: str | None, result: Calibration | Rig | CameraRig, *inputs:
             files[source] = hashlib.sha256(data).hexdigest()
     typed = click.get_current_context().meta.get(TYPED, ())
     origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
-    if isinstance(result, CameraRig):
-        text = camera_rig_page(result, origin)
+    if isinstance(result, Rig):
+        text = rig_page(result, origin)
     else:
-        text = rig_page(result, origin) if isinstance(result, Rig) else calibration_page(result, origin)
+        text = (
+            stereo_page(result, origin) if isinstance(result, StereoRig) else calibration_page(result, origin)
+        )
     write_whole(html, text)

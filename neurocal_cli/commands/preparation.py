@@ -14,8 +14,8 @@ from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
-    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
 
@@ -135,7 +135,7 @@ def calibration_or_camera(
     return camera_of(camera), points
 
 
-def warn_of_poor(rig: Rig | CameraRig, so: str = "") -> None:
+def warn_of_poor(rig: StereoRig | Rig, so: str = "") -> None:
     """Warn of a rig whose verdict is poor, with the first reason and what follows from it."""
     verdict = rig.verdict
     if verdict is not None and verdict.word == "poor":

@@ -18,7 +18,7 @@ from neurocal_cli.files.writing import make_folder, write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.rectification import RectifiedPair, RowError
-    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.camera.remapping import Remapping
     from neurocal_cli.files.exchange.camera_set import CameraSet
     from neurocal_cli.observations.points import Correspondences
@@ -148,26 +148,26 @@ def _sides(files: Sequence[str]) -> _Paths:
     return left, right
 
 
-def _pair(cameras: CameraSet, file: str, names: tuple[str, str] | None) -> Rig:
+def _pair(cameras: CameraSet, file: str, names: tuple[str, str] | None) -> StereoRig:
     """Two cameras of a file as a stereo rig."""
-    from neurocal_cli.files.exchange.neurocal import as_camera_rig, as_rig
+    from neurocal_cli.files.exchange.neurocal import as_rig, as_stereo
 
     count = len(cameras.cameras)
     if names is not None and count > 1:
-        return as_camera_rig(cameras).pair(*names)
+        return as_rig(cameras).pair(*names)
     if count > 2:
         told = ", ".join(camera.name for camera in cameras.cameras)
         raise UsageError(f"{file} holds {count} cameras ({told}); choose two by --cameras LEFT RIGHT")
     if count < 2:
         raise FormatError(f"holds {plural(count, 'camera')}; give the file of a rig of two or more", file)
-    return as_rig(cameras)
+    return as_stereo(cameras)
 
 
 @dataclass
 class _Work:
     """A rig, its rectified cameras, and the folders of the results."""
 
-    rig: Rig
+    rig: StereoRig
     pair: RectifiedPair
     interpolation: str
     output: str

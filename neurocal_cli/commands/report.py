@@ -73,7 +73,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
     from neurocal_cli.commands.show.html_page import Origin
-    from neurocal_cli.commands.show.html_reports import calibration_page, lens_page, rig_page
+    from neurocal_cli.commands.show.html_reports import calibration_page, lens_page, stereo_page
 
     if "neurocal_lens" in root:
         from neurocal_cli.files.lens_yaml import lens_from_field
@@ -82,23 +82,23 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
             raise UsageError("the page of a zoom lens shows no photographs; leave out --images")
         return lens_page(lens_from_field(root), Origin(files))
     if "stereo" in root:
-        from neurocal_cli.files.rig_yaml import rig_from_field
+        from neurocal_cli.files.stereo_yaml import stereo_from_field
 
-        rig = rig_from_field(root)
+        rig = stereo_from_field(root)
         words = images * (3 - len(images))
         shown = [
             _photographs(camera, word, 2) for camera, word in zip((rig.left, rig.right), words, strict=False)
         ]
         origin = Origin(files, versions=_versions(root["left"]))
-        return rig_page(rig, origin, (shown[0], shown[1]) if shown else None)
+        return stereo_page(rig, origin, (shown[0], shown[1]) if shown else None)
     if "rig" in root and "cameras" in root:
-        from neurocal_cli.commands.show.html_reports import camera_rig_page
-        from neurocal_cli.files.camera_rig_yaml import camera_rig_from_field
+        from neurocal_cli.commands.show.html_reports import rig_page
+        from neurocal_cli.files.rig_yaml import rig_from_field
 
         if images:
             raise UsageError("the page of a rig of named cameras shows no photographs; leave out --images")
-        found = camera_rig_from_field(root)
-        return camera_rig_page(found, Origin(files, versions=_versions(root["cameras"][found.first])))
+        found = rig_from_field(root)
+        return rig_page(found, Origin(files, versions=_versions(root["cameras"][found.first])))
     from neurocal_cli.files.calibration_tree import calibration_from_field
 
     calibration = calibration_from_field(root)

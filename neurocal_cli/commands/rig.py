@@ -130,7 +130,7 @@ def rig(
     preparation.check_one_stdin(*inputs, *(file for _, file in known))
     preparation.check_outputs((output, plot, html), (*inputs, *(file for _, file in known)))
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-    from neurocal_cli.commands.show.camera_rig_report import camera_rig_json, camera_rig_report
+    from neurocal_cli.commands.show.rig_report import rig_json, rig_report
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
 
@@ -163,12 +163,12 @@ def rig(
     with ProgressBar() as progress:
         found = calibrate_rig(points, camera_options, outliers=estimation.outliers, progress=progress)
     if plot is not None:
-        from neurocal_cli.commands.show.plot_pages import draw_camera_rig
+        from neurocal_cli.commands.show.plot_pages import draw_rig
 
-        write_plot(plot, draw_camera_rig, found)
+        write_plot(plot, draw_rig, found)
     warn(*write_result(found, output, lean=lean))
     write_page(html, found, *inputs)
-    conclude(found, as_json, camera_rig_json, camera_rig_report)
+    conclude(found, as_json, rig_json, rig_report)
 
 
 def named_file(word: str) -> tuple[str, str]:

@@ -294,8 +294,8 @@ def _rig(
         raise UsageError(f"--rig {words}: give the layout and the number of cameras, such as ring:8")
     import numpy as np
 
-    from neurocal_cli.commands.show.camera_rig_report import rig_study_json, rig_study_table
     from neurocal_cli.commands.show.methods_report import text_of
+    from neurocal_cli.commands.show.rig_report import rig_study_json, rig_study_table
     from neurocal_cli.simulation.rigs import study_rig
 
     with ProgressBar() as progress:

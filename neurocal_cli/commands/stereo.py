@@ -130,7 +130,7 @@ def stereo(
         raise UsageError("-o and --ros name the same file twice; give three different files")
     preparation.check_outputs((output, html, *ros_files, *(file for _, file in plots)), inputs)
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
-    from neurocal_cli.commands.show.rig_report import rig_json, rig_report, views_alone
+    from neurocal_cli.commands.show.stereo_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
 
     prepared = [
@@ -140,18 +140,18 @@ def stereo(
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     if plots:
-        from neurocal_cli.commands.show.plot_pages import draw_rig
+        from neurocal_cli.commands.show.plot_pages import draw_stereo
 
-        write_plots(plots, draw_rig, rig)
+        write_plots(plots, draw_stereo, rig)
     if ros is not None:
-        from neurocal_cli.files.rig_yaml import format_ros_pair
+        from neurocal_cli.files.stereo_yaml import format_ros_pair
 
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
     warn(*write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
     note(*views_alone(rig.alone))
-    conclude(rig, as_json, rig_json, rig_report)
+    conclude(rig, as_json, stereo_json, stereo_report)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

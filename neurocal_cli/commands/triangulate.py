@@ -15,7 +15,7 @@ from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Triangulated
     from neurocal_cli.files.triangulation_csv import Matches
 
@@ -132,7 +132,7 @@ def triangulate(
 
 def _of_many(rig: str, matches: str) -> bool:
     """Whether the rig has other than two cameras, or the matches are those of named cameras."""
-    from neurocal_cli.files.camera_rig_yaml import has_cameras
+    from neurocal_cli.files.rig_yaml import has_cameras
     from neurocal_cli.files.triangulation_csv import has_sightings
 
     return (matches != "-" and has_sightings(matches)) or (rig != "-" and has_cameras(rig))
@@ -144,10 +144,10 @@ def _triangulate_many(
     """Triangulate points from any number of cameras."""
     from neurocal_cli.calibration.rig.many_views import triangulate_many
     from neurocal_cli.calibration.rig.triangulation import epipolar_limit as usual_limit
-    from neurocal_cli.files.camera_rig_yaml import read_camera_rig
+    from neurocal_cli.files.rig_yaml import read_rig
     from neurocal_cli.files.triangulation_csv import format_many_points, read_sightings
 
-    rig = read_camera_rig(file)
+    rig = read_rig(file)
     preparation.warn_of_poor(rig, "; points in space may be far off")
     notes: list[str] = []
     seen = read_sightings(matches, notes)
@@ -178,19 +178,19 @@ def _triangulate_many(
     say(", ".join(parts))
 
 
-def _rig(names: tuple[str, ...]) -> Rig:
+def _rig(names: tuple[str, ...]) -> StereoRig:
     """The rig of the file, or one that is fitted to two calibrations."""
     if len(names) == 1:
-        from neurocal_cli.files.rig_yaml import read_rig
+        from neurocal_cli.files.stereo_yaml import read_stereo_rig
 
-        rig = read_rig(names[0])
+        rig = read_stereo_rig(names[0])
         preparation.warn_of_poor(rig, "; points in space may be far off")
         return rig
-    from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
+    from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
     from neurocal_cli.files.calibration_tree import read_calibration
 
     left, right = (read_calibration(name) for name in names)
-    rig = fit_rig(left, right)
+    rig = fit_stereo(left, right)
     views = plural(len(rig.pairs), "view")
     note(f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}")
     warn(*rig.warnings)
@@ -202,7 +202,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
 class _Tally:
     """Triangulates batch by batch and counts what is wrong with the points."""
 
-    def __init__(self, rig: Rig, limit: float) -> None:
+    def __init__(self, rig: StereoRig, limit: float) -> None:
         self.rig, self.limit = rig, limit
         self.points = self.behind = self.off = self.outside = 0
         self.first: Matches | None = None  # the first batch, a sample for the cause of what is wrong

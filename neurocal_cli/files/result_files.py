@@ -18,8 +18,8 @@ from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.writing import write_whole
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.rig.camera_rig import CameraRig
     from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 
 
 def write_calibration(cal: Calibration, path: str | Path) -> None:
@@ -30,7 +30,7 @@ def write_calibration(cal: Calibration, path: str | Path) -> None:
     write_result(cal, path)
 
 
-def write_rig(rig: Rig | CameraRig, path: str | Path, alpha: float | None = None) -> None:
+def write_rig(rig: StereoRig | Rig, path: str | Path, alpha: float | None = None) -> None:
     """Write a rig file, whole or not at all; ``-`` is stdout.
 
     The extension ``.json`` or ``.xml`` gives JSON or OpenCV's XML, see `write_result`.
@@ -39,7 +39,7 @@ def write_rig(rig: Rig | CameraRig, path: str | Path, alpha: float | None = None
 
 
 def write_result(
-    result: Calibration | Rig | CameraRig, path: str | Path, *, lean: bool = False, alpha: float | None = None
+    result: Calibration | StereoRig | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
 ) -> tuple[str, ...]:
     """Write a calibration or a rig, whole or not at all.
 
@@ -72,15 +72,15 @@ def write_result(
     return ()
 
 
-def _rig_text(rig: Rig | CameraRig, alpha: float | None, by_rows: bool) -> str:
-    from neurocal_cli.calibration.rig.rig import Rig
+def _rig_text(rig: StereoRig | Rig, alpha: float | None, by_rows: bool) -> str:
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+    from neurocal_cli.files.stereo_yaml import format_stereo_rig
+
+    if isinstance(rig, StereoRig):
+        return format_stereo_rig(rig, alpha, by_rows)
     from neurocal_cli.files.rig_yaml import format_rig
 
-    if isinstance(rig, Rig):
-        return format_rig(rig, alpha, by_rows)
-    from neurocal_cli.files.camera_rig_yaml import format_camera_rig
-
-    return format_camera_rig(rig, alpha, by_rows)
+    return format_rig(rig, alpha, by_rows)
 
 
 def _lines(value: Any, depth: int, indent: str = "") -> str:

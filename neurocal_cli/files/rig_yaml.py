@@ -1,7 +1,9 @@
-"""Rig files: two calibrations and the pose of the right camera relative to the left, in one YAML file.
+"""Files of rigs of any number of cameras: the cameras, their poses and the views that connect them, in YAML.
 
-``left`` and ``right`` have the content of a calibration file, with the rectification and projection matrices
-of the rectified pair. ``stereo`` has the rest.
+``cameras`` holds the content of a calibration file for each camera, ``poses`` the pose of each relative to
+the first, ``edges`` the pairs of cameras that see common frames, and ``rig`` the rest. A rig of two cameras
+also has the blocks of a stereo rig (`stereo_yaml`), which hold its cameras with all their data; those in
+``cameras`` are then without points and poses.
 """
 
 from __future__ import annotations
@@ -12,16 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.rectification import Rectification, rectify
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.camera.geometry import Array, euler_to_rotation
+from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import POSE_GROUPS, read_verdict, verdict_lines
+from neurocal_cli.files.calibration_blocks import read_verdict, verdict_lines
 from neurocal_cli.files.calibration_tree import calibration_from_field
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
-from neurocal_cli.files.exchange.camera_set import METRES
 from neurocal_cli.files.file_storage import read_tree
+from neurocal_cli.files.stereo_yaml import stereo_from_field, stereo_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
@@ -33,75 +33,82 @@ from neurocal_cli.files.yaml_text import (
     quoted,
     quoted_words,
     text,
-    words,
 )
 
-FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
-# E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
-_SAME = 1e-6
+FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
+_STDS = (*POSE_NAMES, "baseline")
 
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
-    """Text of a rig file; for `alpha` see `rectify`, for `by_rows` see `format_calibration`."""
-    return "\n".join([*HEADER, *rig_lines(rig, alpha, by_rows), ""])
+    """Text of a rig file; `alpha`, of two cameras, as in `rectify`, `by_rows` as in `format_calibration`."""
+    cameras = rig.cameras
+    lines: Iterator[str] = iter(())
+    if len(cameras) == 2:
+        lines = stereo_lines(rig.pair(*cameras), alpha, by_rows)
+        cameras = {name: camera.lean for name, camera in cameras.items()}
+    named = ("\n".join(block(quoted_key(name), calibration_lines(camera, by_rows=by_rows)))
+             for name, camera in cameras.items())  # fmt: skip
+    lines = chain(
+        lines,
+        block("cameras", (line for part in named for line in part.split("\n"))),
+        block("poses", (line for name in rig.poses for line in _pose_lines(rig, name))),
+        list_lines("edges", (_edge(rig, a, b, count) for (a, b), count in rig.edges.items())),
+        block("rig", _rig_lines(rig)),
+    )
+    return "\n".join([*HEADER, *lines, ""])
 
 
-def rig_lines(rig: Rig, alpha: float | None, by_rows: bool) -> Iterator[str]:
-    """Lines of the blocks left, right and stereo."""
-    rectified = rectify(rig, alpha)
-    pairs: tuple[tuple[Array, Array] | None, ...] = (None, None)
-    if rectified is not None:
-        pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
-    cameras = zip(("left", "right"), (rig.left, rig.right), pairs, strict=True)
-    parts = [block(name, calibration_lines(camera, pair, by_rows)) for name, camera, pair in cameras]
-    yield from chain(*parts, block("stereo", _stereo_lines(rig, rectified)))
+def quoted_key(name: str) -> str:
+    """A name as the key of a mapping."""
+    return text(name)
 
 
-def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
-    """Texts of two calibration files for ROS's stereo nodes, with lengths in metres."""
-    if rig.unit not in METRES:
-        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
-    rectified = rectify(rig, alpha)
-    if rectified is None:
-        raise InputError(
-            "ROS's files need images of one known size; put image_size into both files of points"
-        )
-    metres = rectified.P2.copy()
-    metres[:, 3] *= METRES[rig.unit]
-    sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
-    first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
-    return first, second
+def _pose_lines(rig: Rig, name: str) -> Iterator[str]:
+    pose, std = rig.poses[name], rig.std[name]
+    stds = mapping(**{key: number(std[key]) for key in _STDS})
+    yield f"{quoted_key(name)}: {{R: {flow(pose.R)}, t: {flow(pose.t)}, std: {stds}}}"
 
 
-def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
+def _edge(rig: Rig, first: str, second: str, count: int) -> str:
+    pair = rig.pair(first, second)
+    return mapping(
+        cameras=quoted_words((first, second)),
+        views=str(count),
+        baseline=number(pair.baseline),
+        baseline_std=number(pair.std["baseline"]),
+    )
+
+
+def _rig_lines(rig: Rig) -> Iterator[str]:
     yield f"format: {FORMAT}"
     yield f"unit: {text(rig.unit)}"
-    for key, matrix in (("R", rig.R), ("t", rig.t), ("E", rig.E), ("F", rig.F)):
-        yield f"{key}: {flow(matrix)}"
-    yield f"baseline: {number(rig.baseline)}"
-    yield f"baseline_std: {number(rig.std['baseline'])}"
-    values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
-    for group, members in POSE_GROUPS:
-        entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
-        yield f"{group}: {mapping(**entries)}"
-    yield f"covariance: {mapping(names=words(POSE_NAMES), data=flow(rig.covariance))}"
+    yield f"covariance: {flow(rig.covariance)}"
+    frames = (quoted_words(word for pair in views.items() for word in pair) for views in rig.frames.values())
+    yield from list_lines("frames", frames)
+    yield from list_lines("left_out", (quoted_words((*view, why)) for view, why in rig.left_out.items()))
+    if rig.delays:
+        delays = {
+            name: mapping(value=number(value), std=number(std)) for name, (value, std) in rig.delays.items()
+        }
+        yield from block("delays", (f"{quoted_key(name)}: {entry}" for name, entry in delays.items()))
+        yield f"timed: {boolean(rig.timed)}"
     yield f"rmse_px: {number(rig.rmse_px)}"
     yield f"max_px: {number(rig.max_px)}"
     yield f"converged: {boolean(rig.converged)}"
     yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
     yield f"iterations: {rig.iterations}"
-    if rectified is not None:
-        matrices = {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
-        yield from block("rectification", (f"{key}: {flow(matrix)}" for key, matrix in matrices.items()))
-    yield from list_lines("pairs", map(quoted_words, rig.pairs))
-    left_out = (quoted_words((*pair, reason)) for pair, reason in rig.left_out.items())
-    yield from list_lines("left_out", left_out)
     yield from list_lines("warnings", map(quoted, rig.warnings))
     yield from verdict_lines(rig.verdict)
 
 
+def has_cameras(path: str | Path) -> bool:
+    """Whether a file is of a rig of named cameras, and not of a left and a right one."""
+    root = read_tree(path)
+    return "rig" in root and "stereo" not in root
+
+
 def read_rig(path: str | Path) -> Rig:
-    """Read a rig file that neurocal wrote; ``-`` is stdin.
+    """Read a rig of any number of cameras; ``-`` is stdin. The file of a stereo rig has `left` and `right`.
 
     Raises
     ------
@@ -113,65 +120,66 @@ def read_rig(path: str | Path) -> Rig:
 
 def rig_from_field(root: Field) -> Rig:
     """Read a rig; see `read_rig`."""
-    if "stereo" not in root:
-        if "neurocal" in root:
-            root.refuse("is the calibration of one camera; give a rig, or the calibrations of both cameras")
+    if "rig" not in root or "cameras" not in root:
+        stereo = stereo_from_field(root)
+        return of_two(stereo)
+    if "stereo" in root:
+        names = list(root["cameras"].entries())
+        if len(names) != 2:
+            root["cameras"].fail("two cameras, as there are left and right")
+        return of_two(stereo_from_field(root), *names)
+    own = root["rig"]
+    if own["format"].integer() != FORMAT:
+        root.refuse(f"rig.format is {own['format'].integer()}, not {FORMAT}; update neurocal")
+    cameras = {name: calibration_from_field(one) for name, one in root["cameras"].entries().items()}
+    if len(cameras) < 2:
+        root["cameras"].fail("two cameras or more")
+    units = {camera.unit for camera in cameras.values()} | {own["unit"].text()}
+    if len(units) > 1:
         root.refuse(
-            "is not a rig of neurocal; give a file that neurocal stereo wrote, or make one of another "
-            "program's rig with neurocal convert --to neurocal"
+            f"the cameras and rig have different units ({', '.join(sorted(units))}); correct those edited"
         )
-    block = root["stereo"]
-    if block["format"].integer() != FORMAT:
-        root.refuse(f"stereo.format is {block['format'].integer()}, not {FORMAT}; update neurocal")
-    left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
-    if left.unit != right.unit:
-        root.refuse("left and right have different units; correct one")
-    if (unit := block["unit"].text()) != left.unit:
-        root.refuse(f"stereo.unit is {unit}, but left and right are in {left.unit}; correct the one edited")
-    try:
-        pose = Pose(block["R"].array(3, 3), block["t"].array(3))
-    except InputError as error:
-        raise FormatError(f"stereo: {error}; correct it", root.source) from error
-    std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
-    rig = Rig(
-        left,
-        right,
-        pose,
-        std | {"baseline": block["baseline_std"].number_or_nan()},
-        block["covariance"]["data"].array(6, 6, unknown=True),
-        tuple((a, b) for a, b in (_names(entry, 2) for entry in block["pairs"].items())),
-        {(a, b): why for a, b, why in (_names(entry, 3) for entry in block["left_out"].items())},
-        rmse_px=block["rmse_px"].number_or_nan(),
-        max_px=block["max_px"].number_or_nan(),
-        converged=block["converged"].boolean(),
-        stop_reason=block["stop_reason"].text(),
-        iterations=block["iterations"].integer(),
-        warnings=tuple(block["warnings"].texts()),
-        judgement=block.read("verdict", read_verdict),
+    poses, stds = {}, {}
+    for name, entry in root["poses"].entries().items():
+        try:
+            poses[name] = Pose(entry["R"].array(3, 3), entry["t"].array(3))
+        except InputError as error:
+            raise FormatError(f"poses.{name}: {error}; correct it", root.source) from error
+        stds[name] = {key: entry["std"][key].number_or_nan() for key in _STDS}
+    if list(poses) != list(cameras):
+        root["poses"].fail(f"the poses of {', '.join(cameras)}, in this order")
+    if not np.allclose(next(iter(poses.values())).D, np.eye(3, 4), atol=1e-9):
+        root["poses"].fail("poses relative to the first camera, whose own pose is R = 1, t = 0")
+    frames = {}
+    for entry in own["frames"].items():
+        words = entry.texts()
+        views = dict(zip(words[::2], words[1::2], strict=False))
+        if len(words) < 4 or len(words) % 2 or not set(views) <= set(cameras):
+            entry.fail("a list of cameras of this rig and their views, one after the other")
+        frames[words[1]] = views
+    delays = own["delays"].entries() if "delays" in own else {}
+    n = 6 * (len(cameras) - 1)
+    return Rig(
+        cameras,
+        poses,
+        stds,
+        own["covariance"].array(n, n, unknown=True),
+        frames,
+        {(words[0], words[1]): words[2] for words in map(_three, own["left_out"].items())},
+        {name: (one["value"].number(), one["std"].number_or_nan()) for name, one in delays.items()},
+        own["timed"].boolean() if "timed" in own else False,
+        rmse_px=own["rmse_px"].number_or_nan(),
+        max_px=own["max_px"].number_or_nan(),
+        converged=own["converged"].boolean(),
+        stop_reason=own["stop_reason"].text(),
+        iterations=own["iterations"].integer(),
+        warnings=tuple(own["warnings"].texts()),
+        judgement=own.read("verdict", read_verdict),
     )
-    _check_consistent(rig, block)
-    return rig
 
 
-def _names(entry: Field, count: int) -> tuple[str, ...]:
-    names = tuple(entry.texts())
-    if len(names) != count:
-        entry.fail(f"a list of {count} texts")
-    return names
-
-
-def _check_consistent(rig: Rig, block: Field) -> None:
-    """Refuse a file with contradicting values, of which one was edited."""
-    values = [block[g][n]["value"].number() for g, names in POSE_GROUPS for n in names]
-    stated = (
-        ("E", block["E"].array(3, 3), rig.E),
-        ("F", block["F"].array(3, 3), rig.F),
-        ("baseline", np.array([block["baseline"].number()]), np.array([rig.baseline])),
-        ("rotation", euler_to_rotation(*values[:3]), rig.R),
-        ("translation", np.array(values[3:]), rig.t),
-    )
-    for name, found, expected in stated:
-        if np.abs(found - expected).max() > _SAME * np.abs(expected).max():
-            block.refuse(
-                f"stereo.{name} and stereo.R, stereo.t or the cameras disagree; correct the one edited"
-            )
+def _three(entry: Field) -> list[str]:
+    words = entry.texts()
+    if len(words) != 3:
+        entry.fail("a list of 3 texts")
+    return words

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -218,7 +218,7 @@ def study_rig(
     return RigStudy(rig, tuple(sigma), trials, rmse_px, centre, rotation, over_std)
 
 
-def _errors(found: CameraRig, truth: SimulatedRig) -> tuple[float, float, float, float]:
+def _errors(found: Rig, truth: SimulatedRig) -> tuple[float, float, float, float]:
     """Rms reprojection error, and rms errors of places, rotations, and of all over their std."""
     places, angles, ratios = [], [], []
     for name in list(found.cameras)[1:]:

@@ -25,7 +25,7 @@ from neurocal_cli import (
     Pose,
     calibrate,
     evaluate_camera,
-    fit_rig,
+    fit_stereo,
     read_calibration,
     write_calibration,
     write_points,
@@ -187,7 +187,7 @@ def test_errors_of_a_rig_are_as_large_as_stated_if_its_cameras_are_uncertain(tri
                 calibrate(some, intrinsics=given.camera if exact else given, **options)
                 for some, given in zip(points, drawn, strict=True)
             ]
-            rig = fit_rig(cameras[0], cameras[1])
+            rig = fit_stereo(cameras[0], cameras[1])
             error = np.concatenate([rig.pose.euler - scene.rig.euler, rig.t - scene.rig.t])
             std = [rig.std[name] for name in (*POSE_NAMES, "baseline")]
             result.append(np.append(error, rig.baseline - np.linalg.norm(scene.rig.t)) / std)

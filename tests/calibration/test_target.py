@@ -27,7 +27,7 @@ from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.points_csv import read_points
 from neurocal_cli.files.result_files import write_calibration
-from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli.files.stereo_yaml import read_stereo_rig
 from neurocal_cli.observations.board import Plane, planes_of
 from neurocal_cli.observations.target import board_of
 
@@ -213,9 +213,9 @@ def test_real_pairs_of_one_board(kind: str, tmp_path: Path, real_files: RealFile
         points = tmp_path / "left.csv", tmp_path / "right.csv"
         result = run("stereo", *points, "--target", target, "--no-skew", "-o", tmp_path / "rig.yaml")
         assert result.exit_code == 0, result.stderr
-        from neurocal_cli.files.rig_yaml import read_rig
+        from neurocal_cli.files.stereo_yaml import read_stereo_rig
 
-        rig = read_rig(tmp_path / "rig.yaml")
+        rig = read_stereo_rig(tmp_path / "rig.yaml")
         rms[target], baseline[target] = rig.rmse_px, rig.baseline
     assert rms["auto"] < 0.75 * rms["given"]
     assert baseline["auto"] == pytest.approx(83.29, abs=0.1)
@@ -242,7 +242,7 @@ def test_a_corner_rig_of_three_boards(kind: str, tmp_path: Path, real_files: Rea
     points = tmp_path / "left.csv", tmp_path / "right.csv"
     result = run("stereo", *points, "-o", tmp_path / "rig.yaml")
     assert result.exit_code == 0, result.stderr
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     assert rig.rmse_px < 0.7
     assert rig.baseline == pytest.approx(230.9, abs=2.5)
     assert abs(rig.baseline - 230.9) < 3 * rig.std["baseline"]

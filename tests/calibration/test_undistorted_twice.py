@@ -19,10 +19,10 @@ from neurocal_cli import (
     evaluate_stereo,
     read_calibration,
     read_points,
-    read_rig,
+    read_stereo_rig,
     undistort_points,
 )
-from neurocal_cli.calibration.rig.evaluation import evaluate_rig
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo_rig
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.points_csv import format_points, write_points
@@ -138,7 +138,7 @@ def test_rectify_warns_of_points_that_are_undistorted_already(tmp_path: Path) ->
     run("stereo", *stereo, "--no-skew", "--distortion", "k1", "-o", tmp_path / "rig.yaml")
     straight = [tmp_path / path.name for path in stereo]
     for path, out in zip(stereo, straight, strict=True):
-        write_points(undistort_points(read_points(path), read_rig(tmp_path / "rig.yaml").left), out)
+        write_points(undistort_points(read_points(path), read_stereo_rig(tmp_path / "rig.yaml").left), out)
     for points, count in ((stereo, 0), (straight, 2)):
         result = run("rectify", tmp_path / "rig.yaml", *points, "-o", tmp_path / f"out{count}")
         assert result.exit_code == 0
@@ -148,16 +148,16 @@ def test_rectify_warns_of_points_that_are_undistorted_already(tmp_path: Path) ->
 def test_evaluating_a_rig_warns_once_of_each_file(tmp_path: Path) -> None:
     stereo = [SAMPLES / f"stereo_{side}.csv" for side in ("left", "right")]
     run("stereo", *stereo, "--no-skew", "--distortion", "k1", "-o", tmp_path / "rig.yaml")
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     left, right = (undistort_points(read_points(path), rig.left) for path in stereo)
-    found = evaluate_rig(rig, (left, right))
+    found = evaluate_stereo_rig(rig, (left, right))
     assert sum(BEFORE in text for text in found.warnings) == 2
 
 
 def test_triangulate_says_that_a_rig_of_undistorted_points_needs_such_pixels(tmp_path: Path) -> None:
     stereo = [SAMPLES / f"stereo_{side}.csv" for side in ("left", "right")]
     run("stereo", *stereo, "--no-skew", "--distortion", "k1", "-o", tmp_path / "rig.yaml")
-    rig, straight = read_rig(tmp_path / "rig.yaml"), tmp_path / "straight.csv"
+    rig, straight = read_stereo_rig(tmp_path / "rig.yaml"), tmp_path / "straight.csv"
     write_points(undistort_points(read_points(stereo[0]), rig.left), straight)
     run("stereo", straight, stereo[1], "--no-skew", "-o", tmp_path / "straight.yaml")
     for name, said in (("rig", False), ("straight", True)):

@@ -14,8 +14,8 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
-from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.files.result_files import write_rig
 
@@ -122,12 +122,12 @@ def test_a_folded_target_is_judged_in_one_view(tmp_path: Path) -> None:
 
 
 def test_a_rig_is_judged_as_one_file_or_from_stdin(cameras: tuple[Path, Path], tmp_path: Path) -> None:
-    rig = fit_rig(*(read_calibration(path) for path in cameras))
+    rig = fit_stereo(*(read_calibration(path) for path in cameras))
     write_rig(rig, tmp_path / "rig.yaml")
     result = evaluate(tmp_path / "rig.yaml", "--json")
     assert result.exit_code == 0, result.stderr
     values = json.loads(result.stdout)
-    expected = evaluate_rig(rig)
+    expected = evaluate_stereo_rig(rig)
     same(values, expected.by_view)
     assert values["rig"]["rmse"] == pytest.approx(values["rmse"], rel=1e-6)
     assert evaluate("-", "--json", stdin=(tmp_path / "rig.yaml").read_bytes()).stdout == result.stdout
@@ -156,7 +156,7 @@ def test_files_that_are_no_cameras_are_refused(cameras: tuple[Path, Path], tmp_p
     one_line_error(evaluate(tmp_path / "a.yaml"), "is not a rig of neurocal", "convert --to neurocal")
     one_line_error(evaluate(cameras[0]), "is the calibration of one camera")
     one_line_error(evaluate(cameras[0], tmp_path / "none.yaml"), "there is no such file")
-    rig = fit_rig(*(read_calibration(path) for path in cameras))
+    rig = fit_stereo(*(read_calibration(path) for path in cameras))
     write_rig(rig, tmp_path / "rig.yaml")
     one_line_error(
         evaluate(tmp_path / "rig.yaml", cameras[1]), "is a stereo rig; give the file of one camera"
@@ -220,7 +220,7 @@ def test_lean_files_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> No
     assert json.loads(result.stdout)["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)
     one_line_error(evaluate(*words), "the left camera has no points of its own")
     rig = tmp_path / "rig.yaml"
-    write_rig(fit_rig(*calibrated(made)).lean, rig)
+    write_rig(fit_stereo(*calibrated(made)).lean, rig)
     one_line_error(evaluate(rig), "the rig has no points of its own; give the points to evaluate it on")
     assert evaluate(rig, "--points", *points).exit_code == 0
 
@@ -243,11 +243,11 @@ def test_given_points_of_a_target_of_another_size_are_named(factor: float, reaso
     new = replace(scene(), poses=random_rig(np.random.default_rng(8), "verging", 3).poses)
     points = [new.points(side, 0.2, np.random.default_rng(9)) for side in (0, 1)]
     larger = [replace(one, world=factor * one.world) for one in points]
-    rig = fit_rig(left, right)
-    for verdict in (evaluate_stereo(left, right, larger).verdict, evaluate_rig(rig, larger).verdict):
+    rig = fit_stereo(left, right)
+    for verdict in (evaluate_stereo(left, right, larger).verdict, evaluate_stereo_rig(rig, larger).verdict):
         assert verdict is not None
         assert verdict.word == "poor"
         assert reason in verdict.reasons[0]
-    same = evaluate_rig(rig, (points[0], points[1])).verdict
+    same = evaluate_stereo_rig(rig, (points[0], points[1])).verdict
     assert same is not None
     assert not any("times that of the rig" in text for text in same.reasons)

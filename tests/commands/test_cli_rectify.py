@@ -19,10 +19,10 @@ from neurocal_cli import (
     Correspondences,
     Intrinsics,
     Pose,
-    Rig,
+    StereoRig,
     calibrate,
     read_points,
-    read_rig,
+    read_stereo_rig,
     write_points,
     write_rig,
 )
@@ -31,9 +31,9 @@ from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify_points, row_error
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.rig_report import rig_report
+from neurocal_cli.commands.show.stereo_report import stereo_report
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.exchange.reading import FORMATS
 
 SIZE = (320, 240)
@@ -102,7 +102,7 @@ def test_the_maps_are_those_of_opencv(lens: Distortion, alpha: float | None, tmp
 @pytest.mark.parametrize("lens", [BENT, FISH], ids=["plumb_bob", "fisheye"])
 def test_points_of_both_cameras_come_into_the_same_row(lens: Distortion, pose: Pose) -> None:
     cameras = camera_set(lens, pose)
-    pair = rectified_pair(as_rig(cameras))
+    pair = rectified_pair(as_stereo(cameras))
     assert pair.axis == (0 if pose is VERGING else 1)
     left, right = (rectify_points(pair, side, points) for side, points in enumerate(seen(cameras)))
     assert row_error(pair, left, right).max_px < 1e-9
@@ -116,7 +116,7 @@ def test_points_of_both_cameras_come_into_the_same_row(lens: Distortion, pose: P
 @pytest.mark.parametrize("alpha", slow_but((0.0,), [None, 0.0, 1.0]))
 def test_rows_of_wide_lenses_agree_and_what_is_behind_is_left_out(model: str, alpha: float | None) -> None:
     left, right = wide_camera(model), replace(wide_camera(model), name="right")
-    pair = rectified_pair(as_rig(CameraSet((left, right), (VERGING,), unit="mm")), alpha)
+    pair = rectified_pair(as_stereo(CameraSet((left, right), (VERGING,), unit="mm")), alpha)
     f = pair.matrices.P1[0, 0]
     if alpha is None:  # the scale of the middle, whatever the model calls its focal length
         assert f == pytest.approx(left.project_jacobian(np.array([[0, 0, 1.0]]))[1][0, 1, 1])
@@ -137,7 +137,7 @@ def test_rows_of_wide_lenses_agree_and_what_is_behind_is_left_out(model: str, al
 
 def test_covariances_move_with_the_points() -> None:
     """The scatter of many noisy points about a place is the covariance stated there."""
-    pair = rectified_pair(as_rig(camera_set(BENT)))
+    pair = rectified_pair(as_stereo(camera_set(BENT)))
     rng = np.random.default_rng(0)
     C = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
     noisy = np.array([250.0, 60.0]) + rng.multivariate_normal([0, 0], C, 20000)
@@ -174,7 +174,7 @@ def test_images_are_those_of_opencv_s_remap(rig_file: Path, tmp_path: Path) -> N
     result = run("rectify", *words, "--interpolation", "linear", "--side-by-side", "-o", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
     assert result.stderr == "rectified 3 of 3 pairs\n"
-    matrices = rectified_pair(as_rig(cameras)).matrices
+    matrices = rectified_pair(as_stereo(cameras)).matrices
     pictures = []
     for k, (name, camera) in enumerate(zip(("left", "right"), cameras.cameras, strict=True), start=1):
         R, P = getattr(matrices, f"R{k}"), getattr(matrices, f"P{k}")
@@ -263,11 +263,11 @@ def test_a_pair_of_another_size_is_named_and_left_out(rig_file: Path, tmp_path: 
 
 
 def test_the_summary_says_when_the_common_fit_is_much_worse() -> None:
-    rig = replace(as_rig(camera_set(BENT)), rmse_px=0.23)
+    rig = replace(as_stereo(camera_set(BENT)), rmse_px=0.23)
     for growth, said in ((1.53, True), (1.1, False)):
         judged = Verdict("usable", (), (), {"growth": growth, "alone_px": 0.15})
         told = "the rms is 0.1500 px; with one rig for all pairs it is 1.5 times as much"
-        assert (told in rig_report(replace(rig, judgement=judged))) == said
+        assert (told in stereo_report(replace(rig, judgement=judged))) == said
 
 
 @pytest.mark.slow
@@ -296,11 +296,11 @@ def test_rows_of_real_rigs_agree(
     assert run("stereo", *points, *words, "-o", tmp_path / "rig.yaml").exit_code == 0
     result = run("rectify", tmp_path / "rig.yaml", "--maps", "-o", tmp_path / "out")
     assert float(result.stderr.split("differ by ")[1].split()[0]) < limit
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     assert rows_of_each_pair(rig) < 0.1
 
 
-def rows_of_each_pair(rig: Rig) -> float:
+def rows_of_each_pair(rig: StereoRig) -> float:
     """Rms of the rows' differences when each pair is rectified with the relative pose that it has itself."""
     sides = [
         calibrate(cal.points, type=3, intrinsics=cal.camera, target="given", outliers="keep")
@@ -310,7 +310,7 @@ def rows_of_each_pair(rig: Rig) -> float:
     for pair in rig.pairs:
         left, right = (cal.views[name].pose for cal, name in zip(sides, pair, strict=True))
         R = right.R @ left.R.T
-        own = as_rig(
+        own = as_stereo(
             CameraSet((rig.left.camera, rig.right.camera), (Pose(R, right.t - R @ left.t),), unit="mm")
         )
         rectified = rectified_pair(own)

@@ -10,7 +10,7 @@ import pytest
 from click.testing import Result
 from support.command_line import run
 
-from neurocal_cli import read_camera_rig
+from neurocal_cli import read_rig
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = [ROOT / "sample_data" / f"rig_cam{k}.csv" for k in range(3)]
@@ -32,7 +32,7 @@ def test_the_summary_has_all_cameras_poses_and_a_verdict(made: tuple[Path, Resul
     for words in ("rig_cam2", "X = R X_rig_cam0 + t", "t_z [mm]", "common frames", "verdict: "):
         assert words in said.stderr
     assert max(map(len, said.stderr.splitlines())) < 110
-    rig = read_camera_rig(path)
+    rig = read_rig(path)
     # The truth is in sample_data/README.md.
     assert rig.poses["rig_cam1"].t == pytest.approx([-295.18, 49.51, -20.50], abs=3)
     assert rig.poses["rig_cam2"].t == pytest.approx([-529.32, 26.35, 14.64], abs=4)
@@ -50,7 +50,7 @@ def test_names_known_cameras_and_models_of_single_cameras(tmp_path: Path) -> Non
     found = json.loads(said.stdout)
     assert list(found["cameras"]) == ["a", "b", "c"]
     assert found["edges"][0] == {"cameras": ["a", "b"], "views": 15}
-    rig = read_camera_rig(tmp_path / "rig.json")
+    rig = read_rig(tmp_path / "rig.json")
     assert [camera.distortion_model for camera in rig.cameras.values()] == ["k1k2", "k1", "k1k2"]
     assert rig.cameras["a"].type == 3
 

@@ -15,7 +15,7 @@ from support.real_data import RealFiles
 from support.rigs import RigScene, random_rig
 from support.slow_cases import slow_but
 
-from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
+from neurocal_cli import Board, Correspondences, calibrate, read_stereo_rig, write_calibration, write_points
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.files.board_yaml import write_board
 from neurocal_cli.observations.board import Plane
@@ -48,7 +48,7 @@ def printed(files: tuple[Path, Path]) -> Result:
 def test_the_rig_is_the_librarys(printed: Result, tmp_path: Path) -> None:
     assert printed.exit_code == 0, printed.stderr
     (tmp_path / "rig.yaml").write_text(printed.stdout)
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     expected = calibrate_stereo(*points(), skew=False)
     assert rig.t == pytest.approx(expected.t, abs=1e-9)
     assert rig.std["baseline"] == pytest.approx(expected.std["baseline"])
@@ -88,7 +88,7 @@ def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: 
         "stereo", *files, "--no-skew", "--left-intrinsics", tmp_path / "left.yaml", "-o", tmp_path / "rig"
     )
     assert result.exit_code == 0, result.stderr
-    rig = read_rig(tmp_path / "rig")
+    rig = read_stereo_rig(tmp_path / "rig")
     assert (rig.left.type, rig.right.type) == (3, 1)
     assert rig.left.std["alpha_u"] == 0
     assert "fixed" in result.stderr
@@ -113,7 +113,7 @@ def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path)
     result = run("stereo", *files, "--no-skew", "--alpha", "0", "--ros", *names, "-o", tmp_path / "rig.yaml")
     assert (result.exit_code, result.stdout) == (0, ""), result.stderr
     right = yaml.safe_load(names[1].read_text())
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     P = np.array(right["projection_matrix"]["data"]).reshape(3, 4)
     assert P[0, 3] / P[0, 0] == pytest.approx(-rig.baseline / 1000)
     assert right["camera_name"] == "right"
@@ -228,7 +228,7 @@ def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
     words = ["--no-skew", "--distortion", "plumb_bob", "--outliers", "keep", "-o", tmp_path / "rig.yaml"]
     result = run("stereo", tmp_path / "left.csv", tmp_path / "right.csv", *words)
     assert result.exit_code == 0, result.stderr
-    rig = read_rig(tmp_path / "rig.yaml")
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
     assert len(rig.pairs) == 13
     assert rig.rmse_px < 0.18  # OpenCV's stereoCalibrate: 0.215 px
     assert rig.baseline == pytest.approx(83.2, abs=0.1)

@@ -13,7 +13,7 @@ from support.made_calibration import made_points
 from support.places import SAMPLES
 from support.rigs import random_rig, sides
 
-from neurocal_cli import read_calibration, read_points, read_rig, write_points
+from neurocal_cli import read_calibration, read_points, read_stereo_rig, write_points
 
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
 
@@ -33,7 +33,7 @@ def rig_file(tmp_path: Path) -> Path:
         "stereo", tmp_path / "l.csv", tmp_path / "r.csv", "--no-skew", "--json", "-o", tmp_path / "rig.yaml"
     )
     assert result.exit_code == 0, result.stderr
-    rig, told = read_rig(tmp_path / "rig.yaml"), json.loads(result.stdout)
+    rig, told = read_stereo_rig(tmp_path / "rig.yaml"), json.loads(result.stdout)
     assert told["t"] == rig.t.tolist()
     assert told["left"]["parameters"]["alpha_u"]["value"] == rig.left.intrinsics.alpha_u
     assert told["parameters"]["t_x"]["std"] == rig.std["t_x"]
@@ -112,7 +112,7 @@ def test_what_follows_a_rig_sums_up_as_json(rig_file: Path, tmp_path: Path) -> N
     assert told["points"]["n_points"] == told["rig"]["n_points"] > 0
     assert 0 < told["points"]["rms_px"] < 1
     told = summary("evaluate", "stereo", rig_file)
-    rig = read_rig(rig_file)
+    rig = read_stereo_rig(rig_file)
     assert told["distortion"] == {"left": rig.left.distortion_model, "right": rig.right.distortion_model}
     rows = [line.split() for line in run("evaluate", "stereo", rig_file).stdout.splitlines()]
     assert ["left", "distortion", "model", rig.left.distortion_model] in rows

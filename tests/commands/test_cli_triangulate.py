@@ -15,12 +15,12 @@ from support.command_line import run
 from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.result_files import write_rig
-from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli.files.stereo_yaml import read_stereo_rig
 from neurocal_cli.files.table import stream_table
 from neurocal_cli.files.table_header import Schema
 
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         points = scene().points(side, 0.2, np.random.default_rng(side))
         cameras.append(calibrate(points, skew=False))
         write_calibration(cameras[-1], path / f"{name}.yaml")
-    write_rig(fit_rig(*cameras), path / "rig.yaml")
+    write_rig(fit_stereo(*cameras), path / "rig.yaml")
     write_matches(path / "matches.csv", np.hstack([camera.points.pixels for camera in cameras]))
     return path
 
@@ -59,7 +59,7 @@ def table(result: Result) -> tuple[list[str], dict[str, list[str]]]:
     return head, dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
 
 
-def expected(rig: Rig, rows: Array, sigma: float) -> Array:
+def expected(rig: StereoRig, rows: Array, sigma: float) -> Array:
     found = triangulate(rig.left, rig.right, rig.pose, rows[:, :2], rows[:, 2:])
     assert found.covariance is not None
     return np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
@@ -73,7 +73,7 @@ def test_the_points_are_the_librarys(folder: Path) -> None:
     head, columns = table(run("triangulate", folder / "rig.yaml", folder / "matches.csv", "--sigma", "0.3"))
     assert list(columns) == [*NUMBERS, "flag"]
     found = np.array([columns[name] for name in NUMBERS], dtype=float).T
-    rig = read_rig(folder / "rig.yaml")
+    rig = read_stereo_rig(folder / "rig.yaml")
     assert found == pytest.approx(expected(rig, pixels(folder), 0.3), rel=1e-5, abs=1e-9)
     assert set(columns["flag"]) == {"ok"}
     assert head == [
@@ -89,7 +89,7 @@ def test_two_calibrations_make_the_rig_themselves(folder: Path) -> None:
     assert "note: the rig is fitted to 4 views of both cameras: baseline" in result.stderr
     one = run("triangulate", folder / "rig.yaml", folder / "matches.csv")
     assert result.stdout == one.stdout
-    sigma = read_rig(folder / "rig.yaml").sigma
+    sigma = read_stereo_rig(folder / "rig.yaml").sigma
     assert f"# sigma: {sigma:.6g}" in one.stdout
     assert sigma == pytest.approx(0.2, rel=0.1)
 
@@ -206,7 +206,7 @@ def test_cameras_that_do_not_belong_together_are_refused(folder: Path, tmp_path:
 
 
 def test_a_rig_without_noise_takes_half_a_pixel_and_says_so(folder: Path, tmp_path: Path) -> None:
-    write_rig(replace(read_rig(folder / "rig.yaml"), rmse_px=float("nan")), tmp_path / "rig.yaml")
+    write_rig(replace(read_stereo_rig(folder / "rig.yaml"), rmse_px=float("nan")), tmp_path / "rig.yaml")
     result = run("triangulate", tmp_path / "rig.yaml", folder / "matches.csv")
     assert "note: the rig does not say how accurate its pixels are; 0.5 px is assumed" in result.stderr
     assert "# sigma: 0.5" in result.stdout

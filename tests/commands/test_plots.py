@@ -17,11 +17,11 @@ from support.slow_cases import slow_but
 from neurocal_cli import NeurocalError, write_calibration, write_points
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
-from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.commands.show import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
 from neurocal_cli.commands.show.camera_panels import Subject
-from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_rig
+from neurocal_cli.commands.show.plot_pages import draw_camera, draw_points_in_space, draw_stereo
 
 BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
 
@@ -86,22 +86,22 @@ def test_a_camera_without_a_calibration_is_drawn_with_the_points_it_was_judged_b
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig() -> StereoRig:
     return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
 
 
 @pytest.mark.parametrize("panel", slow_but(("poses",), (None, *RIG_PANELS)))
-def test_a_rig_is_drawn(rig: Rig, panel: str | None) -> None:
-    assert draw_rig(rig, "png", panel).startswith(BEGINNINGS["png"])
+def test_a_rig_is_drawn(rig: StereoRig, panel: str | None) -> None:
+    assert draw_stereo(rig, "png", panel).startswith(BEGINNINGS["png"])
 
 
 @pytest.mark.parametrize("panel", slow_but((None,), (None, *SPACE_PANELS)))
-def test_points_in_space_are_drawn(rig: Rig, panel: str | None) -> None:
-    evaluation = evaluate_rig(rig)
+def test_points_in_space_are_drawn(rig: StereoRig, panel: str | None) -> None:
+    evaluation = evaluate_stereo_rig(rig)
     assert draw_points_in_space(evaluation, rig, "png", panel).startswith(BEGINNINGS["png"])
 
 
-def test_points_in_space_are_drawn_without_a_rig(rig: Rig) -> None:
+def test_points_in_space_are_drawn_without_a_rig(rig: StereoRig) -> None:
     evaluation = evaluate_stereo(rig.left, rig.right)
     assert draw_points_in_space(evaluation, None, "png", "depths").startswith(BEGINNINGS["png"])
 

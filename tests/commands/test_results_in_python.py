@@ -14,8 +14,8 @@ from support.places import SAMPLES
 
 from neurocal_cli import (
     Calibration,
-    CameraRig,
     Rig,
+    StereoRig,
     calibrate,
     calibrate_rig,
     calibrate_stereo,
@@ -34,13 +34,13 @@ def camera() -> Calibration:
 
 
 @cache
-def rig() -> Rig:
+def rig() -> StereoRig:
     left, right = (read_points(SAMPLES / f"stereo_{side}.csv") for side in ("left", "right"))
     return calibrate_stereo(left, right, skew=False, distortion="none", target="given")
 
 
 @cache
-def camera_rig() -> CameraRig:
+def camera_rig() -> Rig:
     points = {f"cam{k}": read_points(SAMPLES / f"rig_cam{k}.csv") for k in range(3)}
     return calibrate_rig(points, distortion="none", skew=False, target="given")
 

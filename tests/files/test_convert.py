@@ -16,7 +16,15 @@ from support.command_line import run
 from support.distorted import LENSES
 from support.made_calibration import made_calibration
 
-from neurocal_cli import Camera, Intrinsics, Pose, Rig, read_calibration, read_rig, write_calibration
+from neurocal_cli import (
+    Camera,
+    Intrinsics,
+    Pose,
+    StereoRig,
+    read_calibration,
+    read_stereo_rig,
+    write_calibration,
+)
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
@@ -455,8 +463,8 @@ def test_a_rig_that_was_converted_serves_as_a_rig(tmp_path: Path) -> None:
     (tmp_path / "camchain.yaml").write_text(KALIBR)
     result = run("convert", tmp_path / "camchain.yaml", "--to", "neurocal", "-o", tmp_path / "rig.yaml")
     assert (result.exit_code, result.stderr) == (0, "")
-    rig = read_rig(tmp_path / "rig.yaml")
-    assert isinstance(rig, Rig)
+    rig = read_stereo_rig(tmp_path / "rig.yaml")
+    assert isinstance(rig, StereoRig)
     assert rig.unit == "m"
     (tmp_path / "matches.csv").write_text("uL,vL,uR,vR\n400,250,340,255\n")
     result = run("triangulate", tmp_path / "rig.yaml", tmp_path / "matches.csv")

@@ -16,9 +16,9 @@ from support.rigs import random_rig, sides
 
 from neurocal_cli import (
     Calibration,
-    Rig,
+    StereoRig,
     read_calibration,
-    read_rig,
+    read_stereo_rig,
     write_calibration,
     write_points,
     write_rig,
@@ -27,16 +27,16 @@ from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.calibration_yaml import format_calibration
 from neurocal_cli.files.result_files import write_result
-from neurocal_cli.files.rig_yaml import format_rig
+from neurocal_cli.files.stereo_yaml import format_stereo_rig
 from neurocal_cli.files.yaml_text import parse_yaml
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig() -> StereoRig:
     return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
 
 
-def test_opencv_opens_the_yaml_of_a_camera_and_of_a_rig(rig: Rig, tmp_path: Path) -> None:
+def test_opencv_opens_the_yaml_of_a_camera_and_of_a_rig(rig: StereoRig, tmp_path: Path) -> None:
     cal = made_calibration(3)
     write_calibration(cal, tmp_path / "camera.yaml")
     storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
@@ -61,17 +61,17 @@ def test_files_of_former_versions_are_read(tmp_path: Path) -> None:
     assert len(read_calibration(tmp_path / "former.yaml").points) == 380
 
 
-def test_json_holds_the_same_tree_and_is_read_back(rig: Rig, tmp_path: Path) -> None:
+def test_json_holds_the_same_tree_and_is_read_back(rig: StereoRig, tmp_path: Path) -> None:
     cal = made_calibration(2)
     write_calibration(cal, tmp_path / "camera.json")
     assert json.loads((tmp_path / "camera.json").read_text()) == parse_yaml(format_calibration(cal), "f")
     assert format_calibration(read_calibration(tmp_path / "camera.json")) == format_calibration(cal)
     write_rig(rig, tmp_path / "rig.json")
-    assert format_rig(read_rig(tmp_path / "rig.json")) == format_rig(rig)
+    assert format_stereo_rig(read_stereo_rig(tmp_path / "rig.json")) == format_stereo_rig(rig)
     assert json.loads((tmp_path / "rig.json").read_text())["stereo"]["t"] == rig.t.tolist()
 
 
-def test_xml_is_opencv_s_and_says_what_it_cannot_hold(rig: Rig, tmp_path: Path) -> None:
+def test_xml_is_opencv_s_and_says_what_it_cannot_hold(rig: StereoRig, tmp_path: Path) -> None:
     told = write_result(made_calibration(2), tmp_path / "camera.xml")
     assert "programs of OpenCV ignore skew" in told[0]
     storage = cv2.FileStorage(str(tmp_path / "camera.xml"), cv2.FILE_STORAGE_READ)
@@ -82,7 +82,7 @@ def test_xml_is_opencv_s_and_says_what_it_cannot_hold(rig: Rig, tmp_path: Path) 
     assert storage.getNode("T").mat().ravel().tolist() == rig.t.tolist()
 
 
-def test_a_lean_file_has_the_camera_and_its_accuracy(rig: Rig, tmp_path: Path) -> None:
+def test_a_lean_file_has_the_camera_and_its_accuracy(rig: StereoRig, tmp_path: Path) -> None:
     cal = made_calibration(3)
     write_result(cal, tmp_path / "lean.yaml", lean=True)
     found = read_calibration(tmp_path / "lean.yaml")
@@ -93,7 +93,7 @@ def test_a_lean_file_has_the_camera_and_its_accuracy(rig: Rig, tmp_path: Path) -
     assert found.image_size == cal.image_size
     assert (tmp_path / "lean.yaml").stat().st_size < 4000
     write_result(rig, tmp_path / "rig.yaml", lean=True)
-    lean = read_rig(tmp_path / "rig.yaml")
+    lean = read_stereo_rig(tmp_path / "rig.yaml")
     assert lean.t.tobytes() == rig.t.tobytes()
     assert lean.std == rig.std
     assert lean.verdict is not None

@@ -16,7 +16,7 @@ from support.rigs import random_rig
 
 from neurocal_cli import write_calibration, write_rig
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.neurocal import as_stereo
 
 POINTS = SAMPLES / "points.csv"
 
@@ -25,7 +25,7 @@ POINTS = SAMPLES / "points.csv"
 def folder(tmp_path: Path) -> Path:
     scene = random_rig(np.random.default_rng(6), "verging", 2, "k1k2")
     cameras = CameraSet((scene.camera(0), scene.camera(1)), (scene.rig,), unit="mm")
-    write_rig(as_rig(cameras), tmp_path / "rig.json")
+    write_rig(as_stereo(cameras), tmp_path / "rig.json")
     write_calibration(made_calibration(), tmp_path / "camera.yaml")
     (tmp_path / "lens.yaml").write_text("neurocal_lens:\n  format: 2\n")
     (tmp_path / "matches.csv").write_text("uL,vL,uR,vR\n300,200,310,205\n")

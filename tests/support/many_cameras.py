@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli import Correspondences, Pose
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.geometry import Array, rotation_step
 from neurocal_cli.simulation.rigs import SimulatedRig, random_rig
 
@@ -69,7 +69,7 @@ def steady(rig: SimulatedRig, frames: int, late: float | Array) -> tuple[Simulat
     return at(t), at(t + late * (t[1] - t[0]))
 
 
-def errors_over_std(rig: CameraRig, truth: SimulatedRig) -> Array:
+def errors_over_std(rig: Rig, truth: SimulatedRig) -> Array:
     """Errors of all relative poses and of the main parameters of the cameras, over their reported std."""
     found = []
     for name in list(rig.cameras)[1:]:

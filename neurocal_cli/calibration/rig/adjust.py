@@ -30,8 +30,14 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
-from neurocal_cli.adjustment.normal_equations import Arrowhead, SharedAndOwn
-from neurocal_cli.adjustment.reprojection import POSE, camera_columns, normal_blocks
+from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SharedAndOwn, solve_scaled
+from neurocal_cli.adjustment.reprojection import (
+    POSE,
+    POSE_COLUMNS,
+    camera_columns,
+    free_columns,
+    normal_blocks,
+)
 from neurocal_cli.adjustment.views import PointBatches, Views, batches_of
 from neurocal_cli.calibration.calibration import Calibration, estimated_parameters
 from neurocal_cli.calibration.evaluation import evaluate_camera
@@ -503,11 +509,22 @@ def _side(
         np.array(calibration.distortion, dtype=float),
         calibration.square_pixels,
     )
-    normal = normal_blocks(batches, state)[0]
-    spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
-    noise = max(float(np.sqrt(normal[:, -1, -1].sum() / max(spare, 1))), _LEAST_NOISE)
+    normal, free = normal_blocks(batches, state)[0], free_parameters(calibration)
+    spare = views.n_equations - int(free.sum()) - 6 * views.n_views
+    noise = max(float(np.sqrt(cost_alone(normal, free) / max(spare, 1))), _LEAST_NOISE)
     observed = Observations(batches, frame, views.pixel_centre, views.pixel_scale, 1.0, views.n_equations)
     return observed, state, normal, noise
+
+
+def cost_alone(normal: Array, free: NDArray[np.bool_]) -> float:
+    """Sum of squares of one camera at its own minimum, to which one step leads.
+
+    `normal` (V, 12 + K, 12 + K) are its `normal_blocks` in any poses near it, such as those of a common fit,
+    and `free` (5 + K,) are its parameters that move.
+    """
+    reduced, _ = Arrowhead.of(normal, free_columns(free), POSE_COLUMNS).reduced()
+    gained = reduced[-1, :-1] @ solve_scaled(reduced[:-1, :-1], reduced[:-1, -1:], ROUNDING)[:, 0]
+    return max(float(reduced[-1, -1] - np.nan_to_num(gained)), 0.0)
 
 
 @frozen_dataclass(eq=False)
@@ -532,6 +549,18 @@ class RigFit:
         equations = sum(observed.n_equations for observed in self.problem.observations)
         unknowns = int(self.free.sum()) + 6 * len(self.problem.scale)
         return self.cost / max(equations - unknowns, 1)
+
+
+def scatter(fit: RigFit) -> tuple[float, int]:
+    """Sum of squares of the views' poses about one rig, over that of noise, and its degrees of freedom.
+
+    It is what the common fit leaves beyond each camera alone.
+    """
+    problem = fit.problem
+    alone = sum(map(cost_alone, problem.own_normal, problem.estimated))
+    views = sum(len(observed.view) for observed in problem.observations)
+    degrees = 6 * (views - len(problem.scale)) - problem.n_rig
+    return max(fit.cost - alone, 0.0), max(degrees, 0)
 
 
 def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) -> RigFit:

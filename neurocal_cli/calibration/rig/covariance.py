@@ -1,9 +1,9 @@
 """What the covariance of a rig contains beyond the noise of independent points.
 
-* Pairs of views that contradict each other by more than noise (`rig_covariance`). The normal matrix treats
-  all points as independent. If the relative pose differs from pair to pair, only the pairs are independent.
-  The delete-one jackknife over the views then gives the covariance, without a model of the differences (Efron
-  and Stein 1981). A known change adds the square of the error that it causes.
+* Views that contradict each other by more than noise (`contradicting_covariance`). The normal matrix treats
+  all points as independent. If the relative poses differ from frame to frame, only the frames are
+  independent. The delete-one jackknife over them then gives the covariance, without a model of the
+  differences (Efron and Stein 1981).
 * A target that was estimated with the cameras, and so is uncertain as well (`with_target_uncertainty`).
 * Unknowns that the common fit left out. They are open unknowns of the common bundle adjustment, as for a
   single camera: coefficients that the selected distortion models lack (`covariance_of_choice`, see
@@ -15,7 +15,7 @@
   additional covariance N_ff^-1 N_fd S N_df N_ff^-1, and x and d are correlated. It does not fall with the
   number of points.
 
-All views share the unknowns of both cameras and of the rig; poses and target points are eliminated. The
+All views share the unknowns of the cameras and of the rig; poses and target points are eliminated. The
 derivatives by the rig's unknowns follow from those of each camera by the chain rule.
 """
 
@@ -33,8 +33,13 @@ from neurocal_cli.adjustment.board.posterior import known_sizes
 from neurocal_cli.adjustment.board.prior import prior_of_target
 from neurocal_cli.adjustment.board.surveyed import noise_variance
 from neurocal_cli.adjustment.covariance import entry_covariance
-from neurocal_cli.adjustment.leave_out import Quadratics
-from neurocal_cli.adjustment.normal_equations import Arrowhead, SchurCovariance, solve_scaled, unit_diagonal
+from neurocal_cli.adjustment.normal_equations import (
+    ROUNDING,
+    Arrowhead,
+    SchurCovariance,
+    solve_scaled,
+    unit_diagonal,
+)
 from neurocal_cli.adjustment.open_coefficients import (
     OpenCoefficients,
     OpenPrior,
@@ -42,42 +47,34 @@ from neurocal_cli.adjustment.open_coefficients import (
     spread_of_open,
 )
 from neurocal_cli.adjustment.reprojection import camera_columns
-from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState
-from neurocal_cli.calibration.rig.contradiction import Contradiction
-from neurocal_cli.calibration.rig.relative_poses import RelativePoses
+from neurocal_cli.calibration.rig.adjust import Observations, RigFit, RigProblem, RigState, scatter
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
 
 _ROUNDS = 20  # in which the moves without a frame converge, if it has less than 3/4 of the information
-_LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
+_MOST_UNKNOWNS = 80  # with which the matrices of the frames are formed instead
+_LEAST_FRAMES = 3  # fewest for a jackknife; with two, the covariance is multiplied by the scatter
 
 
-def rig_covariance(poses: RelativePoses, used: NDArray[np.bool_], found: Contradiction) -> Array:
-    """(F, F) covariance of the unknowns of the common fit of the used pairs, (P,) bool."""
-    S, _ = poses.normal(used)
-    model = solve_scaled(S, np.eye(len(S)))
-    model = 0.5 * (model + model.T)
-    if not found.is_significant:
-        return np.asarray(model)
-    if used.sum() < _LEAST_PAIRS:
-        return np.asarray(found.scatter**2 * model)
-    # Moves of the unknowns when each frame is left out, from the minimum, where their formula holds.
-    S, g = poses.cameras.S.copy(), poses.cameras.g.copy()
-    S[poses.frame[used]] += poses.pairs.S[used]
-    g[poses.frame[used]] += poses.pairs.g[used]
-    moves = Quadratics(S, g - S @ poses.solution(used), poses.cameras.cost).moves_without_each()
-    moves = moves[np.isfinite(moves).all(axis=1)]
-    spread = moves - moves.mean(axis=0)
-    by_pairs = (len(moves) - 1) / len(moves) * spread.T @ spread + 0.5 * found.shift.T @ found.shift
-    return not_smaller(model, by_pairs)
+def contradicting_covariance(fit: RigFit) -> Array:
+    """(f, f) covariance of the free shared unknowns of frames that contradict each other by more than noise.
+
+    It is not smaller than that of independent points, nor than that by the jackknife over the frames, of
+    which there must be enough.
+    """
+    model = fit.normal.only(np.flatnonzero(fit.free)).covariance().shared
+    if fit.problem.together.sum() < _LEAST_FRAMES:
+        squares, degrees = scatter(fit)
+        return np.asarray(max(squares / max(degrees, 1), 1.0) * model)
+    return not_smaller(model, covariance_over_frames(fit))
 
 
 def covariance_over_frames(fit: RigFit) -> Array:
     """(f, f) covariance of the free shared unknowns by the delete-one jackknife over the frames.
 
-    The move without frame k solves (S - S_k) x = -g_k with the frame's own part of the normal equations. The
-    matrices S_k are never formed: x = S^-1 (S_k x - g_k) is repeated.
+    The move without frame k solves (S - S_k) x = -g_k with the frame's own part of the normal equations. Of
+    many unknowns the matrices S_k are never formed: x = S^-1 (S_k x - g_k) is repeated.
     """
     problem, free = fit.problem, np.flatnonzero(fit.free)
     views = problem.view_equations(fit.state, [blocks for blocks, _ in problem.blocks(fit.state)])
@@ -96,13 +93,24 @@ def covariance_over_frames(fit: RigFit) -> Array:
         return out[:, free]
 
     whole = np.zeros((len(cross), n + 1))
-    whole[:, -1] = 1.0
+    # At the minimum, to which one step leads if the cameras were not refined.
+    whole[:, free], whole[:, -1] = -inverse @ reduced[free, -1], 1.0
     scores = of_frames(whole)
-    scores -= scores.mean(axis=0)  # at the minimum their sum is 0 up to rounding
-    moves = -scores @ inverse
-    for _ in range(_ROUNDS):
-        whole[:, free], whole[:, -1] = moves, 0.0
-        moves = (of_frames(whole) - scores) @ inverse
+    scores -= scores.mean(axis=0)  # their sum is 0 up to rounding
+    f = len(free)
+    if f <= _MOST_UNKNOWNS:
+        parts = np.empty((len(cross), f, f))
+        for k, column in enumerate(free):
+            whole[:] = 0.0
+            whole[:, column] = 1.0
+            parts[:, :, k] = of_frames(whole)
+        moves = solve_scaled(S - parts, -scores[..., None], ROUNDING)[..., 0]
+        moves = moves[np.isfinite(moves).all(axis=1)]
+    else:
+        moves = -scores @ inverse
+        for _ in range(_ROUNDS):
+            whole[:, free], whole[:, -1] = moves, 0.0
+            moves = (of_frames(whole) - scores) @ inverse
     spread = moves - moves.mean(axis=0)
     return np.asarray((len(moves) - 1) / len(moves) * spread.T @ spread)
 

@@ -1,7 +1,7 @@
 """The edges of a rig: pairs of cameras that saw common frames, and what these say about the rig.
 
 Each edge is a rig of two cameras: most of its frames agree on one relative pose, and the others have faults
-(`sound_pairs`). The best edges that reach all cameras give the poses of the rig. A view is left out if it has
+(`consensus`). The best edges that reach all cameras give the poses of the rig. A view is left out if it has
 most of the faults of its frame.
 """
 
@@ -14,18 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.reprojection import squared_errors
-from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig, stereo_problem
-from neurocal_cli.calibration.rig.contradiction import MEDIAN, SUSPECT, Contradiction, contradiction
-from neurocal_cli.calibration.rig.frames import groups
-from neurocal_cli.calibration.rig.relative_poses import RelativePoses, relative_poses
-from neurocal_cli.calibration.rig.sound_pairs import (
+from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig
+from neurocal_cli.calibration.rig.consensus import (
+    OPPOSITE,
+    PAIR_ANEW,
+    SHIFTED,
     UNSYNCHRONISED,
     RigConsensus,
-    describe_faults,
+    all_shifted,
     find_consensus,
+    with_shifted,
 )
-from neurocal_cli.calibration.verdict.findings import in_sequence
+from neurocal_cli.calibration.rig.contradiction import MEDIAN, SUSPECT, contradiction
+from neurocal_cli.calibration.rig.frames import groups
+from neurocal_cli.calibration.rig.relative_poses import relative_poses
+from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import median, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
@@ -47,9 +50,9 @@ class Edge:
     cameras: Pair  # by index
     problem: RigProblem  # of these two
     consensus: RigConsensus
-    poses: RelativePoses | None  # None if a view does not determine its pose
-    used: NDArray[np.bool_]  # (P,) pairs without a fault that has a name
-    found: Contradiction | None  # of these
+    # The views of pairs that do not agree with the others, and why: only what the uncertainty of the poses
+    # does not explain, unless the fault has a name.
+    faults: Mapping[tuple[str, str], str]
 
     @property
     def n_agreed(self) -> int:
@@ -61,19 +64,6 @@ class Edge:
         """Whether so many of its frames agree on one relative pose that it is not by chance."""
         n = len(self.consensus.reasons)
         return self.n_agreed >= min(max(_LEAST_AGREED * n, _FEWEST), n)
-
-    @property
-    def faults(self) -> dict[tuple[str, str], str]:
-        """The views of pairs that do not agree with the others, and why.
-
-        Only what the uncertainty of the poses does not explain counts, unless the fault has a name.
-        """
-        faults = dict(zip(self.problem.pairs, self.consensus.reasons, strict=True))
-        if self.poses is not None and self.found is not None:
-            odd = zip(self.poses.names, self.found.odd, strict=True)
-            faults = {pair: why for pair, why in faults.items() if why != UNSYNCHRONISED}
-            faults |= {pair: UNSYNCHRONISED for pair, is_odd in odd if is_odd}
-        return {pair: why for pair, why in faults.items() if why}
 
 
 def examined(problem: RigProblem, seen: NDArray[np.bool_]) -> list[Edge]:
@@ -107,13 +97,16 @@ def _tree(weight: NDArray[np.int_]) -> list[Pair]:
 def _edge(problem: RigProblem, pair: Pair) -> Edge:
     two = problem.of_two(*pair)
     consensus = find_consensus(two)
-    poses = relative_poses(two, consensus.rig)
     reasons = dict(zip(two.pairs, consensus.reasons, strict=True))
-    if poses is None:
-        return Edge(pair, two, consensus, None, np.zeros(0, dtype=bool), None)
-    used = np.array([reasons[name] in ("", UNSYNCHRONISED) for name in poses.names])
-    found = contradiction(poses, used) if used.any() else None
-    return Edge(pair, two, consensus, poses, used, found)
+    faults = with_shifted(two, consensus.rig, {one: why for one, why in reasons.items() if why})
+    poses = relative_poses(two, consensus.rig)
+    if poses is not None:
+        faults = {one: why for one, why in faults.items() if why != UNSYNCHRONISED}
+        used = np.array([name not in faults for name in poses.names])
+        if used.any():
+            odd = zip(poses.names, contradiction(poses, used).odd, strict=True)
+            faults |= {one: UNSYNCHRONISED for one, is_odd in odd if is_odd}
+    return Edge(pair, two, consensus, faults)
 
 
 def connected(edges: Sequence[Edge], names: Sequence[str]) -> list[Pose]:
@@ -144,20 +137,14 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
     part = min(parts, key=len)
     outer = [edge for edge in edges if (edge.cameras[0] in part) != (edge.cameras[1] in part)]
     outer.sort(key=lambda edge: -len(edge.consensus.reasons))
-    views = tuple({name for edge in edges for own in edge.problem.names for name in own})
-    order = {views[k]: place for place, k in enumerate(in_sequence(views))}
     for edge in outer:
         a, b = edge.cameras
         alone, other = (names[a], names[b]) if a in part else (names[b], names[a])
-        for by, word in ((1, "next"), (-1, "previous")):
-            if _shifted_by(edge.problem, order, by if a in part else -by):
-                return (
-                    f"the images of camera {alone} are shifted by one: they fit those of camera {other} in "
-                    "the "
-                    f"{word} frame; one image of one of them is missing or was taken twice, so name the "
-                    "views that "
-                    "were taken at the same moment alike"
-                )
+        if word := all_shifted(edge.problem):
+            return (
+                f"the images of camera {alone} are shifted by one: they fit those of camera {other} of the "
+                f"{word if a in part else OPPOSITE[word]} frame; {PAIR_ANEW}"
+            )
         larger = _size_of_right(edge.problem)
         if larger is not None:
             factor = larger if b in part else 1 / larger
@@ -168,8 +155,13 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
             )
     worst = outer[0]
     other = names[worst.cameras[worst.cameras[0] in part]]
-    faults = dict(zip(worst.problem.pairs, worst.consensus.reasons, strict=True))
-    told = describe_faults({pair: why for pair, why in faults.items() if why}, len(faults))
+    faults = {pair_name(p): why for p, why in zip(worst.problem.pairs, worst.consensus.reasons, strict=True)}
+    told = described({name: why for name, why in faults.items() if why}, len(faults), "pairs of views")
+    if len(names) == 2:
+        return (
+            f"{told}; check that both cameras took their images at the same moment, and that X,Y,Z, their "
+            "order and the unit are the same"
+        )
     return (
         f"camera {', '.join(names[k] for k in part)}: most views contradict those of all other cameras. With "
         f"{other}, {told}; check that the cameras took their images at the same moment, that each file is of "
@@ -180,19 +172,6 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
 def _agree(problem: RigProblem) -> bool:
     reasons = find_consensus(problem).reasons
     return len(reasons) >= _LEAST_FRAMES and reasons.count("") > _MOST * len(reasons)
-
-
-def _shifted_by(problem: RigProblem, order: Mapping[str, int], by: int) -> bool:
-    """Whether the left views agree with the right ones of frames that are later by a number of places."""
-    left, right = problem.names
-    partner = {order[name]: name for name in right}
-    pairs = [(name, partner[order[name] + by]) for name in left if order[name] + by in partner]
-    return bool(pairs) and _agree(stereo_problem(*_two(problem), pairs))
-
-
-def _two(problem: RigProblem) -> tuple[Calibration, Calibration]:
-    left, right = problem.calibrations
-    return left, right
 
 
 def _size_of_right(problem: RigProblem) -> float | None:
@@ -222,6 +201,21 @@ def _size_of_right(problem: RigProblem) -> float | None:
     return size if _agree(enlarged) else None
 
 
+def described(faults: Mapping[str, str], n: int, kind: str) -> str:
+    """Describe what contradicts the rig, of n of its kind: the faults with what has them, most first."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in faults.items():
+        by_reason.setdefault(reason, []).append(name)
+    most_first = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+    parts = [f"{name_some(names)}: {reason}" for reason, names in most_first]
+    return f"{len(faults)} of {n} {kind} contradict the rig ({'; '.join(parts)})"
+
+
+def pair_name(pair: tuple[str, str]) -> str:
+    """The name of a pair of views for messages."""
+    return pair[0] if pair[0] == pair[1] else f"{pair[0]}/{pair[1]}"
+
+
 def views_left_out(edges: Sequence[Edge], problem: RigProblem) -> dict[tuple[int, str], str]:
     """Views with most of the faults of their frames, by the index of the camera, and why.
 
@@ -245,18 +239,38 @@ def views_left_out(edges: Sequence[Edge], problem: RigProblem) -> dict[tuple[int
                 agreed[other] = agreed.get(other, 0) + 1
     found: dict[tuple[int, str], str] = {}
     for bad in by_frame.values():
+        if len(problem.calibrations) == 2:  # neither view can be told from the other
+            found |= {view: why for one, other, why in bad for view in (one, other)}
+            continue
         while bad:
             views = [view for one, other, _ in bad for view in (one, other)]
             worst = max(views, key=lambda view: (views.count(view), -agreed.get(view, 0)))
-            reasons = [why for one, other, why in bad if worst in (one, other)]
+            reasons = [_as_told(why, worst == one) for one, other, why in bad if worst in (one, other)]
             found[worst] = max(reasons, key=reasons.count)
             bad = [entry for entry in bad if worst not in entry[:2]]
     return found
 
 
+def _as_told(why: str, first: bool) -> str:
+    """The fault of a pair as that of its first or its second view."""
+    for word, text in SHIFTED.items():
+        if why == text:
+            return f"fits the images of the {word if first else OPPOSITE[word]} frame"
+    return why
+
+
 def is_suspect(why: str) -> bool:
     """Whether a view is only far from where the others see it, without a fault that has a name."""
     return why == UNSYNCHRONISED
+
+
+def at_fit(problem: RigProblem, fit: RigFit) -> RigFit:
+    """A problem at the cameras and the rig of a fit of some of its views, with the frames' poses refined."""
+    state = problem.start(
+        [Pose(R, t * problem.unit) for R, t in zip(fit.state.R[1:], fit.state.t[1:], strict=True)]
+    )
+    state = replace(state, cameras=fit.state.cameras)
+    return adjust_rig(problem, state, np.zeros(state.columns.n_shared, dtype=bool))
 
 
 def fitting(problem: RigProblem, fit: RigFit) -> list[NDArray[np.bool_]]:
@@ -265,11 +279,7 @@ def fitting(problem: RigProblem, fit: RigFit) -> list[NDArray[np.bool_]]:
     `problem` has frames with views that the fit left out. The linearised pose of a view of few points may
     seem far off, although the points fit the rig.
     """
-    state = problem.start(
-        [Pose(R, t * problem.unit) for R, t in zip(fit.state.R[1:], fit.state.t[1:], strict=True)]
-    )
-    state = replace(state, cameras=fit.state.cameras)
-    state = adjust_rig(problem, state, np.zeros(len(fit.free), dtype=bool)).state
+    state = at_fit(problem, fit).state
     more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
     for side, observed in enumerate(problem.observations):
         cost = observed.weight * squared_errors(observed.batches, problem.camera(state, side))

@@ -16,11 +16,11 @@ from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration, Verdict, undistorted_before
 from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.evaluation import other_images, predict, refuse_another_size
-from neurocal_cli.calibration.rig.assessment import assess_rig
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig, poses_on_rig
+from neurocal_cli.calibration.rig.assessment import assess_stereo
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo, poses_on_rig
 from neurocal_cli.calibration.rig.pairing import Pairs, ViewPairs, pair_points, pair_views
-from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError, space_error
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.rig.triangulation import Method, triangulate
 from neurocal_cli.calibration.verdict.findings import Finding
 from neurocal_cli.calibration.verdict.given_points import (
@@ -90,7 +90,7 @@ def evaluate_stereo(
     """
     left, right = on_one_target(left, right)
     try:
-        rig: Rig | None = fit_rig(left, right)
+        rig: StereoRig | None = fit_stereo(left, right)
         failure = ""
     except CoincidentCamerasError:
         raise
@@ -99,8 +99,11 @@ def evaluate_stereo(
     return _Evaluator((left, right), rig, points, method, failure).evaluation()
 
 
-def evaluate_rig(
-    rig: Rig, points: tuple[Correspondences, Correspondences] | None = None, *, method: Method = "optimal"
+def evaluate_stereo_rig(
+    rig: StereoRig,
+    points: tuple[Correspondences, Correspondences] | None = None,
+    *,
+    method: Method = "optimal",
 ) -> StereoEvaluation:
     """Evaluate a rig by the points of both cameras; see `evaluate_stereo`.
 
@@ -108,7 +111,7 @@ def evaluate_rig(
 
     Parameters
     ----------
-    rig : Rig
+    rig : StereoRig
     points : (left, right) of Correspondences, optional
         By default those that the rig was calibrated with.
     method : {"optimal", "linear", "midpoint"}
@@ -130,7 +133,7 @@ class _Evaluator:
     def __init__(
         self,
         cameras: tuple[Calibration, Calibration],
-        rig: Rig | None,
+        rig: StereoRig | None,
         points: tuple[Correspondences, Correspondences] | None,
         method: Method,
         failure: str = "",
@@ -197,7 +200,7 @@ class _Evaluator:
     def _judgement(self) -> Verdict | None:
         """The verdict on the rig by its own points."""
         if self.rig is not None:
-            return assess_rig(self.rig)
+            return assess_stereo(self.rig)
         advice = ("calibrate both cameras together: neurocal stereo",)
         return Verdict("poor", (self.failure,), advice, {})
 
@@ -227,7 +230,7 @@ class _Evaluator:
             rigs.append(Pose.exact(R, right.t - R @ left.t))
         return first, rigs
 
-    def _judged(self, rig: Rig, poses: list[Pose]) -> Verdict | None:
+    def _judged(self, rig: StereoRig, poses: list[Pose]) -> Verdict | None:
         """The verdict with the findings about the given points."""
         verdict = self._judgement()
         if verdict is None:
@@ -247,7 +250,7 @@ class _Evaluator:
             ]
         return with_findings(verdict, findings)
 
-    def _other_size(self, rig: Rig, grade: int) -> Iterator[Finding]:
+    def _other_size(self, rig: StereoRig, grade: int) -> Iterator[Finding]:
         """The finding about given points of a target of another size or unit, if that is what is wrong.
 
         The views' relative poses then have the rotation and the direction of the rig, but another baseline.
@@ -273,7 +276,7 @@ class _Evaluator:
                 "check the unit of X,Y,Z and the size of the squares",
             )
 
-    def _residuals(self, rig: Rig, poses: list[Pose], side: int) -> Array:
+    def _residuals(self, rig: StereoRig, poses: list[Pose], side: int) -> Array:
         """(N,) reprojection errors of one camera's points in the pairs [px]; nan for points behind it."""
         if side == 1:
             poses = [Pose.exact(rig.R @ pose.R, rig.R @ pose.t + rig.t) for pose in poses]

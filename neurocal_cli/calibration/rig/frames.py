@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.calibration.rig.pairing import pair_points, pair_views
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
@@ -51,6 +52,29 @@ def match_views(views: Mapping[str, Sequence[str]]) -> FrameNames:
     for own in keys:
         frames.append(np.array([place.setdefault(key, len(place)) for key in own], dtype=np.intp))
     return FrameNames(tuple(place), tuple(frames))
+
+
+def connected_frames(points: Mapping[str, Correspondences]) -> FrameNames:
+    """The frames of all views of cameras by name; those of two cameras are paired as by `pair_views`.
+
+    Raises InputError if they do not connect all cameras, or if the cameras do not see one target.
+    """
+    if len(points) > 2:
+        check_one_target(points)
+        views = match_views({name: one.view_names for name, one in points.items()})
+        seen = views.seen.astype(int)
+        together = seen[:, seen.sum(axis=0) > 1]
+        refuse_apart(list(points), together @ together.T > 0)
+        return views
+    left, right = points.values()
+    pairs = pair_views(left.view_names, right.view_names)
+    pair_points(left, right, pairs)
+    partner = {b: a for a, b in pairs.both}
+    place = {name: k for k, name in enumerate(left.view_names)}
+    others = {name: len(place) + k for k, name in enumerate(pairs.right_only)}
+    of_right = [place[partner[name]] if name in partner else others[name] for name in right.view_names]
+    names = (*left.view_names, *pairs.right_only)
+    return FrameNames(names, (np.arange(len(place)), np.array(of_right, dtype=np.intp)))
 
 
 def _without_camera(camera: str, names: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -47,7 +47,7 @@ class SpacePoints:
 
 
 def triangulate_many(
-    cameras: CameraRig | Mapping[str, Camera | Calibration],
+    cameras: Rig | Mapping[str, Camera | Calibration],
     point: ArrayLike,
     camera: Sequence[str] | NDArray[np.str_],
     pixels: ArrayLike,
@@ -59,7 +59,7 @@ def triangulate_many(
 
     Parameters
     ----------
-    cameras : CameraRig, or dict of Camera or Calibration by name
+    cameras : Rig, or dict of Camera or Calibration by name
     point : (M,) int array
         Number of the point of each row, from 0 to N - 1.
     camera : (M,) texts
@@ -76,7 +76,7 @@ def triangulate_many(
     InputError
         Arrays of different lengths, an unknown camera, or a point twice in one camera.
     """
-    if isinstance(cameras, CameraRig):
+    if isinstance(cameras, Rig):
         poses, cameras = cameras.poses, cameras.cameras
     if poses is None or set(poses) != set(cameras):
         raise InputError("the poses are not those of the cameras; give the pose of each camera")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.rig.pairing import pair_points, pair_views
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -45,7 +45,7 @@ class Rectification:
     Q: Array  # (4, 4) (u, v, disparity, 1) of the left image to homogeneous points in its rectified frame
 
 
-def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
+def rectify(rig: StereoRig, alpha: float | None = None) -> Rectification | None:
     """Rectify a rig; None where the image sizes are unknown or differ.
 
     The rectified images are scaled by alpha. With 0 all their pixels are valid, with 1 they contain all
@@ -144,7 +144,7 @@ class RectifiedPair:
         return self.matrices.R1, self.matrices.R2
 
 
-def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
+def rectified_pair(rig: StereoRig, alpha: float | None = None) -> RectifiedPair:
     """Rectify the cameras of a rig, whose images must have one known size; see `rectify`."""
     matrices = rectify(rig, alpha)
     if matrices is None:
@@ -213,7 +213,7 @@ def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences
     return RowError(float(np.median(size)), rms, float(size.max()), len(size))
 
 
-def row_error_of_rig(rig: Rig, pair: RectifiedPair) -> RowError | None:
+def row_error_of_rig(rig: StereoRig, pair: RectifiedPair) -> RowError | None:
     """Row error of the rig's own points in the pairs that determine it; None if it has no points."""
     if not rig.pairs or not len(rig.left.points) or not len(rig.right.points):
         return None

@@ -1,4 +1,4 @@
-"""A stereo rig: two cameras and their relative pose, ``X_right = R X_left + t``."""
+"""A rig of any number of cameras, with their poses relative to the first: ``X_name = R X_first + t``."""
 
 from __future__ import annotations
 
@@ -10,32 +10,41 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.presented import Presented
+from neurocal_cli.calibration.rig.pairing import pair_views
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, cross_matrix
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
+from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
+from neurocal_cli.errors import InputError
 
 
 @frozen_dataclass(eq=False)
 class Rig(Presented):
-    """Two calibrated cameras on one rig.
+    """Calibrated cameras that are fixed to each other.
 
     Attributes
     ----------
-    left, right : Calibration
-        A view of both cameras has one pose: that in the right camera is that in the left one, transformed by
-        the rig.
-    pose : Pose
-        R and t, ``X_right = R X_left + t``.
-    std : dict
-        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline [world unit].
-    covariance : (6, 6) array
-        Of R_x, R_y, R_z, t_x, t_y, t_z.
-    pairs : tuple of (left name, right name)
-        The views that determine the rig.
-    left_out : dict of str by (left name, right name)
+    cameras : dict of Calibration by name
+        A frame that several cameras saw has one pose: that in each camera follows from that in the first.
+    poses : dict of Pose by name
+        R and t, ``X_name = R X_first + t``; the first camera's is the identity.
+    std : dict of dict by name
+        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline, the distance from the first
+        camera [world unit]; 0 for the first.
+    covariance : (6 (C - 1), 6 (C - 1)) array
+        Of the angles and translations of all cameras but the first.
+    frames : dict of dict by frame
+        The views that determine the rig: of each frame that several cameras saw, the view of each camera.
+    left_out : dict of str by (camera, view)
         Views that contradict the rig, with the reason; each contributes to its own camera.
+    delays : dict of (value, std) by name
+        By how much the images of a camera were taken later than its stated times, or than those of the first
+        camera, in seconds if the rig is `timed`, else in units of the time between frames. Empty where it is
+        not estimated.
+    timed : bool
+        Whether the stated times of the images were used.
     rmse_px : float [px]
-        ``sqrt(mean(du^2 + dv^2))`` over all points of both cameras.
+        ``sqrt(mean(du^2 + dv^2))`` over all points of all cameras.
     max_px : float [px]
     converged : bool
     stop_reason : str
@@ -46,13 +55,14 @@ class Rig(Presented):
         The verdict read from a file, or the function that computes it from this rig; see `verdict`.
     """
 
-    left: Calibration
-    right: Calibration
-    pose: Pose
-    std: Mapping[str, float]
+    cameras: Mapping[str, Calibration]
+    poses: Mapping[str, Pose]
+    std: Mapping[str, Mapping[str, float]]
     covariance: Array
-    pairs: tuple[tuple[str, str], ...]
+    frames: Mapping[str, Mapping[str, str]]
     left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    timed: bool = False
     rmse_px: float = float("nan")
     max_px: float = float("nan")
     converged: bool = True
@@ -64,11 +74,9 @@ class Rig(Presented):
     _summary = ("commands.show.rig_report", "rig_report")
 
     def __repr__(self) -> str:
-        std = self.std.get("baseline", float("nan"))
         return (
-            f"Rig of {self.left.camera_name!r} and {self.right.camera_name!r}: {len(self.pairs)} pairs of "
-            f"views, rms {self.rmse_px:.4g} px\n"
-            f"  baseline {self.baseline:.6g} +- {std:.2g} {self.unit}; see .left, .right and .summary()"
+            f"Rig of {len(self.cameras)} cameras ({', '.join(self.cameras)}): {len(self.frames)} "
+            f"frames, rms {self.rmse_px:.4g} px; see .cameras, .poses and .summary()"
         )
 
     @cached_property
@@ -78,53 +86,24 @@ class Rig(Presented):
 
     @property
     def lean(self) -> Rig:
-        """Both cameras and their relative pose, without the data behind them."""
+        """The cameras and their poses, without the data behind them."""
         return replace(
             self,
-            left=self.left.lean,
-            right=self.right.lean,
-            pairs=(),
+            cameras={name: camera.lean for name, camera in self.cameras.items()},
+            frames={},
             left_out={},
             judgement=self.verdict,
         )
 
     @property
-    def R(self) -> Array:
-        """(3, 3) rotation from the left camera's frame to the right one's."""
-        return self.pose.R
+    def first(self) -> str:
+        """Name of the camera whose frame of reference the rig has."""
+        return next(iter(self.cameras))
 
     @property
-    def t(self) -> Array:
-        """(3,) centre of the left camera in the right one's frame [world unit]."""
-        return self.pose.t
-
-    @property
-    def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Views of the left camera alone and of the right camera alone."""
-        both = [*self.pairs, *self.left_out]
-        return (
-            tuple(name for name in self.left.views if name not in {a for a, _ in both}),
-            tuple(name for name in self.right.views if name not in {b for _, b in both}),
-        )
-
-    @property
-    def baseline(self) -> float:
-        """Distance of the cameras [world unit]."""
-        return float(np.linalg.norm(self.pose.t))
-
-    @property
-    def E(self) -> Array:
-        """(3, 3) essential matrix [t]x R: x_right^T E x_left = 0."""
-        return np.asarray(cross_matrix(self.t) @ self.R)
-
-    @property
-    def F(self) -> Array:
-        """(3, 3) fundamental matrix A_right^-T E A_left^-1 of unit norm: m_right^T F m_left = 0.
-
-        m are undistorted pixels.
-        """
-        F = np.linalg.solve(self.right.intrinsics.A.T, self.E) @ np.linalg.inv(self.left.intrinsics.A)
-        return np.asarray(F / np.linalg.norm(F))
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.cameras[self.first].unit
 
     @property
     def sigma(self) -> float:
@@ -132,6 +111,129 @@ class Rig(Presented):
         return self.rmse_px / float(np.sqrt(2.0))
 
     @property
-    def unit(self) -> str:
-        """Unit of the world coordinates."""
-        return self.left.unit
+    def edges(self) -> dict[tuple[str, str], int]:
+        """Number of frames that determine the rig by pairs of cameras, as far as they have any in common."""
+        names = list(self.cameras)
+        place = {name: k for k, name in enumerate(names)}
+        seen = np.zeros((len(self.frames), len(names)), dtype=int)
+        for row, views in zip(seen, self.frames.values(), strict=True):
+            row[[place[name] for name in views]] = 1
+        common = seen.T @ seen
+        return {
+            (a, b): int(common[i, j])
+            for i, a in enumerate(names)
+            for j, b in enumerate(names)
+            if i < j and common[i, j]
+        }
+
+    def pair(self, left: str, right: str) -> StereoRig:
+        """Two of the cameras as a stereo rig, with the covariance of their relative pose.
+
+        Raises InputError for a name that no camera has, or one camera given twice.
+        """
+        for name in (left, right):
+            if name not in self.cameras:
+                raise InputError(f"the rig has no camera {name!r}; give two of {', '.join(self.cameras)}")
+        if left == right:
+            raise InputError(f"{left!r} is given twice; give two cameras")
+        a, b = self.poses[left], self.poses[right]
+        R = b.R @ a.R.T
+        t = b.t - R @ a.t
+        pose = Pose(R, t)
+        if left == self.first:
+            at = 6 * (list(self.poses).index(right) - 1)
+            covariance, std = self.covariance[at : at + 6, at : at + 6], self.std[right]
+            pose = b
+        else:
+            covariance = self._relative_covariance((left, right), pose)
+            std = _named_std(covariance, t)
+        cameras = self.cameras[left], self.cameras[right]
+        pairs = tuple(
+            (views[left], views[right]) for views in self.frames.values() if {left, right} <= set(views)
+        )
+        found = StereoRig(
+            *cameras, pose, std, covariance, pairs, converged=self.converged, stop_reason=self.stop_reason,
+            iterations=self.iterations, max_px=max(camera.max_px for camera in cameras),
+        )  # fmt: skip
+        if (left, right) == tuple(self.cameras):
+            return replace(
+                found,
+                left_out=self.pairs_left_out,
+                delay=self.delays.get(right),
+                timed=self.timed,
+                rmse_px=self.rmse_px,
+                warnings=self.warnings,
+                judgement=None if self.judgement is None else (lambda _: self.verdict),
+            )
+        counts = [len(camera.points) for camera in cameras]
+        squares = sum(n * float(c.rmse_px) ** 2 for n, c in zip(counts, cameras, strict=True) if n)
+        return replace(
+            found,
+            rmse_px=(squares / sum(counts)) ** 0.5 if sum(counts) else self.rmse_px,
+            judgement=self.judgement if isinstance(self.judgement, Verdict) else None,
+        )
+
+    @property
+    def pairs_left_out(self) -> dict[tuple[str, str], str]:
+        """Of two cameras, the pairs of views that contradict the rig, with the reason."""
+        left, right = ([view for one, view in self.left_out if one == name] for name in self.cameras)
+        if not (left and right):
+            return {}
+        first = self.first
+        return {(a, b): self.left_out[first, a] for a, b in pair_views(left, right).both}
+
+    def _relative_covariance(self, names: tuple[str, str], pose: Pose) -> Array:
+        """(6, 6) covariance of the angles and the translation from one camera to another."""
+        places = {name: 6 * k + np.arange(6) for k, name in enumerate(list(self.poses)[1:])}
+        # Steps w, tau of a pose follow from its angles and translation.
+        J = np.zeros((6, len(self.covariance)))
+        R, turned = pose.R, pose.R @ self.poses[names[0]].t
+        for sign, name in zip((-1, 1), names, strict=True):
+            if name not in places:
+                continue
+            angles, shift = places[name][:3], places[name][3:]
+            turn = np.linalg.pinv(euler_jacobian(self.poses[name].R))
+            if sign > 0:  # exp(w) R_b, t_b + tau
+                J[:3, angles] = turn
+                J[3:, angles] = cross_matrix(turned) @ turn
+                J[3:, shift] = np.eye(3)
+            else:  # R_b R_a^T exp(-w), -R_b R_a^T (t_a + tau)
+                J[:3, angles] = -R @ turn
+                J[3:, angles] = -cross_matrix(turned) @ R @ turn
+                J[3:, shift] = -R
+        J[:3] = euler_jacobian(R) @ J[:3]
+        return np.asarray(J @ self.covariance @ J.T)
+
+
+def _named_std(covariance: Array, t: Array) -> dict[str, float]:
+    """Standard deviations of angles and translation by name, and of the baseline."""
+    distance = float(np.linalg.norm(t))
+    along = t / distance if distance > 0 else np.zeros(3)
+    std = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    named = dict(zip(POSE_NAMES, std.tolist(), strict=True))
+    return named | {"baseline": float(np.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)))}
+
+
+def of_two(rig: StereoRig, left: str = "left", right: str = "right") -> Rig:
+    """A stereo rig as a rig of two cameras with names."""
+    none = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
+    left_out: dict[tuple[str, str], str] = {}
+    for (a, b), why in rig.left_out.items():
+        left_out |= {(left, a): why, (right, b): why}
+    return Rig(
+        {left: rig.left, right: rig.right},
+        {left: Pose(np.eye(3), np.zeros(3)), right: rig.pose},
+        {left: none, right: rig.std},
+        rig.covariance,
+        {a: {left: a, right: b} for a, b in rig.pairs},
+        left_out,
+        {} if rig.delay is None else {right: rig.delay},
+        rig.timed,
+        rmse_px=rig.rmse_px,
+        max_px=rig.max_px,
+        converged=rig.converged,
+        stop_reason=rig.stop_reason,
+        iterations=rig.iterations,
+        warnings=rig.warnings,
+        judgement=None if rig.judgement is None else (lambda _: rig.verdict),
+    )

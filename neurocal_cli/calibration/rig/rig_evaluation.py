@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.evaluation import refuse_another_size
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.frames import check_one_target, match_views
 from neurocal_cli.calibration.rig.many_views import SpacePoints, triangulate_many
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
@@ -57,12 +57,12 @@ class RigEvaluation:
         return float(np.sqrt((self.errors**2).sum(axis=1).max()))
 
 
-def evaluate_camera_rig(rig: CameraRig, points: Mapping[str, Correspondences] | None = None) -> RigEvaluation:
+def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) -> RigEvaluation:
     """Evaluate a rig by points of its cameras.
 
     Parameters
     ----------
-    rig : CameraRig
+    rig : Rig
     points : dict of Correspondences by the name of the camera, optional
         By default those of the calibration, which gives smaller errors than new points.
 
@@ -132,7 +132,7 @@ def _rows(
     return label, frames, cameras, pixels, np.concatenate([one.world for one in points.values()])
 
 
-def _known(rig: CameraRig) -> dict[str, Pose]:
+def _known(rig: Rig) -> dict[str, Pose]:
     """Poses of the frames in the first camera."""
     found = {}
     for frame, views in rig.frames.items():
@@ -142,7 +142,7 @@ def _known(rig: CameraRig) -> dict[str, Pose]:
     return found
 
 
-def _fitted(rig: CameraRig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
+def _fitted(rig: Rig, points: Mapping[str, Correspondences]) -> dict[str, Pose]:
     """Poses of given frames in the first camera that fit all cameras of the rig best."""
     from neurocal_cli.calibration.rig.adjust import adjust_rig, rig_problem
     from neurocal_cli.calibration.rig.several_cameras import with_poses
@@ -171,7 +171,7 @@ def _fitted(rig: CameraRig, points: Mapping[str, Correspondences]) -> dict[str, 
 
 
 def _predicted(
-    rig: CameraRig, label: NDArray[np.intp], camera: list[str], pixels: Array
+    rig: Rig, label: NDArray[np.intp], camera: list[str], pixels: Array
 ) -> dict[str, tuple[int, float]]:
     """For each camera, the rms distance of its pixels from the images of what the others see."""
     names, found = np.array(camera), {}

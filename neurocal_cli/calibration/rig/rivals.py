@@ -1,9 +1,9 @@
 """Causes that make the frames of a rig contradict each other, and the one rule by which they are compared.
 
-Each cause moves what one camera sees by a few unknowns: the pose of its views, or its focal length. At the
-minimum of the common fit the gain of each follows from small matrices, with all cameras and the poses of all
-frames eliminated. What the common fit leaves beyond the cameras alone is a chi-squared variable of d degrees
-of freedom if the rig is sound. The log evidence of a cause with m unknowns and a number of choices is
+Each cause moves what one camera or all see by a few unknowns: the pose of the views, or the focal length. At
+the minimum of the common fit the gain of each follows from small matrices, with all cameras and the poses of
+all frames eliminated. What the common fit leaves beyond the cameras alone is a chi-squared variable of d
+degrees of freedom if the rig is sound. The log evidence of a cause with m unknowns and a number of choices is
 
     d/2 log(s^2 / s_m^2) - m/2 log d - log choices,
 
@@ -19,23 +19,26 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import Arrowhead, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
-from neurocal_cli.calibration.rig.adjust import Motion, RigFit
+from neurocal_cli.calibration.rig.adjust import Motion, RigFit, RigProblem, scatter
 from neurocal_cli.calibration.rig.contradiction import is_significant
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
 from neurocal_cli.calibration.verdict.rival import LEVEL
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, median
 
-_LEAST_VIEWS = 2  # of each part before and after a change
-_EXPLAINED = 0.5  # least share of what exceeds chance that a named cause explains
+_LEAST_FRAMES = 2  # of each part before and after a change
+# Least share of what exceeds chance that a named cause explains, and the same where the target's motion
+# between frames, which is known roughly, belongs to the fit.
+_EXPLAINED, _OF_MOTION = 0.5, 0.8
+_OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
 _FREE = np.array([0, 2, *POSE_COLUMNS])  # alpha_u, alpha_v and the pose of a view in its camera
 _ROUNDING = 1e-14
 
 
 @frozen_dataclass(eq=False)
 class RigCause:
-    """A cause that moves what one camera sees."""
+    """A cause that moves what one camera sees, or all cameras."""
 
     cause: str
     advice: str
@@ -44,21 +47,27 @@ class RigCause:
     limit: Limit  # of its amount
     # (V_c, 8, m): how alpha_u, alpha_v and the pose (omega, tau) of each view change with its m unknowns.
     steps: Callable[[RigFit, int, Motion | None], Array]
+    of_all: bool = False  # all cameras together, or one of them
+    # Whether it is one of two cameras against the other, so that either has it: then the second one.
+    is_mutual: bool = True
+    cost: int = 0  # number of unknowns that it counts as, if it is not its own
 
 
 @frozen_dataclass(eq=False)
 class Named:
-    """A cause that a camera has, and what the residuals say about it."""
+    """A cause that a camera has, or all have, and what the residuals say about it."""
 
     cause: RigCause
-    camera: str
-    side: int  # of the camera
+    cameras: tuple[str, ...]  # of the rig, the first one is that whose frame it has
+    side: int  # of the camera that has the cause; -1 for all
     evidence: float  # log odds over nothing
     explained: float  # share of what exceeds chance
     amounts: Array  # (m,) of its unknowns
-    last: str  # view before the change, and the first after it; "" if it is no change
+    last: str  # frame before the change, and the first after it; "" if it is no change
     first: str
-    late: NDArray[np.bool_]  # (V_c,) the views after the change
+    size: float  # typical size of the targets after a change over that before, 1 if it is no change
+    is_late: bool  # whether the smaller part of the frames is that after the change
+    apart: tuple[NDArray[np.bool_], ...]  # (V_c,) of each camera, its views that show it in the smaller part
 
     @property
     def amount(self) -> float:
@@ -71,9 +80,34 @@ class Named:
         return self.cause.limit.grade(abs(self.amount))
 
     @property
+    def mixes_units(self) -> bool:
+        """Whether the rig changed because X,Y,Z did."""
+        return self.cause in TWO_GEOMETRIES and not 1 / _OTHER_SIZE < self.size < _OTHER_SIZE
+
+    @property
     def text(self) -> str:
         """What is wrong."""
+        if self.mixes_units:
+            return f"the targets became {self.size:.3g} times as large, by their X,Y,Z, {self.between}"
         return self.cause.say(self)
+
+    @property
+    def advice(self) -> str:
+        """What to do."""
+        return (
+            "check the unit of X,Y,Z and the size of the squares" if self.mixes_units else self.cause.advice
+        )
+
+    @property
+    def between(self) -> str:
+        """The frames between which something changed."""
+        return f"between {self.last} and {self.first}"
+
+    @property
+    def camera(self) -> str:
+        """The camera that has it, as words."""
+        name = self.cameras[self.side]
+        return f"the {name} camera" if name in ("left", "right") else f"camera {name}"
 
 
 def _pose(fit: RigFit, side: int, motion: Motion | None) -> Array:
@@ -114,69 +148,79 @@ def _percent(found: Named) -> str:
     return f"{100 * found.amount:+.2g} %"
 
 
-MOVED_CAMERA = RigCause(
-    "a camera moved",
-    "calibrate each part by itself, and fix the cameras to each other",
-    lambda found: f"camera {found.camera} moved between {found.last} and {found.first}",
-    True,
-    Limit(0.0, np.inf),
-    _pose,
-)
+def _has_moved(found: Named) -> str:
+    if len(found.cameras) == 2:
+        return f"the rig moved {found.between}"
+    return f"{found.camera} moved {found.between}"
+
+
+def _is_late(found: Named) -> str:
+    when = "later" if found.amount > 0 else "earlier"
+    others = "others" if len(found.cameras) > 2 else "other"
+    return (
+        f"the images of a frame were not taken at the same moment: those of {found.camera} were taken {when} "
+        f"than those of the {others}, by {abs(found.amount):.2g} of the time between frames"
+    )
+
+
+def _has_zoomed(found: Named) -> str:
+    if found.side < 0:
+        return f"the focal lengths of all cameras changed by {_percent(found)} {found.between}"
+    return f"the focal length of {found.camera} changed by {_percent(found)} {found.between}"
+
+
+def _larger(found: Named) -> str:
+    """By how much a target is larger, seen nearer, than it should be."""
+    larger = np.expm1(-np.log1p(found.amount))
+    return f"{100 * abs(larger):.2g} % {'larger' if larger > 0 else 'smaller'}"
+
+
+def _has_another_target(found: Named) -> str:
+    return (
+        f"the target of {found.camera} is {_larger(found)} than its X,Y,Z say, compared with that of "
+        f"the other{'s' * (len(found.cameras) > 2)}"
+    )
+
+
+def _has_another_size(found: Named) -> str:
+    return (
+        f"the size of the target changed {found.between}: it is {_larger(found)} than before, compared with "
+        "X,Y,Z, as only the distances of the cameras differ (or they slid apart, or all changed their focal "
+        "length)"
+    )
+
+
+EACH_PART = "calibrate each part by itself, and fix the cameras to each other"
+"""Advice where a camera moved."""
+_SQUARES = "measure the squares of both targets, and give each target its own X,Y,Z"
+SAME_MOMENT = "trigger all cameras at the same moment, or hold the target still"
+"""Advice where images of a frame were taken at different moments."""
+_LOCK = "calibrate each part by itself, and lock zoom and focus"
+_UNIT = "check the unit of X,Y,Z and the size of the squares in this camera's points"
+_MATTERS, _ZOOMED = Limit(0.0, 0.01), Limit(0.0, 0.005)  # of relative sizes
+MOVED_CAMERA = RigCause("a camera moved", EACH_PART, _has_moved, True, Limit(0.0, np.inf), _pose)
 LATE_CAMERA = RigCause(
-    "a camera's images were taken later",
-    "trigger all cameras at the same moment, or hold the target still",
-    lambda found: (
-        f"the images of camera {found.camera} were taken {abs(found.amount):.2g} of the time between frames "
-        f"{'later' if found.amount > 0 else 'earlier'} than those of the others"
-    ),
-    False,
-    Limit(0.0, np.inf),
-    _delay,
+    "a camera's images were taken later", SAME_MOMENT, _is_late, False, Limit(0.0, np.inf), _delay
 )
+OTHER_SIZE = RigCause(
+    "the target has another size from some frame on", _SQUARES, _has_another_size, True, _MATTERS, _size,
+    of_all=True,
+)  # fmt: skip
 CAUSES = (
     MOVED_CAMERA,
     LATE_CAMERA,
+    OTHER_SIZE,
+    RigCause("a camera's focal length changed", _LOCK, _has_zoomed, True, _ZOOMED, _focal, is_mutual=False),
+    # All focal lengths together mimic small turns of the cameras.
     RigCause(
-        "a camera's focal length changed",
-        "calibrate each part by itself, and lock zoom and focus",
-        lambda found: (
-            f"the focal length of camera {found.camera} changed by {_percent(found)} between {found.last} "
-            "and "
-            f"{found.first}"
-        ),
-        True,
-        Limit(0.0, 0.01),
-        _focal,
+        "all cameras' focal lengths changed", _LOCK, _has_zoomed, True, _ZOOMED, _focal, of_all=True, cost=6
     ),
-    RigCause(
-        "one camera's target has another size",
-        "check the unit of X,Y,Z and the size of the squares in this camera's points",
-        lambda found: (
-            f"the target of camera {found.camera} is {_percent(found)} larger than its X,Y,Z say, compared "
-            "with that "
-            "of the other cameras"
-        ),
-        False,
-        Limit(0.0, 0.01),
-        _size,
-    ),
+    RigCause("one camera's target has another size", _UNIT, _has_another_target, False, _MATTERS, _size),
 )
-
-
-def scatter(fit: RigFit) -> tuple[float, int]:
-    """Sum of squares of the views' poses about one rig, over that of noise, and its degrees of freedom.
-
-    It is what the common fit leaves beyond each camera alone.
-    """
-    problem, alone = fit.problem, 0.0
-    for normal, estimated in zip(problem.own_normal, problem.estimated, strict=True):
-        shared = camera_columns(len(estimated) - 5)[np.flatnonzero(estimated)]
-        reduced, _ = Arrowhead.of(normal, shared, POSE_COLUMNS).reduced()
-        gained = reduced[-1, :-1] @ solve_scaled(reduced[:-1, :-1], reduced[:-1, -1:], _ROUNDING)[:, 0]
-        alone += float(reduced[-1, -1] - np.nan_to_num(gained))
-    views = sum(len(observed.view) for observed in problem.observations)
-    degrees = 6 * (views - len(problem.scale)) - problem.n_rig
-    return max(fit.cost - alone, 0.0), max(degrees, 0)
+TAKEN = "taken"
+"""First word of the reason for views that were taken before or after the rig changed."""
+TWO_GEOMETRIES = (MOVED_CAMERA, OTHER_SIZE)
+"""Causes after which one part of the frames determines the rig."""
 
 
 def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
@@ -185,76 +229,119 @@ def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
     return float(0.5 * degrees * np.log(without / with_them) - 0.5 * m * np.log(degrees))
 
 
-def named_cause(fit: RigFit, names: Sequence[str]) -> tuple[Named | None, float]:
-    """The cause with the largest evidence, if it is beyond doubt, and the rms left over that of noise."""
+def named_cause(
+    fit: RigFit, names: Sequence[str], causes: Sequence[RigCause] = ()
+) -> tuple[Named | None, float]:
+    """The cause with the largest evidence, if it is beyond doubt, and the rms left over that of noise.
+
+    By default all causes compete. With some of them, the cameras and the rig stay as they are.
+    """
     squares, degrees = scatter(fit)
     if not degrees:
         return None, 0.0
     rest = float(np.sqrt(squares / degrees))
     if not is_significant(squares, degrees):
         return None, rest
-    found = list(_ranked(fit, names, squares, degrees))
+    found = list(_ranked(fit, names, squares, degrees, causes))
     best = max(found, key=lambda one: one.evidence, default=None)
-    if best is None or best.evidence < LEVEL or best.explained < _EXPLAINED:
+    least = _EXPLAINED if fit.problem.motion is None else _OF_MOTION
+    if best is None or best.evidence < LEVEL or best.explained < least:
         return None, rest
     return best, float(np.sqrt(max(1.0 - best.explained, 0.0) * max(squares / degrees - 1.0, 0.0) + 1.0))
 
 
-def _ranked(fit: RigFit, names: Sequence[str], squares: float, degrees: int) -> Iterator[Named]:
+def _ranked(
+    fit: RigFit, names: Sequence[str], squares: float, degrees: int, causes: Sequence[RigCause]
+) -> Iterator[Named]:
     problem, motion = fit.problem, motion_of(fit.problem, fit.state, None)
-    free = np.flatnonzero(fit.free)
+    # Cameras that the fit did not refine may still move with a cause.
+    free = np.flatnonzero(problem.estimated_shared & (not causes))
     arrow = fit.normal.only(free)
     reduced, _ = arrow.reduced()
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
     inverse = solve_scaled(S, np.eye(len(S)))
     step = inverse @ g
-    for side, name in enumerate(names):
-        matrices = _of_camera(fit, side, arrow, free)
-        views = problem.names[side]
-        order = np.array(in_sequence(views), dtype=int)
-        together = problem.together[problem.observations[side].view]
-        order = order[together[order]]
-        for cause in CAUSES:
-            Z = cause.steps(fit, side, motion)[order]
-            if not Z.any():
+    squares = max(squares - float(g @ step), 0.0)
+    sides = range(len(names))
+    seen = [_of_camera(fit, side, free) for side in sides]
+    for cause in causes or CAUSES:
+        for subject in _subjects(cause, len(names)):
+            members = sides if subject < 0 else (subject,)
+            Z = [cause.steps(fit, side, motion) for side in members]
+            if not any(part.any() for part in Z):
                 continue
-            back = np.swapaxes(Z, 1, 2)
-            A, X, r = (
-                back @ matrices[0][order] @ Z,
-                back @ matrices[1][order],
-                back @ matrices[2][order][..., None],
-            )
-            parts = [_from_each(part) for part in (A, X, r)] if cause.is_change else [
-                part.sum(axis=0, keepdims=True) for part in (A, X, r)
-            ]  # fmt: skip
+            frames, labels = _frames_of(problem, members)
+            A, X, r = _along(arrow, frames, [seen[side] for side in members], Z)
             if cause.is_change:
-                parts = [part[_LEAST_VIEWS : len(order) - _LEAST_VIEWS + 1] for part in parts]
-            if not len(parts[0]):
+                A, X, r = (
+                    _from_each(part)[_LEAST_FRAMES : len(frames) - _LEAST_FRAMES + 1] for part in (A, X, r)
+                )
+            else:
+                A, X, r = (part.sum(axis=0, keepdims=True) for part in (A, X, r))
+            if not len(A):
                 continue
-            A, X, r = parts
             left = A - X @ inverse @ np.swapaxes(X, 1, 2)
-            right = r[..., 0] - X @ step
+            right = r - X @ step
             values = solve_scaled(left, right[..., None], _ROUNDING)[..., 0]
             gains = np.nan_to_num((values * right).sum(axis=1))
-            k, m = int(np.argmax(gains)), values.shape[1]
+            k, m = int(np.argmax(gains)), cause.cost or values.shape[1]
             gain = float(min(gains[k], squares))
-            evidence = log_evidence(squares, squares - gain, degrees, m) - np.log(len(gains) * len(names))
-            at = k + _LEAST_VIEWS if cause.is_change else 0
-            late = np.zeros(len(views), dtype=bool)
-            late[order[at:]] = True
-            ends = (views[order[at - 1]], views[order[at]]) if cause.is_change else ("", "")
-            explained = gain / max(squares - degrees, 1e-300)
+            choices = len(gains) * (1 if cause.of_all else len(names))
+            evidence = log_evidence(squares, squares - gain, degrees, m) - np.log(choices)
+            at = k + _LEAST_FRAMES if cause.is_change else 0
+            is_late = 2 * at > len(frames)
+            smaller = np.zeros(len(problem.scale), dtype=bool)
+            smaller[frames[at:] if is_late else frames[:at]] = True
+            size = 1.0
+            if cause.is_change:
+                size = float(median(problem.scale[frames[at:]]) / median(problem.scale[frames[:at]]))
+            either = cause.of_all or len(names) == 2
+            apart = tuple(
+                smaller[observed.view] & (either or side == subject)
+                for side, observed in enumerate(problem.observations)
+            )
+            ends = (labels[at - 1], labels[at]) if cause.is_change else ("", "")
+            explained = min(gain / max(squares - degrees, 1e-300), 1.0)
             yield Named(
                 cause,
-                name,
-                side,
+                tuple(names),
+                subject,
                 float(evidence),
-                float(min(explained, 1.0)),
+                float(explained),
                 values[k],
-                ends[0],
-                ends[1],
-                late,
+                *ends,
+                size,
+                is_late,
+                apart,
             )
+
+
+def _subjects(cause: RigCause, n: int) -> Sequence[int]:
+    """The cameras that may have a cause, by index; -1 is all."""
+    if cause.of_all:
+        return (-1,)
+    return (1,) if n == 2 and cause.is_mutual else range(n)
+
+
+def _frames_of(problem: RigProblem, members: Sequence[int]) -> tuple[NDArray[np.intp], list[str]]:
+    """The frames of the rig that some cameras saw, in the order of their names, and words for them."""
+    views: dict[int, list[str]] = {}
+    for side in members:
+        for name, frame in zip(problem.names[side], problem.observations[side].view.tolist(), strict=True):
+            if problem.together[frame]:
+                views.setdefault(frame, []).append(name)
+    places = list(views)
+    # Of two cameras a frame is the pair of their views.
+    if len(problem.names) == 2:
+        for side in (0, 1):
+            for name, frame in zip(
+                problem.names[side], problem.observations[side].view.tolist(), strict=True
+            ):
+                if frame in views and name not in views[frame]:
+                    views[frame].insert(side, name)
+    order = in_sequence(tuple(views[place][0] for place in places))
+    labels = ["/".join(views[places[k]][: 2 if len(problem.names) == 2 else 1]) for k in order]
+    return np.array(places, dtype=np.intp)[order], labels
 
 
 def _from_each(values: Array) -> Array:
@@ -262,43 +349,60 @@ def _from_each(values: Array) -> Array:
     return np.asarray(np.cumsum(values[::-1], axis=0)[::-1])
 
 
-def _of_camera(
-    fit: RigFit, side: int, arrow: Arrowhead, free: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """What a camera's views say about what moves in them, with the poses of the frames eliminated.
+@frozen_dataclass(eq=False)
+class _Seen:
+    """What a camera's views say about what moves in them, by alpha_u, alpha_v and the pose of each."""
 
-    The information (V_c, 8, 8), the coupling to the free shared unknowns (V_c, 8, f), the right sides (V_c,
-    8).
-    """
+    frame: NDArray[np.intp]  # (V_c,)
+    own: Array  # (V_c, 8, 8)
+    by_frame: Array  # (V_c, 6, 8) coupling to the pose of the frame
+    by_shared: Array  # (V_c, 8, f) and to the free shared unknowns
+    right: Array  # (V_c, 8)
+
+
+def _of_camera(fit: RigFit, side: int, free: NDArray[np.intp]) -> _Seen:
     problem, state = fit.problem, fit.state
     observed = problem.observations[side]
     N = observed.weight * normal_blocks(observed.batches, problem.camera(state, side))[0]
-    K = len(state.cameras[side].k)
     of_rig, by_rig, by_pose = problem.pose_steps(state, side)
-    P = N[:, _FREE[:, None], _FREE]
-    own = np.swapaxes(by_pose, 1, 2) @ N[:, POSE_COLUMNS[:, None], _FREE]  # (V_c, 6, 8)
     shared = np.zeros((len(N), 8, len(fit.free)))
-    shared[:, :, state.columns.cameras[side]] = N[:, _FREE[:, None], camera_columns(K)]
+    shared[:, :, state.columns.cameras[side]] = N[
+        :, _FREE[:, None], camera_columns(len(state.cameras[side].k))
+    ]
     shared[:, :, of_rig] = N[:, _FREE[:, None], POSE_COLUMNS] @ by_rig
-    frame = observed.view
-    solved = solve_scaled(arrow.own[frame], own)  # O^-1 a
-    back = np.swapaxes(solved, 1, 2)
-    cross = arrow.cross[frame]
-    return (
-        P - np.swapaxes(own, 1, 2) @ solved,
-        shared[:, :, free] - back @ cross[:, :, :-1],
-        N[:, _FREE, -1] - (back @ cross[:, :, -1:])[..., 0],
+    return _Seen(
+        observed.view,
+        N[:, _FREE[:, None], _FREE],
+        np.swapaxes(by_pose, 1, 2) @ N[:, POSE_COLUMNS[:, None], _FREE],
+        shared[:, :, free],
+        N[:, _FREE, -1],
     )
 
 
-def without_a_part(fit: RigFit, found: Named) -> tuple[bool, list[NDArray[np.bool_]]]:
-    """Which views of each camera, (V_c,), to leave out: the smaller part of those of a camera that moved.
+def _along(
+    arrow: Arrowhead, frames: NDArray[np.intp], seen: Sequence[_Seen], Z: Sequence[Array]
+) -> tuple[Array, Array, Array]:
+    """What some frames say about the unknowns of a cause, with the poses of the frames eliminated.
 
-    Also returns whether it is the later part.
+    The information (F, m, m), the coupling to the free shared unknowns (F, m, f), the right sides (F, m).
     """
-    apart = [np.zeros(len(own), dtype=bool) for own in fit.problem.names]
-    together = fit.problem.together[fit.problem.observations[found.side].view]
-    late, early = found.late & together, ~found.late & together
-    later = bool(late.sum() < early.sum())
-    apart[found.side] = late if later else early
-    return later, apart
+    place = np.full(len(arrow.own), -1)
+    place[frames] = np.arange(len(frames))
+    m, f = Z[0].shape[2], seen[0].by_shared.shape[2]
+    A, a = np.zeros((len(frames), m, m)), np.zeros((len(frames), 6, m))
+    X, r = np.zeros((len(frames), m, f)), np.zeros((len(frames), m))
+    for one, steps in zip(seen, Z, strict=True):
+        inside = place[one.frame] >= 0
+        rows, steps = place[one.frame[inside]], steps[inside]
+        back = np.swapaxes(steps, 1, 2)
+        A[rows] += back @ one.own[inside] @ steps
+        a[rows] += one.by_frame[inside] @ steps
+        X[rows] += back @ one.by_shared[inside]
+        r[rows] += (back @ one.right[inside][..., None])[..., 0]
+    back = np.swapaxes(solve_scaled(arrow.own[frames], a), 1, 2)
+    cross = arrow.cross[frames]
+    return (
+        A - back @ a,
+        X - back @ cross[:, :, :-1],
+        r - (back @ cross[:, :, -1:])[..., 0],
+    )

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.rectification import rectify
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.rig.two_view_points import PointBatch, WidePointBatch
 from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.distortion import Distortion
@@ -76,7 +76,9 @@ class Triangulated:
 
 
 @overload
-def triangulate(left: Rig, right: Array, pose: Array, /, *, method: Method = "optimal") -> Triangulated: ...
+def triangulate(
+    left: StereoRig, right: Array, pose: Array, /, *, method: Method = "optimal"
+) -> Triangulated: ...
 
 
 @overload
@@ -130,7 +132,7 @@ def triangulate(
         Arrays of different lengths or wrong shapes, or a rig that is no Pose.
     """
     check_choice("method", method, METHODS)
-    if isinstance(left, Rig):
+    if isinstance(left, StereoRig):
         left, right, pose, left_pixels, right_pixels = left.left, left.right, left.pose, right, pose
     pixels = _pixels(left_pixels), _pixels(right_pixels)
     n = len(pixels[0])
@@ -185,7 +187,7 @@ def epipolar_limit(sigma: float) -> float:
     return _EPIPOLAR_SIGMAS * sigma
 
 
-def fault_of_matches(rig: Rig, left: Array, right: Array, limit: float) -> str:
+def fault_of_matches(rig: StereoRig, left: Array, right: Array, limit: float) -> str:
     """Name the mistake that keeps matches (N, 2) and (N, 2) [px] from fitting a rig, and what to do.
 
     `limit` is the largest epipolar error [px] of a match that fits. "" if no known mistake explains them.
@@ -206,7 +208,7 @@ def fault_of_matches(rig: Rig, left: Array, right: Array, limit: float) -> str:
     return ""
 
 
-def _tries(rig: Rig, left: Array, right: Array) -> Iterator[_Try]:
+def _tries(rig: StereoRig, left: Array, right: Array) -> Iterator[_Try]:
     """Each mistake with what to do, and the cameras, the rig and the pixels without it."""
     cameras, pose = (rig.left.camera, rig.right.camera), rig.pose
     sides = "the left and the right pixels are exchanged; give uL,vL of the left camera"

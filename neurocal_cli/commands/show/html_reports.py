@@ -9,15 +9,13 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.evaluation import predict
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_report import parameter_rows
-from neurocal_cli.commands.show.camera_rig_report import camera_rows as named_camera_rows
-from neurocal_cli.commands.show.camera_rig_report import pose_rows
 from neurocal_cli.commands.show.html_page import (
     Origin,
     definitions,
@@ -32,7 +30,9 @@ from neurocal_cli.commands.show.html_page import (
     table,
     verdict_block,
 )
-from neurocal_cli.commands.show.rig_report import camera_rows, pair_name, rig_rows
+from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
+from neurocal_cli.commands.show.rig_report import pose_rows
+from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
 from neurocal_cli.commands.show.text import printable, rounded
 from neurocal_cli.commands.show.zoom_report import lens_report
 from neurocal_cli.errors import InputError
@@ -61,8 +61,8 @@ def calibration_page(
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
 
-def rig_page(
-    rig: Rig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
+def stereo_page(
+    rig: StereoRig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
 ) -> str:
     """Make the page of a rig; see `calibration_page`."""
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
@@ -89,7 +89,7 @@ def rig_page(
     return page("Calibration of two cameras", parts)
 
 
-def camera_rig_page(rig: CameraRig, origin: Origin) -> str:
+def rig_page(rig: Rig, origin: Origin) -> str:
     """Make the page of a rig of any number of cameras; see `calibration_page`."""
     cameras, first = list(rig.cameras), printable(rig.first)
     head = f"{len(cameras)} cameras connected by {len(rig.frames)} frames, rms {rig.rmse_px:.4g} px"

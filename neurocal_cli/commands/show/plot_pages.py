@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of, targets_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
@@ -41,7 +41,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
     return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, title, _PAGE, kind)
 
 
-def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
+def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> bytes:
     """Draw both cameras of a rig side by side, or one of `RIG_PANELS` for both; see `draw_camera`."""
     sides = {"left": Subject.of(rig.left), "right": Subject.of(rig.right)}
     panels: dict[str, Draw] = {
@@ -65,7 +65,7 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
     return _page(rows, (1,) * len(rows), panels, title, size, kind)
 
 
-def draw_camera_rig(rig: CameraRig, kind: str = "png", panel: str | None = None) -> bytes:
+def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
     """Draw the cameras of a rig, and the targets of all frames as one of the cameras saw them, in space."""
     of_frames = {next(iter(views.items())) for views in rig.frames.values()}
     targets = [
@@ -93,7 +93,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 
 
 def draw_points_in_space(
-    evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
+    evaluation: StereoEvaluation, rig: StereoRig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
     """Draw the errors of triangulated points, or one of `SPACE_PANELS`; see `draw_camera`."""
     found = evaluation.by_view if evaluation.rig is None else evaluation.rig

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 from neurocal_cli.calibration.advice import advise
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.errors import InputError, UsageError, check_choice
 
-Result = Calibration | Rig | CameraRig | ZoomLens
+Result = Calibration | StereoRig | Rig | ZoomLens
 
 _KINDS = ("png", "svg", "pdf")
 
@@ -32,7 +32,7 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
 
     Parameters
     ----------
-    result : Calibration, Rig, CameraRig or ZoomLens
+    result : Calibration, StereoRig, Rig or ZoomLens
     photographs : dict of bytes by view, optional
         JPEG files of the views of a Calibration.
 
@@ -48,9 +48,9 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
     from neurocal_cli.commands.show.html_page import Origin, versions
     from neurocal_cli.commands.show.html_reports import (
         calibration_page,
-        camera_rig_page,
         lens_page,
         rig_page,
+        stereo_page,
     )
 
     origin = Origin({}, versions=versions())
@@ -58,9 +58,9 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
         return calibration_page(result, origin, photographs)
     if photographs:
         raise UsageError("only the page of a Calibration shows photographs; leave them out")
-    if isinstance(result, Rig):
-        return rig_page(result, origin)
-    return camera_rig_page(result, origin) if isinstance(result, CameraRig) else lens_page(result, origin)
+    if isinstance(result, StereoRig):
+        return stereo_page(result, origin)
+    return rig_page(result, origin) if isinstance(result, Rig) else lens_page(result, origin)
 
 
 def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture:
@@ -68,7 +68,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
 
     Parameters
     ----------
-    result : Calibration, Rig, CameraRig or ZoomLens
+    result : Calibration, StereoRig, Rig or ZoomLens
     panel : str, optional
         One panel of a camera or a pair: residuals, coverage, uncertainty, scatter, poses, learning, views; or
         ``next``, the views of a camera to take next. Default: all panels on a page.
@@ -91,7 +91,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
         from neurocal_cli.commands.show.advice import draw_advice
 
         return Picture(draw_advice(advise(result), result, kind))
-    panels = CAMERA_PANELS if isinstance(result, (Calibration, Rig)) else ()
+    panels = CAMERA_PANELS if isinstance(result, (Calibration, StereoRig)) else ()
     if panel is not None:
         if not panels:
             raise UsageError("this result has a single picture; leave out panel")
@@ -100,12 +100,12 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
         from neurocal_cli.commands.show.zoom_plots import draw_lens
 
         return Picture(draw_lens(result, kind))
-    from neurocal_cli.commands.show.plot_pages import draw_camera, draw_camera_rig, draw_rig
+    from neurocal_cli.commands.show.plot_pages import draw_camera, draw_rig, draw_stereo
 
-    if isinstance(result, CameraRig):
-        return Picture(draw_camera_rig(result, kind))
     if isinstance(result, Rig):
-        return Picture(draw_rig(result, kind, panel))
+        return Picture(draw_rig(result, kind))
+    if isinstance(result, StereoRig):
+        return Picture(draw_stereo(result, kind, panel))
     if not len(result.points):
         raise InputError("the calibration holds no points; give one that was not written with --lean")
     from neurocal_cli.commands.show.camera_panels import Subject

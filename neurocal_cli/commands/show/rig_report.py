@@ -1,23 +1,19 @@
-"""A rig and its errors in space, as text, as rows of tables and as JSON."""
+"""A rig of any number of cameras as text and as JSON."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.space_error import SpaceError
-from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.calibration.rig.rig_evaluation import RigEvaluation
 from neurocal_cli.camera.pinhole import POSE_NAMES
 from neurocal_cli.commands.show.camera_report import calibration_json, target_lines
 from neurocal_cli.commands.show.text import (
-    UNITS,
     Table,
     align,
-    align_views,
     joined,
-    labelled,
+    number,
     number_or_none,
     parameters,
     printable,
@@ -26,114 +22,114 @@ from neurocal_cli.commands.show.text import (
     verdict_lines,
 )
 from neurocal_cli.errors import plural
+from neurocal_cli.simulation.rigs import RigStudy
 
-_MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
-_NAMED = 10  # views named in a remark
-_ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
+_SHOWN = ("alpha_u", "alpha_v", "u0", "v0")
+_MOST_EDGES = 20  # rows of a table that fit on a screen
 
 
 def rig_report(rig: Rig) -> str:
-    """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
-    headline = [f"rig: {plural(len(rig.pairs), 'pair')} of views"]
-    for name, camera in (("left", rig.left), ("right", rig.right)):
-        seen = f"{plural(len(camera.points), 'point')} in {plural(len(camera.views), 'view')}"
-        headline.append(f"{name} {seen}")
-    pairs = []
-    for a, b in rig.pairs:
-        views = rig.left.views[a], rig.right.views[b]
-        cells = [cell for view in views for cell in (str(view.n_points), _figure(view.rmse_px))]
-        pairs.append((max(view.rmse_px for view in views), [pair_name(a, b), *cells]))
+    """Summary of a calibrated rig: its cameras, their poses, the edges, the fit and the verdict."""
+    frames = plural(len(rig.frames), "frame")
+    headline = f"rig: {plural(len(rig.cameras), 'camera')} connected by {frames}"
     return joined(
-        [", ".join(headline)],
-        align(camera_rows(rig)),
-        align(rig_rows(rig)),
-        align_views(["view", "left points", "rms [px]", "right points", "rms [px]"], pairs, "pairs"),
+        [headline],
+        *map(align, camera_rows(rig)),
+        *map(align, pose_rows(rig)),
+        _edge_lines(rig),
         _fit_lines(rig),
         verdict_lines(rig.verdict),
     )
 
 
-def pair_name(left: str, right: str) -> str:
-    """The names of the views of a pair, or the one that both have."""
-    return printable(left if left == right else f"{left} / {right}")
+def camera_rows(rig: Rig) -> tuple[Table, Table]:
+    """What each camera saw with its lens, and its main parameters: a row for each camera."""
+    seen = [["camera", "views", "points", "distortion", "rms [px]"]]
+    found = [["camera", *(f"{name} [px]" for name in _SHOWN)]]
+    for name, camera in rig.cameras.items():
+        counts = str(len(camera.views)), str(len(camera.points))
+        seen.append([printable(name), *counts, camera.distortion_model, number(camera.rmse_px, "#.4g")])
+        values = parameters(camera)
+        found.append(
+            [
+                printable(name),
+                *(
+                    f"{values[key]:.7g} fixed"
+                    if key in camera.fixed
+                    else _with_std(values[key], camera.std.get(key, math.nan))
+                    for key in _SHOWN
+                ),
+            ]
+        )
+    return seen, found
 
 
-def camera_rows(rig: Rig) -> Table:
-    """Both cameras' parameters side by side."""
-    rows = [["parameter", "left", "std", "right", "std"]]
-    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
-    cells = [
-        {
-            name: (f"{value:.7g}", "fixed")
-            if name in camera.fixed
-            else rounded(value, camera.std.get(name, math.nan))
-            for name, value in parameters(camera).items()
-        }
-        for camera in (rig.left, rig.right)
-    ]
-    for name in dict.fromkeys(name for own in sorted(cells, key=len, reverse=True) for name in own):
-        estimates = [cell for own in cells for cell in own.get(name, ("", ""))]
-        rows.append([labelled(name, UNITS.get(name, "")), *estimates])
-    return rows
+def pose_rows(rig: Rig) -> tuple[Table, Table]:
+    """Angles and translations of each camera but the first."""
+    heading, length = f"X = R X_{printable(rig.first)} + t", printable(rig.unit)
+    turns = [[heading, *(f"{name} [rad]" for name in POSE_NAMES[:3])]]
+    shifts = [["", *(f"{name} [{length}]" for name in POSE_NAMES[3:]), f"distance [{length}]"]]
+    for name, pose in list(rig.poses.items())[1:]:
+        values = dict(zip(POSE_NAMES, [*pose.euler.tolist(), *pose.t.tolist()], strict=True))
+        std = rig.std[name]
+        cells = [_with_std(values[key], std[key]) for key in POSE_NAMES]
+        distance = math.sqrt(float(pose.t @ pose.t))
+        turns.append([printable(name), *cells[:3]])
+        shifts.append([printable(name), *cells[3:], _with_std(distance, std["baseline"])])
+    return turns, shifts
 
 
-def rig_rows(rig: Rig) -> Table:
-    """Rows of the pose of the right camera and the baseline, with their standard deviations."""
-    rows = [["X_right = R X_left + t", "value", "std"]]
-    length = printable(rig.unit)
-    for name, value in _pose_values(rig).items():
-        unit = "rad" if name.startswith("R") else length
-        rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
-    return [*rows, [f"baseline [{length}]", *rounded(rig.baseline, rig.std["baseline"])]]
+def _with_std(value: float, std: float) -> str:
+    return " +- ".join(rounded(value, std))
 
 
-def _pose_values(rig: Rig) -> dict[str, float]:
-    return dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
+def _edge_lines(rig: Rig) -> list[str]:
+    """Pairs of cameras with their common frames, those with most frames first."""
+    edges = sorted(rig.edges.items(), key=lambda edge: -edge[1])
+    if not edges:
+        return []
+    told = [f"{printable(a)}-{printable(b)} {count}" for (a, b), count in edges[:_MOST_EDGES]]
+    more = f" and {len(edges) - _MOST_EDGES} more pairs" if len(edges) > _MOST_EDGES else ""
+    return [f"common frames: {', '.join(told)}{more}"]
 
 
 def _fit_lines(rig: Rig) -> list[str]:
-    """How the cameras and the rig were fitted, and what the fit found."""
-    lines = []
-    for name, camera in (("left", rig.left), ("right", rig.right)):
-        record = camera.network
-        if record is not None:
-            lines.append(
-                f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
-                f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
-            )
-    lines.append(
-        f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+    lines = [
+        f"bundle adjustment: rms {number(rig.rmse_px, '#.4g')} px, maximum {number(rig.max_px, '#.4g')} "
+        "px, after "
         f"{plural(rig.iterations, 'iteration')}"
-    )
-    lines += target_lines(rig.left.target or rig.right.target, rig.unit)
-    measures = {} if rig.verdict is None else rig.verdict.measures
-    growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
-    if growth > _MUCH_WORSE:
-        lines.append(
-            f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
-            f"it is {growth:.2g} times as much"
-        )
+    ]
+    if rig.delays:
+        unit = "s" if rig.timed else "of the time between frames"
+        told = ", ".join(f"{printable(name)} {_with_std(*delay)}" for name, delay in rig.delays.items())
+        lines.append(f"images later than those of {printable(rig.first)}: {told} {unit}")
+    if rig.left_out:
+        lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
+    lines += target_lines(rig.cameras[rig.first].target, rig.unit)
     return [*lines, rig.stop_reason]
 
 
 def rig_json(rig: Rig) -> dict[str, Any]:
     """The summary of a rig as JSON values; None for numbers that do not exist."""
     return {
-        "left": calibration_json(rig.left),
-        "right": calibration_json(rig.right),
+        "cameras": {name: calibration_json(camera) for name, camera in rig.cameras.items()},
         "unit": rig.unit,
-        "R": rig.R.tolist(),
-        "t": rig.t.tolist(),
-        "baseline": rig.baseline,
-        "parameters": {
-            name: {"value": value, "std": number_or_none(rig.std[name])}
-            for name, value in _pose_values(rig).items()
+        "poses": {
+            name: {
+                "R": pose.R.tolist(),
+                "t": pose.t.tolist(),
+                "std": {key: number_or_none(value) for key, value in rig.std[name].items()},
+            }
+            for name, pose in rig.poses.items()
         },
-        "baseline_std": number_or_none(rig.std["baseline"]),
+        "edges": [{"cameras": list(pair), "views": count} for pair, count in rig.edges.items()],
+        "delays": {
+            name: {"value": value, "std": number_or_none(std)} for name, (value, std) in rig.delays.items()
+        },
+        "timed": rig.timed,
         "rmse_px": number_or_none(rig.rmse_px),
         "max_px": number_or_none(rig.max_px),
-        "pairs": [list(pair) for pair in rig.pairs],
-        "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
+        "left_out": [[*view, why] for view, why in rig.left_out.items()],
         "converged": bool(rig.converged),
         "stop_reason": str.__str__(rig.stop_reason),
         "warnings": list(rig.warnings),
@@ -141,93 +137,67 @@ def rig_json(rig: Rig) -> dict[str, Any]:
     }
 
 
-def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
-    """Remarks that name the views of one camera alone."""
-    return [
-        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
-        + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
-        for side, names in zip(("left", "right"), alone, strict=True)
-        if names
-    ]
+def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
+    """Rows of the tables of all points, of the cameras and of the frames, each with its heading."""
+    unit = printable(evaluation.unit)
+    x, y, z = evaluation.by_axis.tolist()
+    overall = [[f"[{unit}]", "all cameras"]]
+    for label, value in (("X rms", x), ("Y rms", y), ("Z rms", z), ("rms", evaluation.rmse)):
+        overall.append([label, number(value, "#.4g")])
+    overall += [["maximum", number(evaluation.largest, "#.4g")], ["points", str(len(evaluation.errors))]]
+    cameras = [["camera", "points", "rms from the other cameras' prediction [px]"]]
+    for name, (count, error) in evaluation.predicted.items():
+        cameras.append([printable(name), str(count), number(error, "#.4g")])
+    frames = [["frame", f"rms [{unit}]"]]
+    worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
+    frames += [[printable(name), number(error, "#.4g")] for name, error in worst]
+    return (overall, cameras, frames)
 
 
-def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
-    """Rows of the tables of all points, of the depths and of the views, each with its heading."""
-    unit = evaluation.unit
-    ways, heads = [evaluation.by_view], ["poses of each view"]
-    if evaluation.rig is not None:
-        if math.isclose(evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4):
-            ways, heads = [], []  # both are equal for a rig or a single view
-        ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
-    overall = [[f"[{unit}]", *heads]]
-    for label, name in (
-        ("X rms", "rmse_x"),
-        ("Y rms", "rmse_y"),
-        ("Z (depth) rms", "rmse_z"),
-        ("rms", "rmse"),
-        ("maximum", "max"),
-        ("rms / depth", "relative"),
-        ("NSCE", "nsce"),
-        ("epipolar rms [px]", "epipolar_px"),
-    ):
-        values = [getattr(way, name) for way in ways]
-        overall.append([label, *(_share(v) if name == "relative" else _figure(v) for v in values)])
-    overall.append(["points", *(str(way.n_points) for way in ways)])
-    for side, model in zip(("left", "right"), evaluation.models, strict=True):
-        overall.append([f"{side} distortion model", model, *([""] * (len(ways) - 1))])
-    depths = [[f"depth [{unit}]", "points", f"rms [{unit}]", "rms / depth"]]
-    for part in ways[-1].depths:
-        span = f"{_figure(part.nearest)} - {_figure(part.farthest)}"
-        depths.append([span, str(part.n_points), _figure(part.rmse), _share(part.relative)])
-    views = [["view", "points", *(f"{head} [{unit}]" for head in heads)]]
-    right_names = dict(evaluation.pairs)
-    for name, (count, _) in ways[0].views.items():
-        errors = [_figure(way.views.get(name, (0, math.nan))[1]) for way in ways]
-        views.append([pair_name(name, right_names[name]), str(count), *errors])
-    return (overall, depths, views) if len(views) > 2 else (overall, depths)
-
-
-def _figure(value: float) -> str:
-    """Four significant digits."""
-    if not math.isfinite(value):
-        return "-"
-    if value != 0 and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.3e}"
-    return f"{value:#.4g}".rstrip(".")
-
-
-def _share(value: float) -> str:
-    return f"{two_digits(100 * value)} %" if math.isfinite(value) else "-"
-
-
-def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
+def rig_evaluation_json(evaluation: RigEvaluation) -> dict[str, Any]:
     """An evaluation as JSON values; None for numbers that do not exist."""
+    x, y, z = evaluation.by_axis.tolist()
     return {
-        **_error_json(evaluation.by_view),
+        "n_points": len(evaluation.errors),
+        "n_behind": evaluation.n_behind,
         "unit": evaluation.unit,
-        "baseline": number_or_none(evaluation.baseline),
-        "pairs": [list(pair) for pair in evaluation.pairs],
-        "fitted_views": list(evaluation.fitted),
-        "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
-        "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
+        "rmse": evaluation.rmse,
+        "rmse_x": x,
+        "rmse_y": y,
+        "rmse_z": z,
+        "max": evaluation.largest,
+        "fitted": evaluation.fitted,
+        "cameras": {
+            name: {"n_points": count, "predicted_rmse_px": number_or_none(error)}
+            for name, (count, error) in evaluation.predicted.items()
+        },
+        "frames": evaluation.frames,
         **verdict_json(evaluation.verdict),
     }
 
 
-def _error_json(error: SpaceError) -> dict[str, Any]:
+def rig_study_table(study: RigStudy) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Titles and rows of the table of a simulated rig, and a line below it."""
+    rows = [["sigma [px]", "rms [px]", "place [mm]", "rotation [rad]", "error / std"]]
+    columns = study.sigma, study.rmse_px, study.centre, study.rotation, study.over_std
+    for noise, rmse, centre, rotation, ratio in zip(*columns, strict=True):
+        rows.append([f"{noise:g}", f"{rmse:.4g}", f"{centre:.4g}", f"{rotation:.3g}", f"{ratio:.2f}"])
+    n, frames = len(study.rig.cameras), len(study.rig.frames)
+    title = f"rms errors of {n} cameras in {plural(study.trials, 'trial')}, {frames} frames"
+    return [(title, rows)], ["error / std is 1 where the reported standard deviations are right"]
+
+
+def rig_study_json(study: RigStudy) -> dict[str, Any]:
+    """The study of a simulated rig as JSON values."""
     return {
-        "n_points": error.n_points,
-        "n_behind": error.n_behind,
-        **{name: number_or_none(getattr(error, name)) for name in _ERRORS},
-        "views": {name: number_or_none(rmse) for name, (_, rmse) in error.views.items()},
-        "depths": [
-            {
-                "from": part.nearest,
-                "to": part.farthest,
-                "n_points": part.n_points,
-                "rmse": part.rmse,
-                "relative": part.relative,
-            }
-            for part in error.depths
-        ],
+        "trials": study.trials,
+        "frames": len(study.rig.frames),
+        "sigma_px": list(study.sigma),
+        "rmse_px": list(study.rmse_px),
+        "place_mm": list(study.centre),
+        "rotation_rad": list(study.rotation),
+        "error_over_std": list(study.over_std),
+        "poses": {
+            name: {"R": pose.R.tolist(), "t": pose.t.tolist()} for name, pose in study.rig.relative.items()
+        },
     }

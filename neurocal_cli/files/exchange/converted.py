@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.presented import Converted
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.errors import check_choice
 from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
 from neurocal_cli.files.exchange.neurocal import camera_set
@@ -15,7 +15,7 @@ from neurocal_cli.files.exchange.reading import FORMATS
 
 
 def converted(
-    result: Calibration | Rig | CameraRig, to: str, model: str | None, force: bool, ending: str
+    result: Calibration | StereoRig | Rig, to: str, model: str | None, force: bool, ending: str
 ) -> Converted:
     """Convert a result; see `Presented.convert`."""
     check_choice("to", to, tuple(FORMATS))

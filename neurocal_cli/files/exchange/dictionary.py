@@ -26,7 +26,7 @@ from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.file_storage import storage_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import nested
@@ -206,7 +206,7 @@ def entries(cameras: CameraSet) -> dict[str, Any]:
     if cameras.relative:
         (pose,) = cameras.relative
         tree |= {"R": pose.R, "T": pose.t[:, None]}
-        rig = as_rig(cameras)
+        rig = as_stereo(cameras)
         tree |= {"E": rig.E, "F": rig.F}
         rectified = rectify(rig)
         if rectified is not None:

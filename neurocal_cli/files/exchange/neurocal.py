@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, ViewResult
-from neurocal_cli.calibration.rig.camera_rig import CameraRig
 from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES
@@ -21,12 +21,12 @@ from neurocal_cli.files.calibration_tree import (
     neurocal_block,
 )
 from neurocal_cli.files.calibration_yaml import format_calibration
-from neurocal_cli.files.camera_rig_yaml import camera_rig_from_field, format_camera_rig
 from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.rig_yaml import format_rig, rig_from_field
+from neurocal_cli.files.stereo_yaml import format_stereo_rig, stereo_from_field
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
 
@@ -42,8 +42,8 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
             kind = "rig" if "rig" in root else "stereo rig"
             root.refuse(f"is a {kind}; give the file of one camera")
         if "rig" in root and "stereo" not in root:
-            return camera_set(camera_rig_from_field(root))
-        return camera_set(rig_from_field(root))
+            return camera_set(rig_from_field(root))
+        return camera_set(stereo_from_field(root))
     if not whole:
         intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
         name = root.get("camera_name", "camera").text()
@@ -64,9 +64,9 @@ def without_points(root: Field, camera: CameraSet) -> Calibration:
     return replace(calibration, covariance=covariance, covariance_names=names)
 
 
-def camera_set(result: Calibration | Rig | CameraRig) -> CameraSet:
+def camera_set(result: Calibration | StereoRig | Rig) -> CameraSet:
     """Convert a calibration or a rig to a camera set, which refers to it as its origin."""
-    if isinstance(result, CameraRig):
+    if isinstance(result, Rig):
         unit = None if result.unit == _UNKNOWN else result.unit
         cameras = tuple(replace(one.camera, name=name) for name, one in result.cameras.items())
         poses = {name: view.pose for name, view in result.cameras[result.first].views.items()}
@@ -79,9 +79,9 @@ def camera_set(result: Calibration | Rig | CameraRig) -> CameraSet:
     return CameraSet((left.camera, result.right.camera), (result.pose,), poses, unit, result, "neurocal")
 
 
-def as_rig(cameras: CameraSet) -> Rig:
+def as_stereo(cameras: CameraSet) -> StereoRig:
     """Convert two cameras to a rig; without points unless they come from a rig file of neurocal."""
-    if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
+    if isinstance(cameras.origin, StereoRig) and cameras.program == "neurocal":
         return cameras.origin
     (pose,) = cameras.relative
     if not pose.t.any():
@@ -91,7 +91,7 @@ def as_rig(cameras: CameraSet) -> Rig:
         )
     left, right = (_calibration(cameras, k) for k in range(2))
     unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
-    return Rig(
+    return StereoRig(
         left,
         right,
         pose,
@@ -102,16 +102,16 @@ def as_rig(cameras: CameraSet) -> Rig:
     )
 
 
-def as_camera_rig(cameras: CameraSet) -> CameraRig:
+def as_rig(cameras: CameraSet) -> Rig:
     """Convert several cameras to a rig; without points unless they come from a rig file of neurocal."""
-    if isinstance(cameras.origin, CameraRig) and cameras.program == "neurocal":
+    if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
         return cameras.origin
     names = [camera.name for camera in cameras.cameras]
     if len(set(names)) < len(names):
         names = [f"cam{k}" for k in range(len(names))]
     unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
     n = 6 * len(cameras.relative)
-    return CameraRig(
+    return Rig(
         {name: _calibration(cameras, k) for k, name in enumerate(names)},
         dict(zip(names, cameras.mounted, strict=True)),
         dict(zip(names, [dict.fromkeys(unknown, 0.0), *[unknown] * len(cameras.relative)], strict=True)),
@@ -147,10 +147,10 @@ def _calibration(cameras: CameraSet, k: int) -> Calibration:
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    if len(cameras.cameras) > 2 or isinstance(cameras.origin, CameraRig):
-        return {"": format_camera_rig(as_camera_rig(cameras))}
-    if len(cameras.cameras) == 2:
+    if len(cameras.cameras) > 2 or isinstance(cameras.origin, Rig):
         return {"": format_rig(as_rig(cameras))}
+    if len(cameras.cameras) == 2:
+        return {"": format_stereo_rig(as_stereo(cameras))}
     origin = cameras.origin
     return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
 

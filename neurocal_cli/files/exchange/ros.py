@@ -20,7 +20,7 @@ from neurocal_cli.files.exchange.camera_set import CameraSet, Format
 from neurocal_cli.files.exchange.dictionary import note_size
 from neurocal_cli.files.exchange.document import Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.tree_fields import Field, is_number
 
 _TEXT = re.compile(r"^\s*camera matrix\s*$", re.MULTILINE)  # of ost.txt
@@ -120,7 +120,7 @@ def joined(left: CameraSet, right: CameraSet) -> CameraSet:
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     if len(cameras.cameras) == 1:
         return {"": format_camera_info(cameras.cameras[0], cameras.rectified)}
-    rectified = rectify(as_rig(replace(cameras, origin=None)))
+    rectified = rectify(as_stereo(replace(cameras, origin=None)))
     if rectified is None:
         raise InputError("ROS's files need images of one known size; give --image-size")
     pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)

@@ -14,7 +14,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.calibration.lens_choice import given_model
 from neurocal_cli.calibration.lens_choice.monotonic_fit import MonotonicFit, where_not_monotonic
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
 from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
 from neurocal_cli.camera.monotonic import radial_slope
 from neurocal_cli.camera.pinhole import Pose
@@ -137,7 +137,7 @@ def test_a_rig_keeps_a_camera_that_it_would_fold() -> None:
     right = other.points(SIGMA, np.random.default_rng([38, 5]))
     left = noisy("k1k2", 38)
     cameras = [calibrate(points, distortion="k1k2", skew=False) for points in (left, right)]
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=True)
+    rig = fit_stereo(cameras[0], cameras[1], refine_cameras=True)
     assert np.array_equal(rig.left.distortion, cameras[0].distortion)
     assert any("the distortion model of the left camera is not monotonic" in text for text in rig.warnings)
     assert rig.baseline == pytest.approx(60.0, abs=4 * rig.std["baseline"])

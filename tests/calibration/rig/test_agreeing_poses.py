@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from support.real_data import RealFiles
 
-from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, fit_rig, read_points
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, calibrate, fit_stereo, read_points
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 
 CAMERA = Camera(Intrinsics(1000.0, 1000.0, 639.5, 359.5), image_size=(1280, 720))
 BOARD = np.array([[20.0 * c, 20.0 * r, 0.0] for r in range(3) for c in range(4)]) - [30, 20, 0]
 RIG = Pose.from_euler(0.02, -0.1, 0.01, np.array([-200.0, 3.0, 10.0]))
 
 
-def rig_of(n: int, distance: float, seed: int) -> Rig:
+def rig_of(n: int, distance: float, seed: int) -> StereoRig:
     rng = np.random.default_rng([n, seed])
     sides: list[list[np.ndarray]] = [[], []]
     for _ in range(n):
@@ -35,7 +35,7 @@ def rig_of(n: int, distance: float, seed: int) -> Rig:
         for side in sides
     ]
     assert all(camera.second_poses for camera in cameras)
-    return fit_rig(*cameras, refine_cameras=False)
+    return fit_stereo(*cameras, refine_cameras=False)
 
 
 def test_no_pair_is_left_out_for_its_second_pose() -> None:
@@ -63,4 +63,4 @@ def test_a_reported_rig_of_a_small_board_is_whole(real_files: RealFiles) -> None
     camera = Camera(Intrinsics(1000.0, 1000.0, 640.0, 400.0), image_size=(1280, 800))
     sides = [calibrate(side, type=3, intrinsics=camera) for side in (left, right)]
     assert all(side.second_poses for side in sides)
-    assert not fit_rig(*sides, refine_cameras=False).left_out
+    assert not fit_stereo(*sides, refine_cameras=False).left_out

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.many_cameras import scene
 
-from neurocal_cli import calibrate_rig, evaluate_camera_rig, triangulate, triangulate_many
+from neurocal_cli import calibrate_rig, evaluate_rig, triangulate, triangulate_many
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.simulation.rigs import SimulatedRig
@@ -110,14 +110,14 @@ def test_wrong_rows_are_refused(rows: tuple[list[int], list[str], list[list[floa
 def test_a_rig_is_evaluated_on_its_own_and_on_new_points() -> None:
     truth, points = scene("line", 4, 16)
     rig = calibrate_rig(points, skew=False, distortion="k1", target="given")
-    own = evaluate_camera_rig(rig)
+    own = evaluate_rig(rig)
     assert not own.fitted
     assert own.rmse < 8
     assert all(0.2 < error < 1.5 and count > 300 for count, error in own.predicted.values())
     new = truth.points(0.3, np.random.default_rng(99))
-    other = evaluate_camera_rig(rig, {name: one for name, one in new.items() if name != "cam1"})
+    other = evaluate_rig(rig, {name: one for name, one in new.items() if name != "cam1"})
     assert other.fitted
     assert other.rmse < 9
     assert other.predicted["cam1"][0] == 0
     with pytest.raises(InputError, match="no camera 'x'"):
-        evaluate_camera_rig(rig, {"x": new["cam0"]})
+        evaluate_rig(rig, {"x": new["cam0"]})

@@ -11,12 +11,12 @@ import pytest
 from support.command_line import run
 from support.rigs import RigScene, random_rig
 
-from neurocal_cli import Pose, Rig, write_rig
+from neurocal_cli import Pose, StereoRig, write_rig
 from neurocal_cli.calibration.rig.rectification import rectified_pair
 from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.exchange.camera_set import CameraSet
-from neurocal_cli.files.exchange.neurocal import as_rig
+from neurocal_cli.files.exchange.neurocal import as_stereo
 
 LIMIT = 1.0
 Change = Callable[[Array, Array], tuple[Array, Array]]
@@ -26,9 +26,9 @@ def scene() -> RigScene:
     return random_rig(np.random.default_rng(6), "verging", 4, "k1k2")
 
 
-def made(pose: Pose | None = None) -> Rig:
+def made(pose: Pose | None = None) -> StereoRig:
     some = scene()
-    return as_rig(CameraSet((some.camera(0), some.camera(1)), (pose or some.rig,), unit="mm"))
+    return as_stereo(CameraSet((some.camera(0), some.camera(1)), (pose or some.rig,), unit="mm"))
 
 
 def matches() -> tuple[Array, Array]:

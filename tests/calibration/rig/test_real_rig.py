@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.real_data import RealFiles
 
-from neurocal_cli import CameraRig, Correspondences, calibrate_rig, evaluate_camera_rig
+from neurocal_cli import Correspondences, Rig, calibrate_rig, evaluate_rig
 
 # Distances of the cameras [mm] from poses of the board in single frames, which scatter by 2 to 30 mm.
 DISTANCES = {
@@ -43,18 +43,18 @@ def points_of(real_files: RealFiles, frames: range, alone: bool) -> dict[str, Co
 
 
 @pytest.fixture(scope="module")
-def rig(real_files: RealFiles) -> CameraRig:
+def rig(real_files: RealFiles) -> Rig:
     return calibrate_rig(points_of(real_files, range(0, 10000, 2), True), skew=False)
 
 
-def near_the_distances(rig: CameraRig) -> bool:
+def near_the_distances(rig: Rig) -> bool:
     return all(
         abs(rig.pair(first, second).baseline - known) < 0.05 * known
         for (first, second), known in DISTANCES.items()
     )
 
 
-def test_the_cameras_are_where_single_frames_put_them(rig: CameraRig) -> None:
+def test_the_cameras_are_where_single_frames_put_them(rig: Rig) -> None:
     assert rig.converged
     assert near_the_distances(rig)
     # A rig of webcams that are not triggered together is no good one, and no camera of it has moved.
@@ -62,9 +62,9 @@ def test_the_cameras_are_where_single_frames_put_them(rig: CameraRig) -> None:
     assert not any("moved" in reason for reason in rig.verdict.reasons)
 
 
-def test_two_cameras_predict_what_a_third_sees_in_other_frames(rig: CameraRig, real_files: RealFiles) -> None:
+def test_two_cameras_predict_what_a_third_sees_in_other_frames(rig: Rig, real_files: RealFiles) -> None:
     others = points_of(real_files, range(1, 10000, 2), False)
-    found = evaluate_camera_rig(rig, others)
+    found = evaluate_rig(rig, others)
     assert sum(count for count, _ in found.predicted.values()) > 500
     assert np.median([error for _, error in found.predicted.values()]) < 4
 

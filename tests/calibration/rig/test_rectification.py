@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from support.rigs import random_rig, sides
 
-from neurocal_cli import Pose, Rig
+from neurocal_cli import Pose, StereoRig
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.rectification import rectified_pair, rectify
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
-from neurocal_cli.files.rig_yaml import format_ros_pair
+from neurocal_cli.files.stereo_yaml import format_ros_pair
 from neurocal_cli.files.yaml_text import parse_yaml
 
 POSES = {
@@ -26,11 +26,11 @@ POSES = {
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig() -> StereoRig:
     return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
 
 
-def bent(rig: Rig) -> Rig:
+def bent(rig: StereoRig) -> StereoRig:
     cameras = [
         replace(c, distortion_model="plumb_bob", distortion=np.array(k))
         for c, k in ((rig.left, [-0.2, 0.05, 1e-3, -5e-4, 0]), (rig.right, [-0.15, 0.02, 0, 1e-3, 0]))
@@ -40,7 +40,7 @@ def bent(rig: Rig) -> Rig:
 
 @pytest.mark.parametrize("alpha", [None, 0.0, 0.3, 1.0])
 @pytest.mark.parametrize("name", POSES)
-def test_opencv_says_the_same(name: str, alpha: float | None, rig: Rig) -> None:
+def test_opencv_says_the_same(name: str, alpha: float | None, rig: StereoRig) -> None:
     cv2 = pytest.importorskip("cv2")
     if alpha is not None and int(cv2.__version__.split(".")[0]) < 5:
         pytest.skip("before version 5 OpenCV lets images end a pixel further out")
@@ -66,7 +66,7 @@ def test_opencv_says_the_same(name: str, alpha: float | None, rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("name", POSES)
-def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: Rig) -> None:
+def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: StereoRig) -> None:
     one = replace(rig, pose=POSES[name])
     found = rectify(one, 0.5)
     assert found is not None
@@ -90,7 +90,7 @@ def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: Rig) -> N
     assert back[:, :3] / back[:, 3:] == pytest.approx(X @ found.R1.T, rel=1e-9)
 
 
-def test_without_one_image_size_there_is_none(rig: Rig) -> None:
+def test_without_one_image_size_there_is_none(rig: StereoRig) -> None:
     nothing = replace(rig.left, points=replace(rig.left.points, image_size=None))
     assert rectify(replace(rig, left=nothing)) is None
     with pytest.raises(InputError, match="images of one known size"):
@@ -99,7 +99,7 @@ def test_without_one_image_size_there_is_none(rig: Rig) -> None:
         rectify(rig, 2.0)
 
 
-def test_ros_files_are_in_metres(rig: Rig) -> None:
+def test_ros_files_are_in_metres(rig: StereoRig) -> None:
     found = rectify(rig)
     assert found is not None
     left, right = (parse_yaml(text, "f") for text in format_ros_pair(rig))
@@ -114,7 +114,7 @@ def test_ros_files_are_in_metres(rig: Rig) -> None:
 
 
 @cache
-def wide_rig(seed: int) -> Rig:
+def wide_rig(seed: int) -> StereoRig:
     points = sides(random_rig(np.random.default_rng(seed), "wide", 4), 0.1)
     return calibrate_stereo(*points, skew=False, distortion="none", target="given")
 

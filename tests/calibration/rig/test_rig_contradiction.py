@@ -10,14 +10,14 @@ from support.rigs import RigScene, random_rig
 from support.slow_cases import slow_but
 from support.wrong_rigs import enlarged, in_parts, jolted, loose, scene, seen, turned, zoomed
 
-from neurocal_cli import Correspondences, calibrate, fit_rig
+from neurocal_cli import Correspondences, calibrate, fit_stereo
 from neurocal_cli.calibration.rig.adjust import RigProblem, adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.contradiction import Contradiction, contradiction, odd_pairs
 from neurocal_cli.calibration.rig.covariance import not_smaller
 from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order, relative_poses
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.sound_pairs import find_consensus
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import rotation_step, rotation_vector
 
 Points = tuple[Correspondences, Correspondences]
@@ -35,9 +35,9 @@ def found(points: Points) -> Contradiction:
     return contradiction(made(points)[1])
 
 
-def fitted(points: Points) -> Rig:
+def fitted(points: Points) -> StereoRig:
     left, right = (calibrate(side, distortion="none", skew=False) for side in points)
-    return fit_rig(left, right, refine_cameras=True)
+    return fit_stereo(left, right, refine_cameras=True)
 
 
 def test_the_vector_of_a_rotation_leads_back_to_it() -> None:
@@ -99,7 +99,7 @@ def test_the_majority_wins() -> None:
 
 def test_two_equal_parts_are_named_and_the_cameras_are_right() -> None:
     rig = fitted(in_parts(scene(), turned(scene(), 0.5, 1.0), 6))
-    assert "two geometries, left01 to left06 and left07 to left12" in rig.warnings[0]
+    assert "taken before the rig moved between left06/right06 and left07/right07" in rig.warnings[0]
     truth = scene().cameras
     for camera, true in zip((rig.left, rig.right), truth, strict=True):
         assert abs(camera.intrinsics.alpha_u - true.alpha_u) < 4 * camera.std["alpha_u"]

@@ -16,11 +16,11 @@ from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
 from support.wrong_rigs import in_parts, judged, scene, seen, turned, zoomed
 
-from neurocal_cli import calibrate, calibrate_stereo, fit_rig, read_points, triangulate
-from neurocal_cli.calibration.rig.assessment import assess_rig
-from neurocal_cli.calibration.rig.evaluation import evaluate_rig, evaluate_stereo
-from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.files.rig_yaml import read_rig
+from neurocal_cli import calibrate, calibrate_stereo, fit_stereo, read_points, triangulate
+from neurocal_cli.calibration.rig.assessment import assess_stereo
+from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.files.stereo_yaml import read_stereo_rig
 from neurocal_cli.observations.points import Correspondences
 
 
@@ -50,17 +50,17 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_verdict_is_in_the_file_and_is_reached_again_from_it(bumped: Path) -> None:
-    rig = read_rig(bumped / "rig.yaml")
+    rig = read_stereo_rig(bumped / "rig.yaml")
     assert rig.verdict is not None
     assert rig.verdict.word == "poor"
-    again = assess_rig(rig)
+    again = assess_stereo(rig)
     assert again is not None
     assert (again.word, again.reasons, again.advice) == (
         rig.verdict.word,
         rig.verdict.reasons,
         rig.verdict.advice,
     )
-    assert evaluate_rig(rig).verdict == again
+    assert evaluate_stereo_rig(rig).verdict == again
 
 
 def test_evaluate_tells_the_verdict(bumped: Path) -> None:
@@ -82,7 +82,7 @@ def test_a_file_without_a_verdict_has_none(bumped: Path, tmp_path: Path) -> None
     text = (bumped / "rig.yaml").read_text(encoding="utf-8")
     start = text.index("  verdict:\n    word")
     (tmp_path / "old.yaml").write_text(text[:start], encoding="utf-8")
-    assert read_rig(tmp_path / "old.yaml").verdict is None
+    assert read_stereo_rig(tmp_path / "old.yaml").verdict is None
 
 
 def test_two_calibrations_without_one_rig_are_poor() -> None:
@@ -110,7 +110,7 @@ def test_the_depth_is_as_uncertain_as_it_is_wrong() -> None:
     assert 0.4 < np.sqrt(np.mean(np.square(errors))) / np.mean(told) < 1.8
 
 
-def shared(real_files: RealFiles, name: str) -> Rig:
+def shared(real_files: RealFiles, name: str) -> StereoRig:
     left, right = (real_files(f"wrong_data/{name}_{side}.csv")[0] for side in "lr")
     return calibrate_stereo(read_points(left), read_points(right), distortion="k1k2p1p2")
 
@@ -207,8 +207,8 @@ def test_given_cameras_that_are_exchanged_are_named_before_what_follows_from_it(
     exchanged = [
         calibrate(side, type=3, intrinsics=one) for side, one in zip(points[1], own[::-1], strict=True)
     ]
-    verdict = fit_rig(*exchanged).verdict
+    verdict = fit_stereo(*exchanged).verdict
     assert verdict is not None
     assert verdict.word != "good"
     assert "left camera: alpha_u" in verdict.reasons[0]
-    assert any("relative pose of the cameras differs" in reason for reason in verdict.reasons[1:])
+    assert any("relative poses of the cameras differ" in reason for reason in verdict.reasons[1:])

@@ -14,7 +14,7 @@ from support.rigs import KINDS, RigScene, all_residuals, corner, random_rig, sid
 from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
-from neurocal_cli import Rig, calibrate
+from neurocal_cli import StereoRig, calibrate
 from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.rig.pairing import pair_views
@@ -28,7 +28,7 @@ def flat(kind: str = "verging", n_views: int = 8, seed: int = 5, lens: str = "no
 
 
 @cache
-def usual() -> Rig:
+def usual() -> StereoRig:
     """The rig without skew that others are compared with."""
     return calibrate_stereo(*sides(flat(), 0.2), skew=False)
 
@@ -77,10 +77,10 @@ def test_the_views_poses_go_through_the_rig() -> None:
 
 
 def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() -> None:
-    from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
+    from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
 
     points = sides(flat(), 0.3)
-    apart = fit_rig(*(calibrate(p, skew=False) for p in points))
+    apart = fit_stereo(*(calibrate(p, skew=False) for p in points))
     assert calibrate_stereo(*points, skew=False).rmse_px < apart.rmse_px
 
 
@@ -157,12 +157,12 @@ def test_another_seed_ends_at_the_same_rig() -> None:
     assert two.t == pytest.approx(one.t, abs=0.02 * one.std["baseline"])
 
 
-def parameters(rig: Rig) -> Array:
+def parameters(rig: StereoRig) -> Array:
     K = [camera.intrinsics.values()[:4] for camera in (rig.left, rig.right)]
     return np.concatenate([*K, rig.pose.euler, rig.t, [rig.baseline]])
 
 
-def deviations(rig: Rig) -> Array:
+def deviations(rig: StereoRig) -> Array:
     K = [[camera.std[n] for n in INTRINSIC_NAMES[:4]] for camera in (rig.left, rig.right)]
     return np.concatenate([*K, [rig.std[n] for n in (*POSE_NAMES, "baseline")]])
 

@@ -10,7 +10,7 @@ from support.rigs import RigScene, corner, random_rig
 from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
 from neurocal_cli.calibration.rig.evaluation import evaluate_stereo
 from neurocal_cli.calibration.rig.triangulation import METHODS
 from neurocal_cli.camera.geometry import Array, rotation_step
@@ -195,7 +195,7 @@ def test_a_board_turned_in_one_image_is_named_and_left_out() -> None:
     left, right = sides(scene)
     right = changed(right, "right03", HALF_TURN)
     cameras = calibrate(left, skew=False), calibrate(right, skew=False)
-    rig = fit_rig(*cameras)
+    rig = fit_stereo(*cameras)
     assert rig.left_out == {("left03", "right03"): "the target is turned by 180 degrees in one of the images"}
     assert "left03/right03" in rig.warnings[0]
     assert len(rig.pairs) == 7
@@ -203,7 +203,7 @@ def test_a_board_turned_in_one_image_is_named_and_left_out() -> None:
     with pytest.raises(
         DegenerateGeometryError, match=r"left03/right03: the target is turned.*--outliers reject"
     ):
-        fit_rig(*cameras, outliers="keep")
+        fit_stereo(*cameras, outliers="keep")
     found = evaluate_stereo(*cameras)
     assert any("left03/right03" in text for text in found.warnings)
     assert found.rig is not None
@@ -216,7 +216,7 @@ def test_all_boards_turned_in_one_camera_are_refused_and_named() -> None:
         right = changed(right, name, HALF_TURN)
     cameras = calibrate(left, skew=False), calibrate(right, skew=False)
     with pytest.raises(DegenerateGeometryError, match=r"6 of 6 pairs.*left01/right01.*turned by 180 degrees"):
-        fit_rig(*cameras)
+        fit_stereo(*cameras)
     found = evaluate_stereo(*cameras)
     assert found.rig is None
     assert "turned by 180 degrees" in found.warnings[0]
@@ -231,7 +231,7 @@ def test_a_pair_not_taken_at_the_same_moment_is_named(motion: float) -> None:
     left, right = scene.points(0, 0.2, np.random.default_rng(1)), replace(scene, poses=moved).points(
         1, 0.2, np.random.default_rng(2)
     )  # fmt: skip
-    rig = fit_rig(*(calibrate(side, skew=False, distortion="none") for side in (left, right)))
+    rig = fit_stereo(*(calibrate(side, skew=False, distortion="none") for side in (left, right)))
     assert list(rig.left_out) == [("left05", "right05")]
     assert "same moment" in rig.left_out["left05", "right05"]
 
@@ -247,7 +247,9 @@ def test_exchanged_images_of_one_pair_are_named() -> None:
         left, right = replace(left, pixels=pixels[0]), replace(right, pixels=pixels[1])
     same = scene.cameras[0]
     assert same.alpha_u == pytest.approx(scene.cameras[1].alpha_u, rel=0.06)
-    rig = fit_rig(calibrate(left, skew=False, outliers="keep"), calibrate(right, skew=False, outliers="keep"))
+    rig = fit_stereo(
+        calibrate(left, skew=False, outliers="keep"), calibrate(right, skew=False, outliers="keep")
+    )
     assert "left02/right02: the left and the right image are exchanged" in rig.warnings[0]
 
 
@@ -255,13 +257,13 @@ def test_two_pairs_that_contradict_each_other_are_refused() -> None:
     left, right = sides(flat(2))
     right = changed(right, "right02", HALF_TURN)
     with pytest.raises(DegenerateGeometryError, match="pairs of views contradict"):
-        fit_rig(*(calibrate(side, skew=False, distortion="none") for side in (left, right)))
+        fit_stereo(*(calibrate(side, skew=False, distortion="none") for side in (left, right)))
 
 
 def test_swapped_cameras_are_warned_of() -> None:
     left, right = calibrated(replace(flat(6), names=("{}", "{}")))
-    assert not fit_rig(left, right).warnings
-    (warning,) = fit_rig(right, left).warnings
+    assert not fit_stereo(left, right).warnings
+    (warning,) = fit_stereo(right, left).warnings
     assert "to the left of the left one; if they are swapped, give the left camera first" in warning
 
 

@@ -7,8 +7,8 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate
 from neurocal_cli.calibration.rig.adjust import RigProblem, RigState, adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.pairing import pair_views
-from neurocal_cli.calibration.rig.sound_pairs import find_consensus
 from neurocal_cli.camera.geometry import Array
 
 

@@ -13,28 +13,28 @@ from support.rigs import random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.calibrate_stereo import fit_rig
-from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.calibrate_stereo import fit_stereo
+from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.result_files import write_rig
-from neurocal_cli.files.rig_yaml import format_rig, read_rig
+from neurocal_cli.files.stereo_yaml import format_stereo_rig, read_stereo_rig
 
 
 @pytest.fixture(scope="module")
-def rig() -> Rig:
+def rig() -> StereoRig:
     scene = replace(random_rig(np.random.default_rng(2), "verging", 4), names=("left{}", "right: {}"))
     rng = np.random.default_rng(1)
     cameras = [calibrate(scene.points(side, 0.2, rng), skew=False, camera_name="ab"[side]) for side in (0, 1)]
-    found = fit_rig(*cameras)
+    found = fit_stereo(*cameras)
     verdict = Verdict("usable", ("a reason: here",), ("some advice",), {"scatter": 1.25})
     left_out = {("left09", "right: 09"): "a reason"}
     return replace(found, left_out=left_out, warnings=("a warning: here",), judgement=verdict)
 
 
-def test_a_rig_reads_back_to_the_last_bit(rig: Rig, tmp_path: Path) -> None:
+def test_a_rig_reads_back_to_the_last_bit(rig: StereoRig, tmp_path: Path) -> None:
     write_rig(rig, tmp_path / "rig.yaml")
-    back = read_rig(tmp_path / "rig.yaml")
-    for f in fields(Rig):
+    back = read_stereo_rig(tmp_path / "rig.yaml")
+    for f in fields(StereoRig):
         one, two = getattr(rig, f.name), getattr(back, f.name)
         if f.name in ("left", "right"):
             assert (one.K == two.K).all()
@@ -46,11 +46,11 @@ def test_a_rig_reads_back_to_the_last_bit(rig: Rig, tmp_path: Path) -> None:
             assert (one == two).all()
         else:
             assert one == two, f.name
-    assert format_rig(back) == format_rig(rig)
+    assert format_stereo_rig(back) == format_stereo_rig(rig)
 
 
-def test_others_read_it_as_plain_yaml_with_the_contracts_keys(rig: Rig) -> None:
-    tree = yaml.safe_load(format_rig(rig))
+def test_others_read_it_as_plain_yaml_with_the_contracts_keys(rig: StereoRig) -> None:
+    tree = yaml.safe_load(format_stereo_rig(rig))
     assert list(tree) == ["left", "right", "stereo"]
     assert {"R", "t", "E", "F", "baseline", "rmse_px"} <= set(tree["stereo"])
     assert np.array(tree["stereo"]["R"]).shape == (3, 3)
@@ -60,7 +60,7 @@ def test_others_read_it_as_plain_yaml_with_the_contracts_keys(rig: Rig) -> None:
     assert len(tree["right"]["neurocal"]["views"]) == 4
 
 
-def test_epipolar_matrices_hold_for_the_points(rig: Rig) -> None:
+def test_epipolar_matrices_hold_for_the_points(rig: StereoRig) -> None:
     left, right = rig.left.points.pixels, rig.right.points.pixels
     lines = np.column_stack([left, np.ones(len(left))]) @ rig.F.T
     distance = (lines * np.column_stack([right, np.ones(len(right))])).sum(axis=1) / np.hypot(*lines[:, :2].T)
@@ -85,10 +85,10 @@ def test_epipolar_matrices_hold_for_the_points(rig: Rig) -> None:
     ],
 )
 def test_an_edited_file_is_refused_with_the_key(
-    pattern: str, replacement: str, message: str, rig: Rig, tmp_path: Path
+    pattern: str, replacement: str, message: str, rig: StereoRig, tmp_path: Path
 ) -> None:
-    text, count = re.subn(pattern, replacement, format_rig(rig))
+    text, count = re.subn(pattern, replacement, format_stereo_rig(rig))
     assert count >= 1
     (tmp_path / "rig.yaml").write_text(text)
     with pytest.raises(FormatError, match=re.escape(message)):
-        read_rig(tmp_path / "rig.yaml")
+        read_stereo_rig(tmp_path / "rig.yaml")

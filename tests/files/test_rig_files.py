@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.many_cameras import scene
 
-from neurocal_cli import CameraRig, calibrate_rig, read_camera_rig, read_rig, read_rig_points, write_rig
+from neurocal_cli import Rig, calibrate_rig, read_rig, read_rig_points, read_stereo_rig, write_rig
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange.reading import read_cameras
 from neurocal_cli.files.points_csv import write_points
@@ -18,16 +18,16 @@ from neurocal_cli.files.result_files import write_result
 
 
 @pytest.fixture(scope="module")
-def rig() -> CameraRig:
+def rig() -> Rig:
     _, points = scene("line", 3, 10)
     found = calibrate_rig(points, skew=False, distortion="k1", target="given")
     return replace(found, delays={"cam1": (0.1, 0.02), "cam2": (0.0, 0.01)}, left_out={("cam1", "x"): "why"})
 
 
 @pytest.mark.parametrize("name", ["rig.yaml", "rig.json"])
-def test_a_rig_reads_back(rig: CameraRig, tmp_path: Path, name: str) -> None:
+def test_a_rig_reads_back(rig: Rig, tmp_path: Path, name: str) -> None:
     write_rig(rig, tmp_path / name)
-    back = read_camera_rig(tmp_path / name)
+    back = read_rig(tmp_path / name)
     assert list(back.cameras) == list(rig.cameras)
     assert (back.std, back.frames, back.left_out, back.delays) == (
         rig.std, rig.frames, rig.left_out, rig.delays
@@ -45,9 +45,9 @@ def test_a_rig_reads_back(rig: CameraRig, tmp_path: Path, name: str) -> None:
     assert again.read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_a_lean_rig_has_no_data_behind_it(rig: CameraRig, tmp_path: Path) -> None:
+def test_a_lean_rig_has_no_data_behind_it(rig: Rig, tmp_path: Path) -> None:
     write_result(rig, tmp_path / "lean.yaml", lean=True)
-    back = read_camera_rig(tmp_path / "lean.yaml")
+    back = read_rig(tmp_path / "lean.yaml")
     assert back.frames == {}
     assert all(len(camera.points) == 0 for camera in back.cameras.values())
     assert back.verdict == rig.verdict
@@ -58,14 +58,14 @@ def test_two_cameras_keep_the_blocks_of_a_stereo_rig(tmp_path: Path) -> None:
     _, points = scene("line", 2, 8)
     found = calibrate_rig(points, skew=False, distortion="k1", target="given")
     write_rig(found, tmp_path / "two.yaml")
-    assert found.stereo is not None
-    stereo, back = read_rig(tmp_path / "two.yaml"), read_camera_rig(tmp_path / "two.yaml")
-    assert (stereo.t == found.stereo.t).all()
+    pair = found.pair(*found.cameras)
+    stereo, back = read_stereo_rig(tmp_path / "two.yaml"), read_rig(tmp_path / "two.yaml")
+    assert (stereo.t == pair.t).all()
     assert list(back.cameras) == ["cam0", "cam1"]
-    write_rig(found.stereo, tmp_path / "stereo.yaml")
+    write_rig(pair, tmp_path / "stereo.yaml")
     whole, part = ((tmp_path / name).read_text() for name in ("two.yaml", "stereo.yaml"))
     assert whole.startswith(part)
-    assert list(read_camera_rig(tmp_path / "stereo.yaml").cameras) == ["left", "right"]
+    assert list(read_rig(tmp_path / "stereo.yaml").cameras) == ["left", "right"]
 
 
 @pytest.mark.parametrize(
@@ -77,18 +77,18 @@ def test_two_cameras_keep_the_blocks_of_a_stereo_rig(tmp_path: Path) -> None:
         ('["cam0", "000"', '["camX", "000"', "a list of cameras of this rig"),
     ],
 )
-def test_wrong_files_are_refused(rig: CameraRig, tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_wrong_files_are_refused(rig: Rig, tmp_path: Path, old: str, new: str, said: str) -> None:
     path = tmp_path / "rig.yaml"
     write_rig(rig, path)
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(FormatError, match=said):
-        read_camera_rig(path)
+        read_rig(path)
 
 
 @pytest.mark.parametrize("program", ["kalibr", "colmap", "mrcal"])
-def test_other_programs_get_the_same_projections(rig: CameraRig, tmp_path: Path, program: str) -> None:
+def test_other_programs_get_the_same_projections(rig: Rig, tmp_path: Path, program: str) -> None:
     from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
     from neurocal_cli.files.exchange.colmap import FORMAT as COLMAP
     from neurocal_cli.files.exchange.kalibr import FORMAT as KALIBR
@@ -139,7 +139,7 @@ def test_points_of_several_cameras_are_read(tmp_path: Path) -> None:
         read_rig_points([("cam0", str(path))])
 
 
-def test_json_has_the_same_tree(rig: CameraRig, tmp_path: Path) -> None:
+def test_json_has_the_same_tree(rig: Rig, tmp_path: Path) -> None:
     write_rig(rig, tmp_path / "rig.json")
     tree = json.loads((tmp_path / "rig.json").read_text())
     assert set(tree) == {"cameras", "poses", "edges", "rig"}

@@ -1,0 +1,210 @@
+"""The relative pose on which most pairs of views of two cameras agree, and the faults of the others.
+
+Each pair of views gives the pose of the second camera relative to the first. Pairs that disagree with most
+others are tested for five faults: the target is turned in one image (its points have another order), one
+image is mirrored, the two images are exchanged, an image is paired with that of the next or the previous
+moment, or the two were not taken at the same moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigProblem, stereo_problem
+from neurocal_cli.calibration.rig.relative_poses import in_order
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation
+from neurocal_cli.camera.pinhole import Pose
+
+# Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
+# than so many standard deviations of a pixel. The tests of named faults in test_stereo_evaluation.py
+# repeat that faults are found and sound pairs kept.
+_SHARE = 0.1
+_SIGMAS = 30.0
+_MOST_HYPOTHESES = 40
+_EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
+_NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
+_TURNED = "the target is turned by {} degrees in one of the images"
+_MIRRORED = "one of the two images is mirrored, or its u and v are exchanged"
+# Faults of the images of flat targets: how the target's axes (the longest first, the normal last) and those
+# of the right camera are exchanged. A mirrored image of a flat target is one of its back; programs that
+# number the points in each image by themselves then begin at another corner.
+_IMAGE_MIRRORED = np.diag([-1.0, 1.0, 1.0])
+_FAULTS = (
+    *((_TURNED.format(d), euler_to_rotation(0.0, 0.0, np.radians(d)), np.eye(3)) for d in (90, 270, 180)),
+    *((_MIRRORED, np.diag(of_target), _IMAGE_MIRRORED) for of_target in np.where(np.eye(3)[::-1], -1.0, 1.0)),
+)
+_AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
+
+UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
+PAIR_ANEW = (
+    "one image of one camera is missing or was taken twice; name the views that were taken at the same "
+    "moment alike"
+)
+SHIFTED = {word: f"the left image fits the right one of the {word} pair" for word in ("next", "previous")}
+OPPOSITE = {"next": "previous", "previous": "next"}
+
+Pair = tuple[str, str]
+
+
+@frozen_dataclass(eq=False)
+class RigConsensus:
+    """The rig that most pairs of views support."""
+
+    rig: Pose  # X_right = R X_left + t [world unit]
+    reasons: tuple[str, ...]  # fault of each pair; empty for those that agree
+
+
+def find_consensus(problem: RigProblem) -> RigConsensus:
+    """Find the rig that most pairs of views support."""
+    poses = _poses(problem)
+    R, t = poses.rigs()
+    agree = _distance(problem, poses, R, t) < 1
+    best = int(np.argmax(agree.sum(axis=1)))
+    if agree[best].all():
+        return RigConsensus(_mean_rig(poses, agree[best]), ("",) * len(problem.paired))
+    R, t, sound = _common_fault(problem, poses, (R[best], t[best], agree[best]))
+    return RigConsensus(_mean_rig(poses, sound), _reasons(problem, poses, R, t, sound))
+
+
+def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> dict[Pair, str]:
+    """The faults, with pairs named whose left views fit the right views of the next or the previous pairs.
+
+    From the place on where one camera lost an image, or took one twice, all views are paired wrongly.
+    """
+    odd = {a: b for (a, b), reason in faults.items() if reason == UNSYNCHRONISED}
+    for word in SHIFTED:
+        moved = [pair for pair in neighbours(problem.pairs, word) if pair[0] in odd]
+        if len(moved) < _LEAST_AGREED:
+            continue
+        shifted = stereo_problem(*_two(problem), moved)
+        fits = _distance(shifted, _poses(shifted), rig.R[None], rig.t[None])[0] < 1
+        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
+            names = [a for (a, _), one in zip(shifted.pairs, fits, strict=True) if one]
+            return {**faults, **{(a, odd[a]): SHIFTED[word] for a in names}}
+    return dict(faults)
+
+
+def all_shifted(problem: RigProblem) -> str:
+    """The word for the pairs whose right views the left views fit, if all are paired wrongly; else empty."""
+    if len(problem.paired) < 2 * _LEAST_AGREED:
+        return ""
+    for word in SHIFTED:
+        shifted = stereo_problem(*_two(problem), neighbours(problem.pairs, word))
+        reasons = find_consensus(shifted).reasons
+        if reasons.count("") > _AGREED * len(reasons):
+            return word
+    return ""
+
+
+def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:
+    """Each left view with the right view of the next, or of the previous, pair."""
+    ordered = in_order(pairs)
+    first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
+    return [(a, b) for (a, _), (_, b) in zip(first, second, strict=True)]
+
+
+def _two(problem: RigProblem) -> tuple[Calibration, Calibration]:
+    left, right = problem.calibrations
+    return left, right
+
+
+@frozen_dataclass(eq=False)
+class _Poses:
+    """Poses of the paired targets in each camera alone: rotations and centres, left and right."""
+
+    R: tuple[Array, Array]
+    m: tuple[Array, Array]
+
+    def rigs(self) -> tuple[Array, Array]:
+        """R and t of single pairs, for an even choice of the pairs."""
+        n = len(self.R[0])
+        some = np.linspace(0, n - 1, min(n, _MOST_HYPOTHESES)).astype(int)
+        R = self.R[1][some] @ np.swapaxes(self.R[0][some], 1, 2)
+        return R, self.m[1][some] - (R @ self.m[0][some][..., None])[..., 0]
+
+
+def _poses(problem: RigProblem) -> _Poses:
+    left, right = problem.cameras
+    scale = problem.scale[problem.paired][:, None]
+    return _Poses(
+        (left.R[problem.paired_left], right.R[problem.paired_right]),
+        (left.t[problem.paired_left] * scale, right.t[problem.paired_right] * scale),
+    )
+
+
+def _distance(problem: RigProblem, poses: _Poses, R: Array, t: Array) -> Array:
+    """(H, P) distance of each pair's target from its prediction by each rig; pairs agree below 1."""
+    offsets = problem.spread * problem.scale[problem.paired][:, None, None]
+    targets = [
+        offsets @ np.swapaxes(R_k, 1, 2) + m_k[:, None, :] for R_k, m_k in zip(poses.R, poses.m, strict=True)
+    ]
+    # (H, P, 5, 3): the targets in the right camera's frame, as each rig predicts them.
+    through = np.einsum("hij,pnj->hpni", R, targets[0]) + t[:, None, None, :]
+    focal = problem.cameras[1].entries[0, [0, 2]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = targets[1][..., :2] / targets[1][..., 2:] * focal
+        guess = np.where(through[..., 2:] > 0, through[..., :2] / through[..., 2:], np.inf) * focal
+        apart = np.sqrt(((guess - image) ** 2).sum(axis=-1).mean(axis=-1))
+    size = np.sqrt(((image - image[:, :1]) ** 2).sum(axis=-1).mean(axis=-1))
+    noise = _SIGMAS / np.sqrt(problem.observations[1].weight)
+    return np.asarray(apart / np.maximum(_SHARE * size, noise))
+
+
+def _common_fault(
+    problem: RigProblem, poses: _Poses, found: tuple[Array, Array, NDArray[np.bool_]]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """The rig and the pairs that agree with it, if most pairs have one fault."""
+    most, flat = int(found[2].sum()), problem.is_flat[problem.paired]
+    for _, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        R, t = mended.rigs()
+        sound = _distance(problem, poses, R, t) < 1
+        faulty = (_distance(problem, mended, R, t) < 1) & flat
+        counts = (sound | faulty).sum(axis=1)
+        if counts.max() > most:
+            best, most = int(np.argmax(counts)), int(counts.max())
+            found = R[best], t[best], sound[best]
+    return found
+
+
+def _reasons(
+    problem: RigProblem, poses: _Poses, R: Array, t: Array, sound: NDArray[np.bool_]
+) -> tuple[str, ...]:
+    """Fault of each pair that does not agree with the rig."""
+    plain = _distance(problem, poses, R[None], t[None])[0]
+    exchanged = _Poses((poses.R[1], poses.R[0]), (poses.m[1], poses.m[0]))
+    distance = _distance(problem, exchanged, R[None], t[None])[0]
+    flat = problem.is_flat[problem.paired]
+    reasons = np.where(
+        (distance < _EXCHANGED) & (distance < _NEARER * plain),
+        "the left and the right image are exchanged",
+        UNSYNCHRONISED,
+    )
+    for reason, of_target, of_image in _FAULTS:
+        mended = _mended(problem, poses, of_target, of_image)
+        fits = flat & (_distance(problem, mended, R[None], t[None])[0] < 1)
+        reasons = np.where(fits, reason, reasons)
+    return tuple(np.where(sound, "", reasons).tolist())
+
+
+def _mended(problem: RigProblem, poses: _Poses, of_target: Array, of_image: Array) -> _Poses:
+    """The poses if the axes of the targets and of the image of the right camera were exchanged."""
+    axes = problem.basis[problem.paired]
+    turn = axes @ of_target @ np.swapaxes(axes, 1, 2)
+    return _Poses((poses.R[0], of_image @ poses.R[1] @ turn), (poses.m[0], poses.m[1] @ of_image.T))
+
+
+def _mean_rig(poses: _Poses, agree: NDArray[np.bool_]) -> Pose:
+    """The mean rotation, and the translation that fits the targets' centres best."""
+    if not agree.any():
+        return Pose(np.eye(3), np.zeros(3))
+    R = nearest_rotation((poses.R[1][agree] @ np.swapaxes(poses.R[0][agree], 1, 2)).sum(axis=0))
+    # The centre of a far target is less certain.
+    depth = poses.m[1][agree, 2]
+    t = poses.m[1][agree] - poses.m[0][agree] @ R.T
+    return Pose(R, np.average(t, axis=0, weights=1.0 / np.maximum(depth, 1e-300) ** 2))

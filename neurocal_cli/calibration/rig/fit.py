@@ -1,0 +1,352 @@
+"""The rig of cameras that are calibrated already: which views agree, and one adjustment of all.
+
+`fit_rig` finds the poses of the cameras through the edges of the rig (pairs of cameras with common frames,
+see `edges`), leaves out views that contradict the others, and adjusts all cameras, poses and frames together.
+Where images of one frame were taken at different times, the target's motion and the delays of the cameras
+belong to the adjustment (`motion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, rig_problem, scatter
+from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
+from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED
+from neurocal_cli.calibration.rig.contradiction import is_significant
+from neurocal_cli.calibration.rig.covariance import (
+    contradicting_covariance,
+    covariance_of_stretch,
+    not_smaller,
+    with_target_uncertainty,
+)
+from neurocal_cli.calibration.rig.edges import (
+    Edge,
+    at_fit,
+    connected,
+    described,
+    examined,
+    fitting,
+    is_suspect,
+    pair_name,
+    views_left_out,
+)
+from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames, refuse_apart
+from neurocal_cli.calibration.rig.motion import timed
+from neurocal_cli.calibration.rig.pairing import ViewPairs
+from neurocal_cli.calibration.rig.refinement import adjusted
+from neurocal_cli.calibration.rig.result import RigAssembly
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.calibration.rig.rivals import (
+    LATE_CAMERA,
+    TAKEN,
+    TWO_GEOMETRIES,
+    Named,
+    log_evidence,
+    named_cause,
+)
+from neurocal_cli.calibration.verdict.rival import LEVEL
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
+
+_HERE = Pose(np.eye(3), np.zeros(3))
+_ONE_PLACE = 3.0  # a baseline below this number of standard deviations counts as 0
+
+_TRIES = 2  # for the place and the kind of a change
+
+_LeftOut = dict[tuple[int, str], str]  # views, by the index of the camera, and why
+
+
+def fit_rig(
+    cameras: Mapping[str, Calibration],
+    views: FrameNames | None = None,
+    *,
+    refine_cameras: bool = False,
+    outliers: str = "reject",
+    target_kept: bool = False,
+) -> Rig:
+    """Find the poses of cameras relative to the first one from the views of all.
+
+    Parameters
+    ----------
+    cameras : dict of Calibration by name
+        On one target, in one world unit.
+    views : FrameNames, optional
+        The frames of their views, by default as `connected_frames` finds them.
+    refine_cameras : bool
+        Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
+        estimated. Otherwise it refines the rig and the poses alone.
+    outliers : {"reject", "keep"}
+        Whether views that contradict most others are left out of the rig with a warning, or raise.
+    target_kept : bool
+        Whether the given target was kept although it could have been estimated from all cameras.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Views that contradict each other.
+    CoincidentCamerasError
+        Two cameras at one place.
+    UsageError
+        An unknown option.
+    """
+    if outliers not in ("reject", "keep"):
+        raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
+    names = list(cameras)
+    views = views or connected_frames({name: camera.points for name, camera in cameras.items()})
+    cameras = dict(zip(names, _with_agreeing_poses(list(cameras.values()), views), strict=True))
+    problem = rig_problem(list(cameras.values()), views.of_views)
+    edges = examined(problem, views.seen)
+    start = connected(edges, names)
+    _refuse_poor_camera(edges, names)
+    left_out = views_left_out(edges, problem)
+    if outliers == "keep" and left_out:
+        raise DegenerateGeometryError(
+            f"{_told(left_out, problem, names)}; remove them, or use --outliers reject"
+        )
+    fit, left_out, warnings = _without_contradictions(problem, start, left_out, refine_cameras, names)
+    _refuse_if_most_contradict(left_out, problem, names)
+    least, stretched = _covariance(fit), None
+    target = cameras[names[0]].target
+    if target is not None and all(camera.target is target for camera in cameras.values()):
+        uncertain = with_target_uncertainty(target, fit)
+        least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
+    if target_kept or any(camera.target_stretched for camera in cameras.values()):
+        stretched = covariance_of_stretch(fit)
+    if target_kept and stretched is not None:
+        kept = tuple(replace(camera, target_stretched=stretched[0]) for camera in fit.problem.calibrations)
+        fit = replace(fit, problem=replace(fit.problem, calibrations=kept))
+    rig = _assembled(fit, names, least, None if stretched is None else stretched[1])
+    if left_out:
+        warnings.insert(0, _told(left_out, problem, names))
+    rig = replace(
+        rig,
+        left_out={(names[c], view): why for (c, view), why in left_out.items()},
+        judgement=assess_rig,
+        warnings=tuple(warnings),
+    )
+    _refuse_one_place(rig)
+    return rig
+
+
+def _without_contradictions(
+    problem: RigProblem, start: Sequence[Pose], left_out: _LeftOut, refine_cameras: bool, names: list[str]
+) -> tuple[RigFit, _LeftOut, list[str]]:
+    """The common fit, the views that it leaves out, and its warnings."""
+    times = _times(problem)
+
+    def fitted() -> tuple[RigFit, list[str]]:
+        within = _detached(problem, left_out, names)
+        fit, warnings = adjusted(within, within.start(start), refine_cameras, names)
+        moving = with_delays(fit, times, names)
+        return (
+            (fit, warnings)
+            if moving is fit
+            else adjusted(moving.problem, moving.state, refine_cameras, names)
+        )
+
+    fit, warnings = fitted()
+    if any(map(is_suspect, left_out.values())):
+        fits = fitting(_detached(problem, _named(left_out), names), fit)
+        held = {view for view in _views(problem, fits) if is_suspect(left_out.get(view, ""))}
+        if held:
+            left_out = {view: why for view, why in left_out.items() if view not in held}
+            fit, warnings = fitted()
+    for _ in names:
+        found = named_cause(fit, names)[0]
+        if found is None or found.cause not in TWO_GEOMETRIES:
+            break
+        before = left_out
+        for _ in range(_TRIES):
+            why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
+            left_out = before | dict.fromkeys(_views(problem, found.apart), why)
+            fit, warnings = fitted()
+            again = _seen_again(_detached(problem, before, names), fit, names)
+            if again is None or again.text == found.text:
+                break
+            found = again
+    return fit, left_out, warnings
+
+
+def _seen_again(problem: RigProblem, fit: RigFit, names: Sequence[str]) -> Named | None:
+    """What the fit of one part says that changed before the other one, which `problem` has as well.
+
+    Large changes look different where the fit is a compromise between both parts.
+    """
+    still = at_fit(problem, fit)
+    return named_cause(still, names, TWO_GEOMETRIES)[0]
+
+
+def _with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[Calibration]:
+    """Cameras with the poses of flat targets on which they agree with others."""
+    if not any(camera.second_poses for camera in cameras):
+        return cameras
+    frames = [dict(zip(own.tolist(), camera.points.view_names, strict=True))
+              for own, camera in zip(views.of_views, cameras, strict=True)]  # fmt: skip
+    for a in range(len(cameras)):
+        for b in range(a + 1, len(cameras)):
+            both = tuple((frames[a][k], frames[b][k]) for k in frames[a].keys() & frames[b].keys())
+            if both:
+                cameras[a], cameras[b] = with_agreeing_poses(cameras[a], cameras[b], ViewPairs(both))
+    return cameras
+
+
+def _detached(problem: RigProblem, left_out: Mapping[tuple[int, str], str], names: list[str]) -> RigProblem:
+    """The problem without the views that are left out of the rig; each camera must still be in it."""
+    apart = [
+        np.array([(c, name) in left_out for name in own], dtype=bool) for c, own in enumerate(problem.names)
+    ]
+    found = problem.detached(apart)
+    member = np.zeros((len(names), len(found.scale)), dtype=int)
+    for row, observed in zip(member, found.observations, strict=True):
+        row[observed.view[found.together[observed.view]]] = 1
+    if not (member.sum(axis=1) > 0).all():
+        lost = names[int(np.argmin(member.sum(axis=1)))]
+        raise DegenerateGeometryError(
+            f"no view connects camera {lost}: {_told(left_out, problem, names)}; check that the views of a "
+            "frame show one target at one moment, in the same order"
+        )
+    refuse_apart(names, member @ member.T > 0)
+    return found
+
+
+def _views(problem: RigProblem, chosen: Sequence[NDArray[np.bool_]]) -> list[tuple[int, str]]:
+    """The chosen views of each camera, (V_c,) bool, by the index of the camera and by name."""
+    return [
+        (c, view)
+        for c, (own, which) in enumerate(zip(problem.names, chosen, strict=True))
+        for view, is_in in zip(own, which, strict=True)
+        if is_in
+    ]
+
+
+def _named(left_out: Mapping[tuple[int, str], str]) -> dict[tuple[int, str], str]:
+    """The views with a fault that has a name."""
+    return {view: why for view, why in left_out.items() if not is_suspect(why)}
+
+
+def _told(left_out: Mapping[tuple[int, str], str], problem: RigProblem, names: Sequence[str]) -> str:
+    """The views that are left out, of two cameras by pairs, and why."""
+    if len(names) == 2:
+        pairs = {pair: left_out[0, pair[0]] for pair in problem.pairs if (0, pair[0]) in left_out}
+        faults = {pair_name(pair): why for pair, why in pairs.items()}
+        return described(faults, len(problem.paired), "pairs of views")
+    n = sum(int(problem.together[observed.view].sum()) for observed in problem.observations)
+    return described({f"{names[c]}/{view}": why for (c, view), why in left_out.items()}, n, "views")
+
+
+def _refuse_poor_camera(edges: Sequence[Edge], names: Sequence[str]) -> None:
+    """Refuse two cameras of which most pairs contradict each other if one is poor by itself."""
+    n, agreed = len(edges[0].consensus.reasons), edges[0].n_agreed
+    if len(names) > 2 or 2 * agreed > n:
+        return
+    for name, camera in zip(names, edges[0].problem.calibrations, strict=True):
+        verdict = camera.verdict
+        if verdict is not None and verdict.word == "poor":
+            raise DegenerateGeometryError(
+                f"{n - agreed} of {n} pairs of views contradict the rig, and camera {name} is poor by "
+                f"itself: {verdict.reasons[0]}; {verdict.advice[0]}"
+            )
+
+
+def _refuse_if_most_contradict(left_out: _LeftOut, problem: RigProblem, names: Sequence[str]) -> None:
+    """Refuse two cameras of which half of the pairs contradict the others for no change of the rig."""
+    odd = [why for (c, _), why in left_out.items() if c == 0 and not why.startswith(TAKEN)]
+    if len(names) > 2 or 2 * len(odd) < len(problem.paired):
+        return
+    told = _told(left_out, problem, names)
+    if not set(odd).isdisjoint(SHIFTED.values()):
+        raise DegenerateGeometryError(f"{told}; {PAIR_ANEW}")
+    raise DegenerateGeometryError(
+        f"{told}; check that the views of a pair show one target at one moment, in the same order"
+    )
+
+
+def _refuse_one_place(rig: Rig) -> None:
+    if len(rig.cameras) > 2:
+        return  # others may still determine the points
+    pair = rig.pair(*rig.cameras)
+    if pair.baseline <= _ONE_PLACE * pair.std["baseline"]:
+        raise CoincidentCamerasError(
+            f"both cameras are at the same place: the baseline is {pair.baseline:.3g} +- "
+            f"{pair.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two "
+            "different cameras"
+        )
+
+
+def _times(problem: RigProblem) -> list[Array] | None:
+    """Times of each camera's views, if all are known."""
+    times = [camera.points.view_times for camera in problem.calibrations]
+    known = [one for one in times if one is not None]
+    return known if len(known) == len(times) else None
+
+
+def with_delays(fit: RigFit, times: Sequence[Array] | None, names: Sequence[str]) -> RigFit:
+    """The fit with the motion of the target and the delays of the cameras, if the frames show them.
+
+    Delays are tried where they are the cause of the contradictions, stated times wherever they are known.
+    """
+    squares, degrees = scatter(fit)
+    if not is_significant(squares, degrees):
+        return fit
+    found, _ = named_cause(fit, names)
+    late = found is not None and found.cause is LATE_CAMERA
+    best, most = fit, LEVEL
+    for stated in ([times] if times is not None else []) + ([None] if late else []):
+        trial = timed(fit, stated)
+        if trial is not None:
+            evidence = log_evidence(squares, scatter(trial)[0], degrees, len(names) - 1)
+            if evidence > most:
+                best, most = trial, evidence
+    return best
+
+
+def _covariance(fit: RigFit) -> Array | None:
+    """Covariance of the free shared unknowns if that of independent points is too small; else None.
+
+    It is that of all unknowns that the points determine, also of cameras that were not refined.
+    """
+    estimated = fit.problem.estimated_shared
+    if is_significant(*scatter(fit)) or (fit.free != estimated).any():
+        whole = contradicting_covariance(replace(fit, free=estimated))
+        moved = fit.free[estimated]
+        return whole[np.ix_(moved, moved)]
+    return None
+
+
+def _assembled(fit: RigFit, names: list[str], least: Array | None, stretched: Array | None) -> Rig:
+    found = RigAssembly(fit, least, stretched)
+    cameras = dict(zip(names, found.cameras, strict=True))
+    none = dict.fromkeys((*POSE_NAMES, "baseline"), 0.0)
+    first = next(iter(cameras.values()))
+    return Rig(
+        cameras,
+        dict(zip(names, [_HERE, *found.poses], strict=True)),
+        dict(zip(names, [none, *found.stds], strict=True)),
+        found.covariance,
+        _frames(fit.problem, names),
+        delays=dict(zip(names[1:], found.delays, strict=False)),
+        timed=fit.problem.motion is not None and fit.problem.motion.stated,
+        rmse_px=found.rmse_px,
+        max_px=max(camera.max_px for camera in found.cameras),
+        converged=first.converged,
+        stop_reason=first.stop_reason,
+        iterations=fit.iterations,
+    )
+
+
+def _frames(problem: RigProblem, names: list[str]) -> dict[str, dict[str, str]]:
+    """The views of each frame that several cameras saw, by the name that the first of them gave it."""
+    frames: dict[int, dict[str, str]] = {}
+    for camera, own, observed in zip(names, problem.names, problem.observations, strict=True):
+        for view, frame in zip(own, observed.view.tolist(), strict=True):
+            if problem.together[frame]:
+                frames.setdefault(frame, {})[camera] = view
+    return {next(iter(views.values())): views for views in frames.values()}
