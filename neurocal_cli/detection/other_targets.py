@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 # With these limits test_other_targets.py recognises nothing in noise, blurred boards and sample images.
 _LONGEST = 1000  # px; larger images are reduced to this longer side, which still shows a target's marks
 _MARKERS = 3  # different ones of one family; noise sometimes gives one
+# Markers of a family that are looked for. Boards usually have the first ones, and 1000 take 7 times as long.
+_IDS = 100
+_SMALLEST = 0.05  # least perimeter of a marker, in longer sides of the image; its bits are 2 px wide then
 _WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers
 _FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
 _CIRCLES = 16
@@ -48,9 +51,11 @@ def _shows_markers(grey: NDArray[np.uint8]) -> bool:
         return False
     parameters = aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW
+    parameters.minMarkerPerimeterRate = _SMALLEST
     for family in _FAMILIES:
-        detector = aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, family)), parameters)
-        _, ids, _ = detector.detectMarkers(grey)
+        dictionary = aruco.getPredefinedDictionary(getattr(aruco, family))
+        dictionary.bytesList = dictionary.bytesList[:_IDS]
+        _, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
         if ids is not None and len(np.unique(ids)) >= _MARKERS:
             return True
     return False
