@@ -11,6 +11,8 @@ from support.slow_cases import slow_but
 
 from neurocal_cli.detection.board_size import SeenBoard, Vote, agreed_size, find_board, found_size, seen_board
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.identify import identify
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.observations.board import Board
@@ -175,9 +177,33 @@ def test_drawn_circles_have_no_grid_and_overexposed_squares_have_one(blur: float
 
 def test_the_border_of_a_shadow_is_no_end_of_the_board(real_files: RealFiles) -> None:
     (image,) = map(grey, real_files("photographs/shadow_rim.png"))
-    with pytest.raises(NoBoardError, match="with ends on all sides, but the board has 9 x 7"):
-        identify(Board.single(9, 7, 25.0), find_grids(image), image)
-    assert not found_size([image]).sure
+    grids = find_grids(image)
+    ends = [end for _, end in sorted(board_ends(image, grids[0]).items())]
+    assert sorted(end.name for end in ends) == ["BOARD", "BOARD", "BOARD", "PATTERN"]
+    (located,) = identify(Board.single(9, 7, 25.0), grids, image).located
+    assert located.grid.shape == (7, 5)
+    with pytest.raises(NoBoardError, match="only parts of a chessboard are seen, of 7 x 5"):
+        found_size([image])
+
+
+def in_shadow(light: float) -> tuple[np.ndarray, Grid]:
+    """A board in a shadow that begins at its fifth line, and the grid of the four lines before it."""
+    image = np.array(picture("tilt 0", 0).image, dtype=float)
+    (grid,) = find_grids(image)
+    first, last = grid.pixels[0, 4], grid.pixels[-1, 4]
+    v, u = np.indices(image.shape)
+    (du, dv), (au, av) = last - first, grid.pixels[0, 5] - first
+    side = du * (v - first[1]) - dv * (u - first[0])
+    dark = side * (du * av - dv * au) > 0
+    return np.where(dark, 30 + light * (image - 30), image).round().astype(np.uint8), Grid(
+        grid.pixels[:, :4], grid.dark
+    )
+
+
+@pytest.mark.parametrize(("light", "end"), [(0.1, End.PATTERN), (0.0, End.DIM)])
+def test_a_shadow_that_begins_at_a_line_is_no_end(light: float, end: End) -> None:
+    image, lit = in_shadow(light)
+    assert board_ends(image, lit)[1, 0] is end
 
 
 def test_a_smaller_board_is_no_part_of_the_one_that_is_described(real_files: RealFiles) -> None:

@@ -2,8 +2,9 @@
 
 One more ring of squares surrounds the outer vertices. If the board ends, the brightness beyond the ring is
 the same next to dark and light squares, and the change is where the next vertices would be. An occluder, a
-shadow or the image border cuts the ring at another place. A shadow may begin just at a line of the board.
-What lies beyond is then dark at one side and light at the others, so that side is not taken for an end.
+shadow or the image border cuts the ring at another place. A shadow may begin just at a line of the board. The
+pattern may be seen in it faintly. If not, what lies beyond is dark at one side and light at the others, so
+that side is not taken for an end.
 """
 
 from __future__ import annotations
@@ -20,12 +21,16 @@ from neurocal_cli.detection.grid import Grid
 # Sides of a grid, named by their outward directions (c, r).
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 # With these limits test_identity.py classifies ends of rendered boards, occluders and image borders.
-_STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
-_RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
+_STEPS = np.arange(0.60, 1.71, 0.05)  # squares outwards from the outer vertices
+_RING, _BEYOND = _STEPS < 0.76, (_STEPS > 1.19) & (_STEPS < 1.41)
+_MARGIN = (_STEPS > 1.09) & (_STEPS < 1.16)  # of a board whose margin is narrow
+_NEXT = _STEPS > 1.29  # in the middle of the next squares
+_FAR = int(np.count_nonzero(_STEPS < 1.41)) - 1
 _ACROSS = np.array([0.3, 0.5, 0.7])  # samples along a side, in widths of a square
 _SAME, _DIFFERENT = 0.35, 0.6  # differences of brightness, in contrasts of dark and light squares
 _AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
 _SHARE = 0.75  # least share of the squares along a side that must agree
+_FAINT, _FEWEST_FAINT = 0.004, 4  # least contrast of the pattern in a shadow, and number of neighbours
 _OUTSIDE = 0.5  # share of the profiles that leave the image above which the side does
 _FEWEST = 2  # least number of usable squares at a side
 
@@ -47,12 +52,12 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)
         found = [_classify(*side) for side in sides]
-    margins = [light for end, light in found if end is End.BOARD]
     # The margin of most sides; the light one if there are as many dark ones, which may be shadows.
-    usual = 2 * sum(margins) >= len(margins)
+    margins = sorted(margin for end, margin in found if end is End.BOARD)
+    usual = margins[len(margins) // 2] if margins else 0.0
     return {
-        direction: End.DIM if end is End.BOARD and light != usual else end
-        for direction, (end, light) in zip(DIRECTIONS, found, strict=True)
+        direction: End.DIM if end is End.BOARD and abs(margin - usual) > _DIFFERENT else end
+        for direction, (end, margin) in zip(DIRECTIONS, found, strict=True)
     }
 
 
@@ -61,28 +66,51 @@ def surrounded(ends: Mapping[tuple[int, int], End]) -> bool:
     return len(ends) == len(DIRECTIONS) and not {End.PATTERN, End.OUTSIDE, End.UNKNOWN} & set(ends.values())
 
 
-def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool_]) -> tuple[End, bool]:
+def _classify(light: NDArray[np.bool_], profile: Array, outside: NDArray[np.bool_]) -> tuple[End, float]:
     """Classify a side by the colours (N,) of its ring squares and the profiles (N, steps) across the side.
 
-    Also returns whether it is light beyond the ring.
+    Also returns the brightness beyond the ring.
     """
     if outside.mean() > _OUTSIDE:
-        return End.OUTSIDE, False
+        return End.OUTSIDE, np.nan
     ring = profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - light) < _SAME
     count = np.count_nonzero(valid)
     if count < max(_FEWEST, 0.6 * len(valid)):
-        return End.UNKNOWN, False
+        return End.UNKNOWN, np.nan
     profile, ring, light = profile[valid], ring[valid], light[valid]
     if light.all() or not light.any():
-        return End.UNKNOWN, False
-    beyond = profile[:, _BEYOND].mean(axis=1)
+        return End.UNKNOWN, np.nan
+    state, margin = _beyond_ring(light, profile, ring, _BEYOND)
+    if state is End.BOARD and margin < _SAME and _goes_on_in_shadow(light, profile):
+        return End.PATTERN, margin
+    if state is End.STOPS:  # the margin may be narrow
+        near, margin_near = _beyond_ring(light, profile, ring, _MARGIN)
+        state, margin = (near, margin_near) if near is End.BOARD else (state, margin)
+    return state, margin
+
+
+def _goes_on_in_shadow(light: NDArray[np.bool_], profile: Array) -> bool:
+    """Whether every square beyond a dark one of the ring is lighter than its neighbours, in the dark."""
+    level = profile[:, _NEXT].mean(axis=1)
+    rise = np.diff(level) * np.where(light[1:], -1, 1)
+    alternating = light[1:] != light[:-1]
+    if np.count_nonzero(alternating) < _FEWEST_FAINT or not alternating.all():
+        return False
+    return bool(rise.min() > _FAINT)
+
+
+def _beyond_ring(
+    light: NDArray[np.bool_], profile: Array, ring: Array, steps: NDArray[np.bool_]
+) -> tuple[End, float]:
+    """Classify a side by the brightness at some steps beyond the ring, and return this."""
+    beyond = profile[:, steps].mean(axis=1)
     turns = np.abs(beyond - ring) > _SAME
     at_line = np.abs(_crossings(profile, ring, beyond) - 1) < _AT_THE_LINE
     agreeing, turning = np.count_nonzero(turns & at_line), np.count_nonzero(turns)
     next_to_dark, next_to_light = float(np.median(beyond[~light])), float(np.median(beyond[light]))
-    step, margin = next_to_dark - next_to_light, bool(next_to_dark + next_to_light > 1)
-    if step > _DIFFERENT and agreeing >= _SHARE * count:
+    step, margin = next_to_dark - next_to_light, 0.5 * (next_to_dark + next_to_light)
+    if step > _DIFFERENT and agreeing >= _SHARE * len(light):
         return End.PATTERN, margin
     if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
         return End.BOARD, margin
@@ -127,7 +155,7 @@ def _opposite(
     darker = np.where(light, level, same)
     contrast[~(contrast > 0)] = np.nan
     profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
-    outside = np.any(np.isnan(values[:, -1]) & np.isfinite(places[:, -1, ..., 0]), axis=-1)
+    outside = np.any(np.isnan(values[:, _FAR]) & np.isfinite(places[:, _FAR, ..., 0]), axis=-1)
     return [(light[k], profile[k], outside[k]) for k in (0, 1)]
 
 
