@@ -72,7 +72,8 @@ class Remapping:
         if size != self.size:
             raise InputError(
                 f"has {size[0]} x {size[1]} px, but the camera is for {self.size[0]} x {self.size[1]} px; "
-                "give original images of this camera"
+                "give original images of this camera or, if they were resized, make theirs: neurocal resize "
+                f"CAMERA.yaml --to {size[0]} {size[1]} -o RESIZED.yaml"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
         undistorted = np.empty((*self.new_size[::-1], *image.shape[2:]), image.dtype)

@@ -35,6 +35,7 @@ _SUMMARIES = {
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
+    "resize": "Make the camera or the rig of resized, binned or cropped images.",
     "rig": "Calibrate a rig of any number of cameras, and their poses relative to the first.",
     "sample": "Write the sample data, with which all examples work.",
     "simulate": "Calibrate simulated cameras, and compare the methods' errors.",

@@ -110,7 +110,8 @@ def given_camera(
             raise InputError(
                 f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
                 f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
-                "for this image size"
+                "for this image size or, if the images were resized, make it: neurocal resize CAMERA.yaml "
+                f"--to {points.image_size[0]} {points.image_size[1]} -o RESIZED.yaml"
             )
     return points, camera
 

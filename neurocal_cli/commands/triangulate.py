@@ -239,7 +239,11 @@ class _Tally:
         else:
             say(", ".join(parts))
         if self.outside:
-            warn(f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras")
+            warn(
+                f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras "
+                "or, if they are of resized images, make their rig: neurocal resize RIG.yaml --to W H "
+                "-o RESIZED.yaml"
+            )
         if self.off + self.behind > _MANY_OFF * self.points:
             from neurocal_cli.calibration.rig.triangulation import fault_of_matches
 

@@ -343,7 +343,9 @@ class _Undistorting:
         if points.image_size not in (None, self.size):
             raise InputError(
                 f"{points.source}: the image_size is {_size(points.image_size)}, but the camera is for "
-                f"{_size(self.size)}; give a camera for this image size"
+                f"{_size(self.size)}; give a camera for this image size or, if the images were resized, make "
+                f"it: neurocal resize CAMERA.yaml --to {' '.join(map(str, points.image_size or ()))} "
+                "-o RESIZED.yaml"
             )
         if why := undistorted_before(points, self.camera):
             warn(why)

@@ -144,7 +144,8 @@ def test_images_that_cannot_be_corrected_are_a_line_each(camera: Path, images: P
     assert result.stderr.splitlines() == [
         f"{images}/broken.png: is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM",
         f"{images}/small.png: has 100 x 50 px, but the camera is for 400 x 300 px; give original "
-        "images of this camera",
+        "images of this camera or, if they were resized, make theirs: neurocal resize CAMERA.yaml --to 100 "
+        "50 -o RESIZED.yaml",
         "undistorted 3 of 5 files",
     ]
     assert len(list((tmp_path / "straight").iterdir())) == 3

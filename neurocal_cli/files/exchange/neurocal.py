@@ -146,13 +146,21 @@ def _calibration(cameras: CameraSet, k: int) -> Calibration:
     )
 
 
-def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+def result_of(cameras: CameraSet) -> Calibration | StereoRig | Rig:
+    """What a neurocal file of these cameras holds."""
     if len(cameras.cameras) > 2 or isinstance(cameras.origin, Rig):
-        return {"": format_rig(as_rig(cameras))}
+        return as_rig(cameras)
     if len(cameras.cameras) == 2:
-        return {"": format_stereo_rig(as_stereo(cameras))}
+        return as_stereo(cameras)
     origin = cameras.origin
-    return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
+    return origin if isinstance(origin, Calibration) else _calibration(cameras, 0)
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    result = result_of(cameras)
+    if isinstance(result, Calibration):
+        return {"": format_calibration(result)}
+    return {"": format_rig(result) if isinstance(result, Rig) else format_stereo_rig(result)}
 
 
 def matches(document: Document) -> bool:
