@@ -6,7 +6,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import print_summary
+from neurocal_cli.commands.streams import ProgressBar, print_summary, print_text, tell_written
 
 
 @click.command(cls=options.Command)
@@ -40,12 +40,14 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     from neurocal_cli.files.calibration_tree import read_calibration
 
     known = read_calibration(calibration)
-    advice = weigh(known, count)
+    with ProgressBar("comparing views"):
+        advice = weigh(known, count)
+    if as_json:
+        print_summary(advice_json(advice))
+    else:
+        print_text(lambda: "\n".join(advice_lines(advice)))
     if plot is not None:
         from neurocal_cli.commands.show.advice import draw_advice
 
         write_plot(plot, draw_advice, advice, known)
-    if as_json:
-        print_summary(advice_json(advice))
-    else:
-        click.echo("\n".join(advice_lines(advice)))
+        tell_written(plot)

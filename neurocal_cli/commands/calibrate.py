@@ -8,7 +8,7 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS
-from neurocal_cli.commands.streams import ProgressBar, conclude, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, tell_written, warn
 
 
 @click.command(cls=options.Command)
@@ -90,11 +90,16 @@ def calibrate(
 
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
-    if plots:
-        from neurocal_cli.commands.show.camera_panels import Subject
-        from neurocal_cli.commands.show.plot_pages import draw_camera
+    with concluding(calibration, as_json, calibration_json, calibration_report):
+        if not preparation.is_for_the_eye(output, "camera.yaml"):
+            warn(*write_result(calibration, output, lean=lean))
+        if plots:
+            from neurocal_cli.commands.show.camera_panels import Subject
+            from neurocal_cli.commands.show.plot_pages import draw_camera
 
-        write_plots(plots, draw_camera, Subject.of(calibration))
-    warn(*write_result(calibration, output, lean=lean))
-    write_page(html, calibration, *inputs)
-    conclude(calibration, as_json, calibration_json, calibration_report)
+            write_plots(plots, draw_camera, Subject.of(calibration))
+        write_page(html, calibration, *inputs)
+        poor = calibration.verdict is not None and calibration.verdict.word != "good"
+        better = "`neurocal advise {}` names the views to take next" if poor else ""
+        uses = "`neurocal report {} -o report.html` shows it, `neurocal undistort {} IMAGE...` uses it"
+        tell_written(output, *(file for _, file in plots), html, then=better or uses)

@@ -271,13 +271,15 @@ _OPTIONS = [
     options.choice(
         "--distortion",
         f"auto {options.MODELS} rich plumb-line",
-        "Distortion model, with coefficients as in OpenCV; none is a pinhole camera. thin_prism and "
-        "tilted are OpenCV's models of 12 and 14 coefficients. fisheye, omnidir, double_sphere and eucm are "
-        "for wide lenses, also beyond 180 degrees. rich is a fisheye with a smooth displacement of the "
-        "image, for lenses that no other model describes. auto chooses from none to rational and fisheye, "
-        "by cross-validation error and number of coefficients, and takes rich only where it predicts views "
-        "left out decidedly better. "
+        f"Distortion model, with coefficients as in OpenCV: auto, {options.MODELS.replace(' ', ', ')}, rich "
+        "or plumb-line. none is a pinhole camera. thin_prism and tilted are OpenCV's models of 12 and 14 "
+        "coefficients. fisheye, omnidir, double_sphere and eucm are for wide lenses, also beyond 180 "
+        "degrees. rich is a fisheye with a smooth displacement of the image, for lenses that no other model "
+        "describes. "
+        "auto chooses from none to rational and fisheye, by cross-validation error and number of "
+        "coefficients, and takes rich only where it predicts views left out decidedly better. "
         "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
+        metavar="MODEL",
         default="auto",
     ),
     options.no_skew,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary, print_text
 
 
 @click.command(cls=options.Command)
@@ -96,4 +96,4 @@ def compare(
     if as_json:
         print_summary(comparison_json(found))
     else:
-        click.echo(comparison_report(found))
+        print_text(lambda: comparison_report(found))

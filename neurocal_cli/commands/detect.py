@@ -27,6 +27,7 @@ from neurocal_cli.commands.streams import (
     one_line,
     print_summary,
     say,
+    tell_written,
     warn,
     where_reasons_are,
 )
@@ -177,6 +178,7 @@ def detect(
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
     write_whole(output, text)
+    tell_written(output, save_board, overlay, then="`neurocal calibrate {} -o camera.yaml`")
 
 
 @dataclass

@@ -10,7 +10,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import first_of, note, print_summary, warn
+from neurocal_cli.commands.streams import first_of, note, print_summary, tell_written, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -130,11 +130,6 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
             if evaluation.fit is not None:
                 drift = drift_since(judged, evaluation.fit.points)
             verdict = judged_by_points(verdict, judged, evaluation.given_points, drift)
-    if plots:
-        from neurocal_cli.commands.show.camera_panels import Subject
-        from neurocal_cli.commands.show.plot_pages import draw_camera
-
-        write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
     renamed = evaluation.renamed
     for names, why in (
         ([name for name in evaluation.fitted_views if name not in renamed], "not in the calibration"),
@@ -150,6 +145,12 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         print_summary(evaluation_json(evaluation, verdict) | since)
     else:
         show(evaluation_tables(evaluation), [*since_lines(drift), *verdict_lines(verdict)])
+    if plots:
+        from neurocal_cli.commands.show.camera_panels import Subject
+        from neurocal_cli.commands.show.plot_pages import draw_camera
+
+        write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
+        tell_written(None, *(file for _, file in plots))
 
 
 @evaluate.command(cls=options.Command)
@@ -223,10 +224,6 @@ def stereo(
     preparation.check_outputs((file for _, file in plots), inputs)
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
-    if plots:
-        from neurocal_cli.commands.show.plot_pages import draw_points_in_space
-
-        write_plots(plots, draw_points_in_space, evaluation, rig)
     from neurocal_cli.commands.show.stereo_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
@@ -246,6 +243,11 @@ def stereo(
         print_summary(stereo_evaluation_json(evaluation))
     else:
         show(stereo_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
+    if plots:
+        from neurocal_cli.commands.show.plot_pages import draw_points_in_space
+
+        write_plots(plots, draw_points_in_space, evaluation, rig)
+        tell_written(None, *(file for _, file in plots))
 
 
 @evaluate.command(cls=options.Command)

@@ -6,7 +6,16 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import ProgressBar, conclude, note, print_summary, say, warn
+from neurocal_cli.commands.streams import (
+    ProgressBar,
+    concluding,
+    note,
+    print_summary,
+    print_text,
+    say,
+    tell_written,
+    warn,
+)
 
 _MOST_UNITS = 20  # of a layer
 # Options that change nothing on known cameras.
@@ -163,12 +172,16 @@ def fit(
                 topologies=topologies,
                 progress=progress,
             )
-    if plot is not None:
-        from neurocal_cli.commands.show.zoom_plots import draw_lens
+    with concluding(learnt, as_json, lens_json, lens_report):
+        if not preparation.is_for_the_eye(output, "lens.yaml"):
+            write_lens(learnt, output)
+        if plot is not None:
+            from neurocal_cli.commands.show.zoom_plots import draw_lens
 
-        write_plot(plot, draw_lens, learnt)
-    write_lens(learnt, output)
-    conclude(learnt, as_json, lens_json, lens_report)
+            write_plot(plot, draw_lens, learnt)
+        settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
+        then = f"`neurocal lens camera {{}} {settings} -o camera.yaml` gives the camera at one setting"
+        tell_written(output, plot, then=then)
 
 
 @lens.command(cls=options.Command)
@@ -272,12 +285,13 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     note(*notes)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
+    if as_json:
+        print_summary(evaluation_json(evaluation, verdict))
+    else:
+        print_text(lambda: evaluation_report(evaluation, learnt.controls, verdict))
+    warn(*evaluation.warnings)
     if plot is not None:
         from neurocal_cli.commands.show.zoom_plots import draw_evaluation
 
         write_plot(plot, draw_evaluation, evaluation, learnt.controls)
-    if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
-    else:
-        click.echo(evaluation_report(evaluation, learnt.controls, verdict))
-    warn(*evaluation.warnings)
+        tell_written(plot)

@@ -6,6 +6,7 @@ Commands use them as ``@options.path(...)``, so that options with the same meani
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from functools import partial, wraps
@@ -49,6 +50,19 @@ MODELS = f"{_USUAL} thin_prism tilted fisheye omnidir double_sphere eucm"
 COMMON_MODELS = f"auto {_USUAL} fisheye"
 """Those from which "auto" chooses by cross-validation."""
 
+_FEW = 10  # options that need no headings
+_REST = "Options"
+# Headings of options in the help of commands that have many, and the parameters below each.
+_GROUPS = {
+    "What is known": "type image_center intrinsics extrinsics left_intrinsics right_intrinsics known "
+    "image_size fix alpha_u",
+    "Lens": "distortion distortion_of models no_skew skew square_pixels",
+    "Target and outliers": "file cols rows square unit points target gamma outliers",
+    "Output": "output plot plots html lean as_json camera_name ros alpha overlay save_board cache help",
+    "Research": "method trainer starts seed epochs rate rate_gamma training hidden",
+}
+_NOISE = re.compile(r"default: \((none|no)\)|(\S+<=?)?x(<=?|>=?)\S+").fullmatch
+
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `simulation.comparison`, which a test compares."""
 
@@ -80,7 +94,32 @@ class Command(click.Command):
         if rows := arguments(self):
             with formatter.section("Arguments"):
                 formatter.write_dl(rows)
-        super().format_options(ctx, formatter)
+        for title, options in grouped(self, ctx):
+            records = [record for option in options if (record := option.get_help_record(ctx))]
+            with formatter.section(title):
+                formatter.write_dl([(names, _without_noise(text)) for names, text in records])
+
+
+def grouped(command: click.Command, ctx: click.Context) -> list[tuple[str, list[click.Option]]]:
+    """The options of a command under the headings of ``--help``; under one heading if they are few."""
+    options = [p for p in command.get_params(ctx) if isinstance(p, click.Option)]
+    if len(options) <= _FEW:
+        return [("Options", options)]
+    home = {name: title for title, names in _GROUPS.items() for name in names.split()}
+    groups: dict[str, list[click.Option]] = {title: [] for title in (_REST, *_GROUPS)}
+    for option in options:
+        groups[home.get(str(option.name), _REST)].append(option)
+    return [(title, members) for title, members in groups.items() if members]
+
+
+def _without_noise(text: str) -> str:
+    """Help of an option without ranges and defaults that tell nothing, which Click adds in brackets."""
+    sentence, bracket, extra = text.rpartition("  [")
+    if not bracket:
+        return text
+    parts = [part for part in extra.removesuffix("]").split("; ") if not _NOISE(part)]
+    told = "; ".join(re.sub(r"^default: \((.*)\)$", r"default: \1", part) for part in parts)
+    return f"{sentence}  [{told}]" if told else sentence
 
 
 def arguments(command: click.Command) -> list[tuple[str, str]]:

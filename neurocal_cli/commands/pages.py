@@ -12,7 +12,7 @@ import click
 from neurocal_cli.commands import options
 from neurocal_cli.commands.options import F
 from neurocal_cli.commands.show.figure import check_available
-from neurocal_cli.commands.streams import TYPED
+from neurocal_cli.commands.streams import TYPED, ProgressBar
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import write_whole
@@ -86,7 +86,8 @@ def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None
 
 def write_plot(file: str, draw: Callable[..., bytes], *subject: Any) -> None:
     """Draw and write a picture of a subject, of the `kind` that the file's name ends in."""
-    write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
+    with ProgressBar(f"drawing {file}"):
+        write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
 
 
 html_option = options.path(

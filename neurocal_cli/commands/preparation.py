@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.streams import note, warn
+from neurocal_cli.commands import options
+from neurocal_cli.commands.screen import is_terminal
+from neurocal_cli.commands.streams import note, say, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 from neurocal_cli.files.writing import STDOUT_NAMES, check_places, held_back
 
@@ -26,6 +29,14 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     if held is not None:
         held.protect(*inputs)
     check_places(*outputs)
+
+
+def is_for_the_eye(output: str, name: str, what: str = "the file") -> bool:
+    """Whether a result that nobody asked for would go to a terminal, over its summary; say how to keep it."""
+    if output != "-" or options.typed("output") or not is_terminal(sys.stdout):
+        return False
+    say(f"{what} is not kept; add `-o {name}` to keep it, or `-o -` to see it")
+    return True
 
 
 def check_folder(option: str, folder: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note
+from neurocal_cli.commands.streams import note, tell_written
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.image_files import photographs_of
 from neurocal_cli.files.reading import decode, read_bytes
@@ -67,7 +67,11 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
-    write_whole(output, _page(root, {source: hashlib.sha256(data).hexdigest()}, images))
+    text = _page(root, {source: hashlib.sha256(data).hexdigest()}, images)
+    if preparation.is_for_the_eye(output, "report.html", "the page"):
+        return
+    write_whole(output, text)
+    tell_written(output, then="open {} in a browser")
 
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:

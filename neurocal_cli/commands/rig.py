@@ -11,7 +11,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import check_plot, html_option, plot_option, write_page, write_plot
-from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, note, tell_written, warn
 from neurocal_cli.errors import UsageError
 
 
@@ -162,13 +162,16 @@ def rig(
         points[name], camera_options[name] = own.prepare(one)
     with ProgressBar() as progress:
         found = calibrate_rig(points, camera_options, outliers=estimation.outliers, progress=progress)
-    if plot is not None:
-        from neurocal_cli.commands.show.plot_pages import draw_rig
+    with concluding(found, as_json, rig_json, rig_report):
+        if not preparation.is_for_the_eye(output, "rig.yaml"):
+            warn(*write_result(found, output, lean=lean))
+        if plot is not None:
+            from neurocal_cli.commands.show.plot_pages import draw_rig
 
-        write_plot(plot, draw_rig, found)
-    warn(*write_result(found, output, lean=lean))
-    write_page(html, found, *inputs)
-    conclude(found, as_json, rig_json, rig_report)
+            write_plot(plot, draw_rig, found)
+        write_page(html, found, *inputs)
+        then = "`neurocal evaluate {}` has its errors, `neurocal triangulate {} POINTS.csv` uses it"
+        tell_written(output, plot, html, then=then)
 
 
 def named_file(word: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary
+from neurocal_cli.commands.streams import ProgressBar, note, print_summary, print_text, tell_written
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -207,14 +207,15 @@ def simulate(
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
         starts = _starts(scene, random_starts, seed, jobs, progress)
+    if as_json:
+        print_summary(simulation_json(scene, seed, study, starts))
+    else:
+        print_text(lambda: text_of(*simulation_tables(study, starts, paper)))
     if plot is not None:
         from neurocal_cli.commands.show.simulation_plots import draw_simulation
 
         write_plot(plot, draw_simulation, study, starts, scene.unit)
-    if as_json:
-        print_summary(simulation_json(scene, seed, study, starts))
-    else:
-        click.echo(text_of(*simulation_tables(study, starts, paper)))
+        tell_written(plot)
 
 
 def _scene(
@@ -269,14 +270,15 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
+    if as_json:
+        print_summary(rates_json(study))
+    else:
+        print_text(lambda: text_of(*rates_tables(study)))
     if plot is not None:
         from neurocal_cli.commands.show.simulation_plots import draw_rates
 
         write_plot(plot, draw_rates, study)
-    if as_json:
-        print_summary(rates_json(study))
-    else:
-        click.echo(text_of(*rates_tables(study)))
+        tell_written(plot)
 
 
 def _rig(
@@ -315,7 +317,7 @@ def _rig(
     if as_json:
         print_summary(rig_study_json(study))
     else:
-        click.echo(text_of(*rig_study_table(study)))
+        print_text(lambda: text_of(*rig_study_table(study)))
 
 
 def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:

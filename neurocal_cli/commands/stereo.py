@@ -11,7 +11,7 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import RIG_PANELS
-from neurocal_cli.commands.streams import ProgressBar, conclude, note, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, note, tell_written, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
 
@@ -139,19 +139,22 @@ def stereo(
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
         rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
-    if plots:
-        from neurocal_cli.commands.show.plot_pages import draw_stereo
-
-        write_plots(plots, draw_stereo, rig)
-    if ros is not None:
-        from neurocal_cli.files.stereo_yaml import format_ros_pair
-
-        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
-            write_whole(name, text)
-    warn(*write_result(rig, output, lean=lean, alpha=alpha))
-    write_page(html, rig, *inputs)
     note(*views_alone(rig.alone))
-    conclude(rig, as_json, stereo_json, stereo_report)
+    with concluding(rig, as_json, stereo_json, stereo_report):
+        if not preparation.is_for_the_eye(output, "rig.yaml"):
+            warn(*write_result(rig, output, lean=lean, alpha=alpha))
+        if ros is not None:
+            from neurocal_cli.files.stereo_yaml import format_ros_pair
+
+            for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
+                write_whole(name, text)
+        if plots:
+            from neurocal_cli.commands.show.plot_pages import draw_stereo
+
+            write_plots(plots, draw_stereo, rig)
+        write_page(html, rig, *inputs)
+        then = "`neurocal evaluate {}` has its errors, `neurocal rectify {} LEFT RIGHT -o DIR` uses it"
+        tell_written(output, *ros_files, *(name for _, name in plots), html, then=then)
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:

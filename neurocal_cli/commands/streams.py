@@ -5,16 +5,19 @@ from __future__ import annotations
 import io
 import json
 import os
+import shlex
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from neurocal_cli.commands.screen import drawn_on, is_terminal, wrapped
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
 if TYPE_CHECKING:
@@ -73,7 +76,7 @@ def one_line(text: str) -> str:
 def tell(text: str) -> None:
     """Show a text on stderr. A full or closed stderr must not cost the user the result."""
     with suppress(OSError):
-        click.echo(text, err=True)
+        click.echo(wrapped(text, sys.stderr), err=True)
 
 
 def say(text: str) -> None:
@@ -117,22 +120,41 @@ def tell_more(text: str) -> None:
         tell(one_line(text))
 
 
-def conclude(
+@contextmanager
+def concluding(
     result: Any, as_json: bool, in_json: Callable[[Any], dict[str, Any]], in_words: Callable[[Any], str]
-) -> None:
-    """Show the summary of a result and its warnings; exit if its training did not converge."""
+) -> Iterator[None]:
+    """Show the summary of a result and its warnings, and then write the outputs inside.
+
+    As JSON, it is printed after them. In the end, exit if the training did not converge.
+    """
+    if not as_json:
+        with drawn_on(sys.stderr):
+            say(in_words(result))
+        warn(*result.warnings)
+    yield
     if as_json:
         print_summary(in_json(result))
-    else:
-        say(in_words(result))
-    warn(*result.warnings)
+        warn(*result.warnings)
     if not result.converged:
         click.get_current_context().exit(_NOT_CONVERGED)
 
 
-def is_terminal(stream: TextIO | None) -> bool:
-    """Whether the stream is a terminal."""
-    return stream is not None and not stream.closed and stream.isatty()
+def print_text(made: Callable[[], str]) -> None:
+    """Print a text on stdout, made for its width if it is a terminal."""
+    with drawn_on(sys.stdout):
+        click.echo(wrapped(made(), sys.stdout))
+
+
+def tell_written(output: str | None, *others: str | None, then: str = "") -> None:
+    """Say on a terminal which files were written, and what to do next with the first of them, ``{}``."""
+    if not is_terminal(sys.stderr):
+        return
+    written = [file for file in (output, *others) if file not in (None, "-")]
+    if written:
+        say(f"wrote {', '.join(map(str, written))}")
+    if then and output not in (None, "-"):
+        say(f"next: {then.replace('{}', shlex.quote(str(output)))}")
 
 
 def first_of(names: Sequence[str]) -> str:
@@ -148,40 +170,55 @@ def print_summary(tree: dict[str, Any]) -> None:
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Draws a bar on stderr for long work; it is called with a stage and the completed fraction.
 
-    Without a terminal it does nothing, and rich is not imported. With --verbose, each stage is a line
-    instead.
+    It appears after half a second, even if the work has not told of itself. Without a terminal it does
+    nothing, and rich is not imported. With --verbose, each stage is a line instead.
     """
 
-    def __init__(self) -> None:
-        self._visible = is_terminal(sys.stderr) and not verbose()
-        self._stage = ""
+    def __init__(self, stage: str = "") -> None:
+        self._stage = stage
+        self._share = 0  # of the work that is done, in thousandths
         self._start = time.monotonic()
         self._bar: Progress | None = None
         self._task: TaskID | None = None
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        if is_terminal(sys.stderr) and not verbose() and _VERBOSITY.get() >= 0:
+            self._timer = threading.Timer(_PATIENCE, self._appear)
+            self._timer.daemon = True
+            self._timer.start()
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Show the progress of the work."""
         if stage != self._stage:
-            self._stage = stage
             tell_more(f"{time.monotonic() - self._start:7.2f} s  {stage}")
-        if not self._visible or time.monotonic() - self._start < _PATIENCE:
-            return
-        if self._bar is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        with self._lock:
+            self._stage, self._share = stage, round(1000 * min(max(fraction, 0.0), 1.0))
+            if self._bar is not None and self._task is not None:
+                total = 1000 if self._share else None  # the bar pulses as long as the share is unknown
+                self._bar.update(self._task, description=stage, total=total, completed=self._share)
 
-            columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
-            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._bar.add_task("", total=1.0)
+    def _appear(self) -> None:
+        """Draw the bar, in a thread of its own."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        with self._lock:
+            if self._timer is None:  # the work has ended meanwhile
+                return
+            parts = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+            self._bar = Progress(*parts, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task(self._stage, total=1000 if self._share else None)
             self._bar.start()
-        assert self._task is not None
-        self._bar.update(self._task, description=stage, completed=min(max(fraction, 0.0), 1.0))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+            if self._bar is not None:
+                self._bar.stop()
         tell_more(f"{time.monotonic() - self._start:7.2f} s  {'done' if kind is None else 'stopped'}")
 
 

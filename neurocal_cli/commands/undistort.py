@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import each_of, is_terminal, note, note_once, print_summary, say, warn
+from neurocal_cli.commands.screen import is_terminal
+from neurocal_cli.commands.streams import (
+    each_of,
+    note,
+    note_once,
+    print_summary,
+    say,
+    tell_written,
+    warn,
+)
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.files.image_files import find_images, is_image
 from neurocal_cli.files.writing import make_folder, write_whole
@@ -145,8 +154,11 @@ def undistort(
         print_summary({"files": written, "failed": failed, **work.summary()})
         return
     work.tell_loss()
+    if original.distortion.is_identity:
+        say("the camera has no distortion, so the pixels stay where they are")
     if len(paths) > 1:
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
+    tell_written(None if not paths else folder or output, new_camera, maps)
 
 
 def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[int, int] | None) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,23 +117,6 @@ def test_stdin_is_not_read_twice() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo terminal")
-def test_a_terminal_gets_a_drawn_table(camera: Path) -> None:
-    leader, follower = os.openpty()
-    command = [sys.executable, "-m", "neurocal_cli", "evaluate", "camera", str(camera)]
-    with subprocess.Popen(command, stdout=follower, stderr=subprocess.PIPE) as process:
-        os.close(follower)
-        shown = b""
-        try:
-            while chunk := os.read(leader, 4096):
-                shown += chunk
-        except OSError:  # how Linux reports that the other side is closed
-            pass
-        os.close(leader)
-    assert process.returncode == 0
-    assert "│" in shown.decode()
-    assert b"view01" in shown
-
-
 def test_a_camera_file_of_ros_is_judged_by_points_with_fitted_poses(tmp_path: Path) -> None:
     ros = tmp_path / "ros.yaml"
     ros.write_text(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import subprocess
 import sys
@@ -13,14 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 from support.command_line import run
 from support.places import SAMPLES
 from support.slow_cases import slow_but
 
 from neurocal_cli import Board, read_image
 from neurocal_cli.commands.requested_board import _shown, another_size
-from neurocal_cli.commands.show import terminal
 from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.measuring import Points
@@ -103,14 +100,3 @@ def test_the_shell_can_complete(shell: str) -> None:
     assert "_NEUROCAL_COMPLETE" in completed(_NEUROCAL_COMPLETE=f"{shell}_source")
     words = {"COMP_WORDS": "neurocal calib", "COMP_CWORD": "calib" if shell == "fish" else "1"}
     assert "calibrate" in completed(_NEUROCAL_COMPLETE=f"{shell}_complete", **words)
-
-
-@pytest.mark.parametrize("width", [30, 60, 100])
-def test_tables_break_no_word_on_a_narrow_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = io.StringIO()
-    monkeypatch.setattr(terminal, "is_terminal", lambda stream: True)
-    monkeypatch.setattr("rich.console.Console", lambda: Console(file=shown, width=width))
-    words = ["correspondence", "reprojection", "cross-validation"]
-    terminal.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
-    for word in words:
-        assert word in shown.getvalue()

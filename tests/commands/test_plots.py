@@ -55,7 +55,7 @@ def test_odd_calibrations_are_drawn(calibration: Calibration) -> None:
 
 def test_missing_matplotlib_is_said_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(NeurocalError, match=r"pip install 'neurocal\[plot\]'"):
+    with pytest.raises(NeurocalError, match="pip install matplotlib"):
         draw_camera(Subject.of(made_calibration()))
 
 

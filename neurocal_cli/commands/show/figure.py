@@ -21,7 +21,7 @@ def check_available() -> None:
         import matplotlib  # noqa: F401 - only tests whether it is installed
     except ImportError as error:
         raise NeurocalError(
-            "pictures need matplotlib, which is not installed; pip install 'neurocal[plot]'"
+            "pictures need matplotlib, which is not installed; pip install matplotlib"
         ) from error
 
 

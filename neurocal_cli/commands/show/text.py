@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.commands.screen import table_width
 from neurocal_cli.commands.streams import verbose
 
 if TYPE_CHECKING:
@@ -43,16 +44,35 @@ def joined(*blocks: Sequence[str]) -> str:
 
 
 def align(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
+    """Lines of a table: the first column to the left, the others to the right.
+
+    On a terminal that is too narrow, the columns that do not fit stand below, after the first one again.
+    """
     rows = list(rows)
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    lines: list[str] = []
+    for shown in _fitting(widths):
+        lines += [""] if lines else []
+        lines += [
+            "  ".join(
+                row[k].ljust(widths[k]) if k == 0 else row[k].rjust(widths[k]) for k in (0, *shown)
+            ).rstrip()
+            for row in rows
+        ]
+    return lines
+
+
+def _fitting(widths: Sequence[int]) -> list[list[int]]:
+    """Columns of each table that fit beside the first one, in as few tables as possible."""
+    most, room = table_width(), 0
+    parts: list[list[int]] = [[]]
+    for k in range(1, len(widths)):
+        room += 2 + widths[k]
+        if most is not None and parts[-1] and widths[0] + room > most:
+            parts.append([])
+            room = 2 + widths[k]
+        parts[-1].append(k)
+    return parts
 
 
 def align_views(heading: list[str], rows: Sequence[tuple[float, list[str]]], what: str) -> list[str]:
