@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -43,7 +44,7 @@ def board(
     output: str,
     as_json: bool,
 ) -> None:
-    """Draw a chessboard target to print.
+    """Draw a target to print: a chessboard, squares with markers (ChArUco), AprilTags or circles.
 
     Without a size, the board has 9 x 6 inner vertices and the largest squares, in whole mm, that fit on the
     paper. One of these numbers is odd and one is even, so the board looks different after a turn of 180
@@ -63,18 +64,23 @@ def board(
       neurocal board --cols 8 --rows 5 --square 1 --unit inch --paper letter \\
           --dpi 150 -o letter.png
       neurocal board --board target.yaml --json -o again.pdf
+      neurocal board --board charuco:8x6:30:22 -o charuco.pdf
+      neurocal board --board aprilgrid:6x6:22:0.3 -o tags.svg
+      neurocal board --board asymmetric_circles:4x11:20 --paper A3 -o circles.pdf
     """  # noqa: D301 - as in the group
     ending = os.path.splitext(output)[1].lower()
     if ending not in _ENDINGS:
         raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
-    beside = None if board.file is not None else os.path.splitext(output)[0] + ".yaml"
+    beside = None if board.is_file else os.path.splitext(output)[0] + ".yaml"
     preparation.check_outputs((output, beside), (board.file,))
+    from neurocal_cli.observations.marked_cells import to_print
     from neurocal_cli.observations.printed_sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
     target = board.read() or default_board(size)
+    target = replace(target, planes=tuple(map(to_print, target.planes)))
     sheet = on_paper(target, size)
     from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
 
@@ -91,23 +97,29 @@ def board(
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:
     """Warn of a board that is hard to detect, and describe what was written."""
+    from neurocal_cli.files.board_kinds import kind_of
+    from neurocal_cli.observations.board_kinds import described
+
     cols, rows = target.planes[0].cols, target.planes[0].rows
-    if len(target.planes) == 1 and (cols - rows) % 2 == 0:
+    plain = all(kind_of(plane) == "chessboard" for plane in target.planes)
+    if plain and len(target.planes) == 1 and (cols - rows) % 2 == 0:
         warn(
             f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
             f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
         )
-    if any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
+    if plain and any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
         warn("neurocal detect needs at least 3 x 3 inner vertices")
     if as_json:
         keys = ("name", "cols", "rows", "square")
-        planes = [{key: getattr(plane, key) for key in keys} for plane in target.planes]
+        planes = [
+            {"kind": kind_of(plane), **{key: getattr(plane, key) for key in keys}} for plane in target.planes
+        ]
         paper = [sheet.width, sheet.height]
         print_summary({"unit": target.unit, "planes": planes, "paper_mm": paper, "board_file": beside})
         return
     for plane in target.planes:
         name = f"{plane.name}: " if plane.name else ""
-        say(f"{name}{plane.cols} x {plane.rows} inner vertices, square {plane.square:g} {target.unit}")
+        say(f"{name}{described(plane, target.unit)}")
     say(f"paper {sheet.width:g} x {sheet.height:g} mm; print at 100 % and measure the rulers")
     if beside is not None:
         say(f"board file: {beside}")

@@ -110,13 +110,18 @@ def detect(
     as_json: bool,
     output: str,
 ) -> None:
-    """Detect chessboards in images and measure points on them.
+    """Detect boards in images and measure points on them.
 
-    The number of columns and rows is found if neither these nor a board file are given; at least some
-    images must show the whole board then. Give the side of a square by --square; without it, the unit
-    of all lengths is a square. Each image becomes a view with the name of its file. A board that is
+    The number of columns and rows of a chessboard is found if neither these nor a board are given; at least
+    some images must show the whole board then. Give the side of a square by --square; without it, the unit
+    of all lengths is a square. Each image becomes a view with the name of its file. A chessboard that is
     partly hidden or cut off by the image is used if enough of its outer border is visible to tell which
-    part it is.
+    part it is. Other boards are described by --board.
+
+    Boards with markers (ChArUco, AprilGrid) are found by these, and any part with two of them is used. The
+    dictionary of a ChArUco board, and whether it has OpenCV's legacy pattern, are told from the image if they
+    are not given. Vertices and mid-points are measured as on chessboards; on tags they are their corners
+    TAG:0 to TAG:3 and the mid-points of their edges TAG:e0 to TAG:e3.
 
     A point has the same id in all images. Vertex 0:0 is the corner where OpenCV's
     findChessboardCorners begins; the inner square there is dark. If the numbers of columns and rows
@@ -145,6 +150,8 @@ def detect(
       neurocal detect sample_data/board*.png --board board.yaml --json \\
           --cache found --frames 30 -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
+      neurocal detect photos/*.jpg --board charuco:8x6:30:22 -o points.csv
+      neurocal detect photos/*.jpg --board target.yaml --points vertices -o points.csv
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(*images, board.file)
     preparation.check_summary(as_json, output)

@@ -268,6 +268,12 @@ class BoardOptions:
         self.check_unit()
         cols, rows, square, unit = self.cols, self.rows, self.square, self.unit
         if self.file is not None:
+            from neurocal_cli.files.board_kinds import short_board
+
+            if (cols, rows, square) == (None,) * 3:
+                short = short_board(self.file, "mm" if unit is None else unit)
+                if short is not None:
+                    return short
             if (cols, rows, square, unit) != (None,) * 4:
                 raise UsageError(
                     "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
@@ -302,6 +308,13 @@ class BoardOptions:
             raise UsageError("--unit is the unit of --square, which is missing; give both")
         return 1.0, "squares"
 
+    @property
+    def is_file(self) -> bool:
+        """Whether the board is described by a file, not in short."""
+        from neurocal_cli.files.board_kinds import SHORT_FORMS
+
+        return self.file is not None and self.file.partition(":")[0] not in SHORT_FORMS
+
     def check_unit(self) -> None:
         """Refuse a unit that cannot be stored in a file, with a UsageError."""
         unit = self.unit
@@ -313,7 +326,15 @@ def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     """Add the options of `BoardOptions`, a command's keyword ``board``."""
     size = partial(count, without="none", least=2, most=1000)
     added = (
-        path("--board", "BOARD.yaml", "Board file; a board may have several planes.", to="file"),
+        path(
+            "--board",
+            "BOARD.yaml",
+            "Board file, of neurocal or Kalibr, or a board in short: chessboard:COLSxROWS:SQUARE, "
+            "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], "
+            "circles:COLSxROWS:DISTANCE[:DIAMETER], asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
+            "and ROWS count squares, tags or circles; of a chessboard, inner vertices.",
+            to="file",
+        ),
         size("--cols", "C", "Number of inner vertices in a row of the board."),
         size("--rows", "R", "Number of rows of inner vertices."),
         number("--square", "S", "Side length of a square.", without="none", positive=True),

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from neurocal_cli import __version__
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.detect import Detection, detect_points, wanted_sizes
-from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.detect import Detection, detect_points, grids_in
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
@@ -43,7 +42,7 @@ from neurocal_cli.observations.board import Board
 
 _FORMAT = 6  # raised when the same image gives other points than before
 # Of a detection; its grids are not cached, which only its picture needs.
-_FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings")
+_FIELDS = ("ids", "world", "pixels", "covariance", "across", "image_size", "rejected", "warnings", "notes")
 _WORTH_A_PROCESS = 4  # images; fewer take less time than starting a process
 _KEPT = 31 << 20  # bytes; blocks of 32 MiB and more do not raise glibc's threshold
 _STRETCH = 0.25  # seconds; even a shaking hand is still for a moment in it
@@ -135,7 +134,7 @@ def _named(found: Outcome, path: str, source: str) -> Outcome:
 
 def _detected(image: Image, options: DetectionOptions) -> Outcome:
     """Detect the board in an image; the outcome has no name of the image yet."""
-    grids = find_grids(image.grey, wanted_sizes(options.board))
+    grids = grids_in(image.grey, options.board)
     overlay: bytes | None = None
     try:
         found = detect_points(image.grey, options.board, options.points, options.gamma, grids)
@@ -146,7 +145,7 @@ def _detected(image: Image, options: DetectionOptions) -> Outcome:
         return Outcome("", None, str(error), image.notes, overlay, shown, image.turned)
     if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    notes = (*image.notes, *_remarks(found, options.board))
+    notes = (*image.notes, *found.notes, *_remarks(found, options.board))
     return Outcome("", found, "", notes, overlay, turned=image.turned)
 
 
@@ -239,6 +238,7 @@ def _detection(tree: dict[str, Any]) -> Detection:
         image_size=(int(width), int(height)),
         rejected=int(tree["rejected"]),
         warnings=tuple(map(str, tree["warnings"])),
+        notes=tuple(map(str, tree["notes"])),
     )
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,9 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
-from neurocal_cli.detection.identity.identify import Located, identify
+from neurocal_cli.detection.identity.identify import Identified, Located, identify
 from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.observations.board import Board, Plane
@@ -36,10 +38,9 @@ class Labels:
 
     @property
     def ids(self) -> list[str]:
-        """``[plane/]h:c:r``, ``[plane/]v:c:r`` or ``[plane/]c:r``."""
-        prefixes = [self.plane.prefix + prefix for prefix in _PREFIXES]
+        """Those of `Plane.label`; empty for points that the board does not name."""
         return [
-            f"{prefixes[kind]}{c}:{r}"
+            self.plane.label(_PREFIXES[kind], c, r)
             for kind, (c, r) in zip(self.kind.tolist(), self.place.tolist(), strict=True)
         ]
 
@@ -77,6 +78,8 @@ class Detection:
         The grids that belong to the board, for pictures; empty if the detection comes from the cache.
     measured : tuple of Measured
         The points measured on each of them.
+    notes : tuple of str
+        What the image told of the board beyond its description.
     """
 
     ids: tuple[str, ...]
@@ -89,6 +92,7 @@ class Detection:
     warnings: tuple[str, ...]
     located: tuple[Located, ...] = ()
     measured: tuple[Measured, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         width, height = self.image_size
@@ -127,16 +131,9 @@ def detect_points(
         The image has another shape or type, or pixels that are not finite.
     """
     image = grey_image(image)
-    found = find_grids(image, wanted_sizes(board)) if grids is None else grids
-    try:
-        identified = identify(board, found, image)
-    except NoBoardError as error:
-        other = other_target(image)
-        if other:
-            raise NoBoardError(other) from error
-        raise
+    identified = _identified(image, board, grids)
     located = identified.located
-    measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
+    measured = tuple(_named(one, _sound(measure(image, one.grid, points, gamma, one.ink))) for one in located)
     count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
     if count < _FEWEST:
         share = f"{count} of {count + rejected} points"
@@ -158,7 +155,38 @@ def detect_points(
         identified.warnings,
         located,
         measured,
+        identified.notes,
     )
+
+
+def grids_in(image: NDArray[np.generic], board: Board) -> list[Grid]:
+    """The chessboards in an image that may be planes of the board; none for other kinds of boards."""
+    return find_grids(image, wanted_sizes(board)) if is_plain(board) else []
+
+
+def is_plain(board: Board) -> bool:
+    """Whether a board has chessboards without markers."""
+    return type(board.planes[0]) is Plane and board.planes[0].markers is None
+
+
+def _identified(image: NDArray[np.generic], board: Board, grids: list[Grid] | None) -> Identified:
+    """Locate the board, by its markers if it has any."""
+    if not is_plain(board):
+        return locate(board, image)
+    found = grids_in(image, board) if grids is None else grids
+    try:
+        return identify(board, found, image)
+    except NoBoardError as error:
+        other = other_target(image)
+        if other:
+            raise NoBoardError(other) from error
+        raise
+
+
+def _named(located: Located, measured: Measured) -> Measured:
+    """Leave out points that the board does not name, which do not count as rejected."""
+    named = np.array([bool(name) for name in label(located, measured).ids], dtype=bool)
+    return measured if named.all() else replace(measured.only(named), rejected=measured.rejected)
 
 
 def wanted_sizes(board: Board) -> list[tuple[int, int]]:

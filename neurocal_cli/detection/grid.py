@@ -32,6 +32,8 @@ class Grid:
     # column each hold at least one vertex.
     pixels: Array
     dark: int  # 0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where c + r + dark is even
+    # Places of the lines -1 to cols and -1 to rows [any unit], if they are not at equal distances
+    lines: tuple[Array, Array] | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:

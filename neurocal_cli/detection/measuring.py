@@ -41,6 +41,8 @@ from neurocal_cli.detection.fitting.map_fit import select_map
 from neurocal_cli.detection.fitting.strips import grid_lines
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_grid_vertices
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.markers.ink import Ink
+from neurocal_cli.detection.markers.plain import fit_without_ink
 from neurocal_cli.detection.medians import upper_median
 
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
@@ -55,14 +57,19 @@ _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to t
 
 
 def measure(
-    image: NDArray[np.generic], grid: Grid, points: Points = "midpoints", gamma: float | None = None
+    image: NDArray[np.generic],
+    grid: Grid,
+    points: Points = "midpoints",
+    gamma: float | None = None,
+    ink: Ink | None = None,
 ) -> Measured:
     """Measure the mid-points of edges, or the vertices, of a grid with vertices known to half a pixel.
 
     The grey image (H, W) is uint8, uint16 or float. `points` are the mid-points of the edges between known
     vertices ("midpoints"), these and the mid-points of the edges to the rim ("edges"), or the vertices. If a
     camera's `gamma` is given, pixels are ``light^(1 / gamma)`` and are linearised first; without it, the
-    effect of the response on the edges is estimated. Points whose fits are rejected are left out.
+    effect of the response on the edges is estimated. `ink` are the markers on a board, if it has any. Points
+    whose fits are rejected are left out.
     """
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
@@ -72,7 +79,7 @@ def measure(
     if len(grid_image.edges.index) == 0:
         index = np.zeros((0, 2), dtype=np.int64)
         return Measured(index[:, 0], index, np.zeros((0, 2)), np.zeros((0, 3)), None, vertices, 0, 0.0)
-    fitted = fit_grid(grid_image)
+    fitted = fit_grid(grid_image) if ink is None else fit_without_ink(light, grid, floor, ink)
     grid_image = fitted.grid_image
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":

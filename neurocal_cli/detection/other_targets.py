@@ -20,16 +20,21 @@ _ELLIPTIC = 0.05  # deviation from an ellipse over its radius; that of a square 
 _EVEN = 0.5  # greatest spread of the distances between neighbours over their median
 _ALIKE = 1.0  # greatest logarithm of an area over the median area
 _SHARP = 1.25  # greatest ratio of areas at two brightness levels; a blurred square may look like a circle
-_WANTED = "neurocal takes a chessboard; `neurocal detect --help` describes it"
 
 
 def other_target(grey: NDArray[np.generic]) -> str:
     """Message about the other target that a grey image shows; empty if none is recognised."""
     small = _small(grey)
     if _shows_markers(small):
-        return f"the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; {_WANTED}"
+        return (
+            "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; describe them by "
+            "--board, for example charuco:8x6:30:22"
+        )
     if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
-        return f"the image shows a grid of circles, no chessboard; {_WANTED}"
+        return (
+            "the image shows a grid of circles, no chessboard; describe it by --board, for example "
+            "circles:7x6:20"
+        )
     return ""
 
 

@@ -20,6 +20,13 @@ from neurocal_cli.observations.printed_sheet import Line, Sheet, Text
 _POINT = 72 / 25.4  # points per millimetre
 _DASH = 1.0  # mm
 _MOST_PIXELS = 200_000_000
+# Points of a circle of radius 1 by four Bezier curves: the start, then two controls and the end of each. The
+# error is 0.0003 of the radius.
+_BEND = 0.5519150244935106
+_QUARTER = np.array([[1, _BEND], [_BEND, 1], [0, 1]])
+_CIRCLE = np.concatenate(
+    [[[1.0, 0.0]], *(_QUARTER @ np.linalg.matrix_power([[0, 1], [-1, 0]], k) for k in range(4))]
+)
 
 
 def board_svg(sheet: Sheet) -> str:
@@ -27,6 +34,7 @@ def board_svg(sheet: Sheet) -> str:
     squares = "\n".join(
         f'<path d="M{" L".join(f"{x:.6f} {y:.6f}" for x, y in square)} Z"/>' for square in sheet.squares
     )
+    squares += "".join(f'\n<circle cx="{x:.6f}" cy="{y:.6f}" r="{r:.6f}"/>' for x, y, r in sheet.discs)
     lines = "\n".join(
         f'<line x1="{line.start[0]:.6f}" y1="{line.start[1]:.6f}" x2="{line.end[0]:.6f}" '
         f'y2="{line.end[1]:.6f}" stroke-width="{line.width}"'
@@ -60,6 +68,8 @@ def board_pdf(sheet: Sheet) -> bytes:
     content = ["0 g 0 G"]
     for square in sheet.squares:
         content.append(f"{place(square[0])} m {' '.join(f'{place(p)} l' for p in square[1:])} h f")
+    for x, y, radius in sheet.discs:
+        content.append(_round([place(p) for p in (np.array([x, y]) + radius * _CIRCLE)]))
     for line in sheet.lines:
         dash = f"[{_DASH * _POINT:.4f}] 0 d" if line.dashed else "[] 0 d"
         content.append(f"{dash} {line.width * _POINT:.4f} w {place(line.start)} m {place(line.end)} l S")
@@ -85,6 +95,13 @@ def board_pdf(sheet: Sheet) -> bytes:
     )
 
 
+def _round(points: list[str]) -> str:
+    """Path of a disc through the points of `_CIRCLE`."""
+    first, *others = points
+    curves = [" ".join(others[k : k + 3]) + " c" for k in range(0, len(others), 3)]
+    return " ".join([f"{first} m", *curves, "h f"])
+
+
 def _pdf(objects: list[bytes]) -> bytes:
     """Number the objects, the catalogue first, and add the table of the bytes at which they begin."""
     data, places = b"%PDF-1.4\n", []
@@ -105,6 +122,8 @@ def board_png(sheet: Sheet, dpi: float) -> bytes:
     ink = np.zeros((height, width), dtype=np.float32)
     for square in sheet.squares:
         _cover(ink, pixels * square.min(axis=0), pixels * square.max(axis=0))
+    for x, y, radius in pixels * sheet.discs:
+        _cover_disc(ink, np.array([x, y]), radius)
     for line in sheet.lines:
         for start, end in _dashes(line):
             ends = np.array([start, end])
@@ -138,6 +157,15 @@ def _cover(ink: NDArray[np.float32], low: Array, high: Array) -> None:
         parts.append((slice(first, last), covered))
     (rows, down), (cols, right) = parts
     ink[rows, cols] += np.outer(down, right)
+
+
+def _cover_disc(ink: NDArray[np.float32], centre: Array, radius: float) -> None:
+    """Add a disc [px], by the part of each pixel on the inner side of its edge."""
+    low = np.maximum(np.floor(centre - radius).astype(int), 0)
+    high = np.minimum(np.ceil(centre + radius).astype(int) + 1, ink.shape[::-1])
+    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    distance = np.hypot(u + 0.5 - centre[0], v + 0.5 - centre[1])
+    ink[low[1] : high[1], low[0] : high[0]] += np.clip(radius + 0.5 - distance, 0, 1).astype(np.float32)
 
 
 def _write_texts(ink: NDArray[np.float32], texts: tuple[Text, ...], pixels: float) -> None:

@@ -1,4 +1,7 @@
-"""Board YAML: a chessboard target of one or several planes, as a file that users write."""
+"""Board YAML: a target of one or several planes, as a file that users write.
+
+A board of one plane may stand at the top of the file with its ``kind``, or in the list of planes.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from neurocal_cli.files.board_kinds import KIND_KEYS, is_kalibr, kalibr_plane, kind_entries, read_plane
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
@@ -17,7 +21,7 @@ from neurocal_cli.observations.distances import Distance
 
 _COUNTS = ("cols", "rows")
 _VECTORS = ("origin", "x_axis", "y_axis")
-_PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS, "points")
+_OWN_KEYS = ("name", *_VECTORS, "points", "kind")
 
 
 def read_board(path: str | Path) -> Board:
@@ -51,8 +55,9 @@ def format_board(board: Board) -> str:
     lines = [f"unit: {text(board.unit)}", "planes:"]
     for plane in board.planes:
         entries = {"name": text(plane.name)} if plane.name else {}
-        entries |= {key: str(getattr(plane, key)) for key in _COUNTS}
-        entries["square"] = number(plane.square)
+        own = kind_entries(plane)
+        counts = {key: str(getattr(plane, key)) for key in _COUNTS}
+        entries |= own or {**counts, "square": number(plane.square)}
         entries |= {key: flow(np.array(getattr(plane, key))) for key in _VECTORS}
         if not plane.measured:
             lines.append(f"  - {mapping(**entries)}")
@@ -70,12 +75,18 @@ def format_board(board: Board) -> str:
 
 
 def _board(root: Field) -> Board:
-    _only(root, ("unit", "planes", "distances"))
-    fields = list(root["planes"].items())
-    if not fields:
-        root["planes"].fail("a list of at least one plane")
+    if is_kalibr(root):
+        with value_failures(root.source):
+            return Board((kalibr_plane(root),), "m")
     unit = root.get("unit", "mm").text()
-    planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
+    if "kind" in root:
+        planes: tuple[Plane, ...] = (_plane(root, alone=True, more=("unit", "distances")),)
+    else:
+        _only(root, ("unit", "planes", "distances"))
+        fields = list(root["planes"].items())
+        if not fields:
+            root["planes"].fail("a list of at least one plane")
+        planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
     with value_failures(root.source, "planes: "):
         board = Board(planes, unit)
     if "distances" not in root:
@@ -91,19 +102,20 @@ def _board(root: Field) -> Board:
     return replace(board, distances=tuple(distances))
 
 
-def _plane(field: Field, *, alone: bool) -> Plane:
-    """Read a plane; a single plane needs no name, origin and axes."""
-    _only(field, _PLANE_KEYS)
-    cols, rows = (field[key].integer(2) for key in _COUNTS)
-    square = field["square"].number()
+def _plane(field: Field, *, alone: bool, more: tuple[str, ...] = ()) -> Plane:
+    """Read a plane, which may have `more` keys; a single plane needs no name, origin and axes."""
+    kind = field.get("kind", "chessboard").text()
+    if kind not in KIND_KEYS:
+        field["kind"].fail(f"one of {', '.join(KIND_KEYS)}")
+    _only(field, (*_OWN_KEYS, *KIND_KEYS[kind], *more))
     place: dict[str, Any] = {
         key: tuple(field[key].array(3).tolist()) for key in _VECTORS if not alone or key in field
     }
     if "points" in field:
         place["measured"] = tuple(map(tuple, field["points"].array(-1, 5).tolist()))
     name = field["name"].text() if not alone or "name" in field else ""
-    with value_failures(field.source, f"{field.path}."):
-        return Plane(name, cols, rows, square, **place)
+    with value_failures(field.source, f"{field.path}." if field.path else ""):
+        return read_plane(field, kind, name, place)
 
 
 def _only(field: Field, known: tuple[str, ...]) -> None:

@@ -1,9 +1,10 @@
-"""Chessboard targets: where the vertices and the mid-points of their edges lie in the world.
+"""Targets of flat planes: where their points lie in the world.
 
-A plane has cols x rows inner vertices. Vertex (c, r) is ``origin + c square x_axis + r square y_axis``.
-The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway from (c, r) to
-(c + 1, r), ``v:c:r`` halfway from (c, r) to (c, r + 1). On a folded target, points belong to planes by the
-names in their ids, or else by their places (`planes_of`).
+A `Plane` is a chessboard, with or without markers in its light squares; `board_kinds` has the other kinds. It
+has cols x rows inner vertices. Vertex (c, r) is ``origin + c square x_axis + r square y_axis``. The edges
+between neighbouring vertices carry the mid-points: ``h:c:r`` halfway from (c, r) to (c + 1, r), ``v:c:r``
+halfway from (c, r) to (c, r + 1). On a folded target, points belong to planes by the names in their ids, or
+else by their places (`planes_of`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.distances import Distance, Scale, fitted_scale, grid_place
+from neurocal_cli.observations.markers import Markers
 
 Triple = tuple[float, float, float]
 
@@ -47,6 +49,7 @@ class Plane:
     x_axis: Triple = (1.0, 0.0, 0.0)
     y_axis: Triple = (0.0, 1.0, 0.0)  # unit vectors, perpendicular to each other
     measured: tuple[tuple[float, ...], ...] = ()  # c, r [squares] and X, Y, Z of points
+    markers: Markers | None = None  # in the light squares
 
     def __post_init__(self) -> None:
         name = self.name
@@ -87,6 +90,10 @@ class Plane:
                 f"points must name {_FEWEST_MEASURED} or more different places (c, r); correct them"
             )
         object.__setattr__(self, "measured", rows)
+        if self.markers is not None and not self.markers.side <= square:
+            raise InputError(
+                f"marker must be at most the square's side {square:g}, found {self.markers.side:g}"
+            )
 
     @property
     def prefix(self) -> str:
@@ -100,8 +107,16 @@ class Plane:
 
     def at(self, grid: ArrayLike) -> Array:
         """World coordinates (..., 3) of places (..., 2) along the axes, in squares from the first vertex."""
-        lengths = self.square * np.asarray(grid, dtype=float)
+        lengths = self.square * self.spread(np.asarray(grid, dtype=float))
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
+
+    def spread(self, grid: Array) -> Array:
+        """Distances (..., 2) along the axes from the first vertex, in squares, of grid places (..., 2)."""
+        return grid
+
+    def label(self, kind: str, c: int, r: int) -> str:
+        """Id of a point, of the kind ``h:``, ``v:`` or, for a vertex, nothing; empty if it has none."""
+        return f"{self.prefix}{kind}{c}:{r}"
 
     def truly_at(self, grid: ArrayLike) -> Array:
         """True world coordinates (N, 3) of places (N, 2) [squares]: measured, else by a thin-plate spline."""
@@ -117,7 +132,9 @@ class Plane:
             return self
         x, y, z = (factor * value for value in self.origin)
         measured = tuple((c, r, *(factor * value for value in place)) for c, r, *place in self.measured)
-        return replace(self, square=factor * self.square, origin=(x, y, z), measured=measured)
+        markers = None if self.markers is None else self.markers.rescaled(factor)
+        square = factor * self.square
+        return replace(self, square=square, origin=(x, y, z), measured=measured, markers=markers)
 
     def vertices(self) -> Array:
         """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""
@@ -126,7 +143,7 @@ class Plane:
 
     def vertex_ids(self) -> tuple[str, ...]:
         """Ids of the vertices, ``[plane/]c:r``, row by row."""
-        return tuple(f"{self.prefix}{c}:{r}" for r in range(self.rows) for c in range(self.cols))
+        return tuple(self.label("", c, r) for r in range(self.rows) for c in range(self.cols))
 
     def midpoint_grid(self) -> Array:
         """Grid coordinates (N, 2) [squares] of the mid-points, all of ``h`` row by row and then all of ``v``.
@@ -140,9 +157,9 @@ class Plane:
 
     def midpoint_ids(self) -> tuple[str, ...]:
         """Ids of the mid-points in the order of `midpoint_grid`."""
-        along_x = [f"{self.prefix}h:{c}:{r}" for r in range(self.rows) for c in range(self.cols - 1)]
-        along_y = [f"{self.prefix}v:{c}:{r}" for r in range(self.rows - 1) for c in range(self.cols)]
-        return (*along_x, *along_y)
+        places = np.floor(self.midpoint_grid()).astype(int).tolist()
+        along_x = np.rint(2 * (self.midpoint_grid() % 1)[:, 0]).astype(bool).tolist()
+        return tuple(self.label("h:" if x else "v:", c, r) for x, (c, r) in zip(along_x, places, strict=True))
 
     def midpoints(self) -> tuple[tuple[str, ...], Array]:
         """Ids (N) and world coordinates (N, 3) [world unit] of the mid-points; see `midpoint_grid`."""

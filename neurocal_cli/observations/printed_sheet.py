@@ -1,4 +1,4 @@
-"""A board on a sheet of paper: squares, folds, rulers and a line of text, in millimetres.
+"""A board on a sheet of paper: its pattern, folds, rulers and a line of text, in millimetres.
 
 The square between vertices (0, 0) and (1, 1) is black. That is where detection, like OpenCV, begins to count.
 Several planes of a board lie side by side on one sheet, joined at the lines along which it is folded. The
@@ -12,11 +12,14 @@ import re
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane, circle_places, described
+from neurocal_cli.observations.marked_cells import printed_rectangles
 
 # Width and height [mm], upright.
 PAPERS = {
@@ -73,13 +76,19 @@ class Laid:
     axes: Array  # (2, 2) rows: x_axis and y_axis on the sheet, unit vectors
     reach: Array  # (2, 2) [squares] of the pattern beyond the outer vertices, [axis, low or high]
 
-    def at(self, grid: Array) -> Array:
-        """Places on the sheet of grid coordinates (..., 2) [squares]."""
-        return np.asarray(self.origin + self.plane.square * np.asarray(grid, dtype=float) @ self.axes)
+    def at(self, lengths: Array) -> Array:
+        """Places on the sheet of lengths (..., 2) from vertex (0, 0) along the axes [squares]."""
+        return np.asarray(self.origin + self.plane.square * np.asarray(lengths, dtype=float) @ self.axes)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Grid coordinates of two opposite corners of the pattern [squares]."""
+        """Two opposite corners of the pattern, as lengths from vertex (0, 0) [squares]."""
+        if isinstance(self.plane, CirclePlane):
+            centres, radius = circle_places(self.plane)
+            return centres.min(axis=0) - radius, centres.max(axis=0) + radius
+        if isinstance(self.plane, TagPlane):
+            ends = np.array([[-1.0, -1.0], [self.plane.cols, self.plane.rows]])
+            return tuple(self.plane.spread(ends))
         last = np.array([self.plane.cols - 1, self.plane.rows - 1], dtype=float)
         return -self.reach[:, 0], last + self.reach[:, 1]
 
@@ -97,6 +106,7 @@ class Sheet:
     width: float
     height: float
     squares: Array  # (N, 4, 2) corners of the black squares and parts of squares
+    discs: Array  # (N, 3) centres and radii of black circles
     lines: tuple[Line, ...]
     texts: tuple[Text, ...]
     laid: tuple[Laid, ...]  # the planes in the board's unit, before they were scaled and moved
@@ -155,14 +165,15 @@ def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
     lines = [line for fold in folds for line in _beside(*(scale * fold + origin))]
     rulers, numbers = _rulers(corner, size, height)
     squares = scale * np.concatenate([_black(one) for one in laid]) + origin
+    discs = scale * np.concatenate([_discs(one) for one in laid]) + [*origin, 0.0]
     sizes = [
-        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
-        f"{plane.square:g} {board.unit}"
-        for plane in board.planes
+        f"{plane.name + ': ' if plane.name else ''}{described(plane, board.unit)}" for plane in board.planes
     ]
     caption = f"{', '.join(sizes)}. Print at 100 %, then measure the rulers."
     text = Text(np.array([_EDGE + _RULER + _QUIET, height - _EDGE]), caption, 2.8)
-    return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
+    return Sheet(
+        width, height, squares, discs, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin
+    )
 
 
 def _room(width: float, height: float) -> tuple[float, float]:
@@ -172,6 +183,11 @@ def _room(width: float, height: float) -> tuple[float, float]:
 
 def _black(laid: Laid) -> Array:
     """(N, 4, 2) corners of the black squares of a plane, those at the border cut to its reach."""
+    if isinstance(laid.plane, CirclePlane):
+        return np.zeros((0, 4, 2))
+    if laid.plane.markers is not None:
+        x, y, dark = printed_rectangles(laid.plane)
+        return laid.at(_merged(x, y, dark[1:-1, 1:-1]))
     low, high = laid.bounds
     c, r = np.meshgrid(np.arange(-1, laid.plane.cols), np.arange(-1, laid.plane.rows))
     black = (c + r) % 2 == 0
@@ -180,6 +196,31 @@ def _black(laid: Laid) -> Array:
     kept = ((end - start) > 1e-9).all(axis=1)
     (a, b), (x, y) = start[kept].T, end[kept].T
     return laid.at(np.column_stack([a, b, x, b, x, y, a, y]).reshape(-1, 4, 2))
+
+
+def _merged(x: Array, y: Array, dark: NDArray[np.bool_]) -> Array:
+    """(N, 4, 2) corners of rectangles for dark cells ``[y, x]`` between lines, equal pieces joined."""
+    open_pieces: dict[tuple[int, int], int] = {}
+    found = []
+    for j in range(len(y)):
+        row = dark[j] if j < len(dark) else np.zeros(len(x) - 1, dtype=bool)
+        steps = np.flatnonzero(np.diff(np.pad(row.astype(int), 1)))
+        pieces = set(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
+        for piece in [piece for piece in open_pieces if piece not in pieces]:
+            found.append((*piece, open_pieces.pop(piece), j))
+        open_pieces |= {piece: j for piece in pieces if piece not in open_pieces}
+    first, last, top, bottom = np.array(found).T
+    low_x, high_x, low_y, high_y = x[first], x[last], y[top], y[bottom]
+    corners = [low_x, low_y, high_x, low_y, high_x, high_y, low_x, high_y]
+    return np.column_stack(corners).reshape(-1, 4, 2)
+
+
+def _discs(laid: Laid) -> Array:
+    """(N, 3) centres and radii of the circles of a plane on the sheet."""
+    if not isinstance(laid.plane, CirclePlane):
+        return np.zeros((0, 3))
+    centres, radius = circle_places(laid.plane)
+    return np.column_stack([laid.at(centres), np.full(len(centres), radius * laid.plane.square)])
 
 
 def _beside(start: Array, end: Array) -> list[Line]:
@@ -252,6 +293,8 @@ def _first_map(planes: tuple[Plane, ...]) -> _Map:
     """The first plane's x_axis is to the right, as one sees it from the printed side."""
     plane = planes[0]
     down = np.array(plane.y_axis)
+    if isinstance(plane, TagPlane):
+        down = -down  # its y points upwards
     if len(planes) > 1:
         others = np.mean([_middle(other) for other in planes[1:]], axis=0)
         if (others - _middle(plane)) @ plane.normal > 0:  # x, y and the way to the eye are right-handed

@@ -30,6 +30,7 @@ HOMES = {
         "detection/",
         "files/board_pictures.py",
         "files/images.py",
+        "observations/markers.py",
         "simulation/",
     ),
 }

@@ -87,10 +87,10 @@ def levels_of(image: NDArray[np.generic]) -> list[Level]:
 
     The original is first; there are no levels if it is too small for a board.
     """
-    return pyramid(_grey(image))
+    return pyramid(grey_levels(image))
 
 
-def _grey(image: NDArray[np.generic]) -> Image:
+def grey_levels(image: NDArray[np.generic]) -> Image:
     """Convert the image to float32 and the grey levels of 8 bits."""
     if image.dtype == np.uint8:
         return image.astype(np.float32)

@@ -120,12 +120,7 @@ class GridFit:
 
 def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
     """Run all stages, after sharpening by the camera is undone if `undo`."""
-    vertices = grid_image.vertices
-    start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
-    anchors = grid_image.anchors(_START_SIGMA)
-    found = select_map(start, anchors, np.zeros(1), _GOOD_START)
-    if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
-        found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
+    found = map_of_vertices(grid_image)
     dark, light, noise = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(found.map.frame, dark, light)
     if isinstance(found.map, WideMap):
@@ -136,6 +131,35 @@ def fit_grid(grid_image: GridImage, undo: bool = True) -> GridFit:
         image = sharpening.undone(grid_image.image, grid_image.grid)
         floor = grid_image.floor * float((sharpening.inverse**2).sum())
         return fit_grid(replace(grid_image, image=image, floor=floor), undo=False)
+    return fit_from(grid_image, mapped, sigma, shading, levels, noise)
+
+
+def map_of_vertices(grid_image: GridImage) -> MapFit:
+    """The map through the found vertices."""
+    vertices = grid_image.vertices
+    start = homography_start(
+        Frame.of(vertices, grid_image.size, grid_image.grid.lines), vertices, grid_image.pixels
+    )
+    anchors = grid_image.anchors(_START_SIGMA)
+    found = select_map(start, anchors, np.zeros(1), _GOOD_START)
+    if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
+        found = _wide_if_better(grid_image, found, anchors, _GOOD_START)
+    return found
+
+
+def fit_from(
+    grid_image: GridImage,
+    mapped: MapFit,
+    sigma: float,
+    shading: Shading,
+    levels: tuple[Array, Array],
+    noise: float,
+) -> GridFit:
+    """Run the stages after the first look at the edges.
+
+    The look gives their map with the residuals of their offsets, blur [px], shading, mean level and half
+    contrast of each edge, two arrays (E,), and the noise of a pixel [DN^2].
+    """
     first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
     return _last_fit(grid_image, first)
 

@@ -17,6 +17,7 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_medi
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Bilinear weights (64, 4) of a square's corners for samples of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
+LEVEL_VARIANCE = 0.5 * np.pi / len(_INTERIOR)  # of a square's median, over that of a pixel
 # Insensitive.
 _STEPS = 2  # reweighted fits after the highest degree has been reached
 _TUKEY = 5.0  # standard deviations beyond which a level is an outlier
@@ -167,8 +168,7 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
-        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR))
-        for kind in (is_dark, ~is_dark)
+        Levels(middle[kind], level[kind], LEVEL_VARIANCE * noise[kind]) for kind in (is_dark, ~is_dark)
     )
     return dark, light, upper_median(noise)
 

@@ -46,20 +46,37 @@ class Frame:
     half: Array  # (2,) [squares] the grid length of 1
     centre: Array  # (2,) [px]
     unit: float  # [px] half of the image's diagonal
+    lines: tuple[Array, Array] | None = None  # of `Grid`; then squares are its unit in `origin` and `half`
 
     @classmethod
-    def of(cls, grid: Array, size: tuple[int, int]) -> Frame:
-        """Choose the scales for grid points (N, 2) in an image of (width, height)."""
-        low, high = grid.min(axis=0), grid.max(axis=0)
+    def of(cls, grid: Array, size: tuple[int, int], lines: tuple[Array, Array] | None = None) -> Frame:
+        """Choose the scales for grid points (N, 2) in an image of (width, height), with `Grid.lines`."""
+        places = _between_lines(grid, lines)
+        low, high = places.min(axis=0), places.max(axis=0)
         half = np.maximum(0.5 * (high - low), 0.5)
         centre = 0.5 * (np.array(size, dtype=float) - 1)
-        return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)))
+        return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)), lines)
 
     def ground(self, grid: Array) -> Array:
         """(3, N) homogeneous scaled coordinates x, y, 1 of grid points (N, 2)."""
         ground = np.ones((3, len(grid)))
-        ground[:2] = ((grid - self.origin) / self.half).T
+        ground[:2] = ((self.places(grid) - self.origin) / self.half).T
         return ground
+
+    def places(self, grid: Array) -> Array:
+        """Places (N, 2) of grid points (N, 2), in the unit of the lines."""
+        return _between_lines(grid, self.lines)
+
+
+def _between_lines(grid: Array, lines: tuple[Array, Array] | None) -> Array:
+    """Places (N, 2) of grid coordinates (N, 2), linear between the lines of a grid; see `Grid.lines`."""
+    if lines is None:
+        return grid
+    columns = []
+    for place, at in zip(grid.T + 1, lines, strict=True):
+        first = np.clip(np.floor(place).astype(np.intp), 0, len(at) - 2)
+        columns.append(at[first] + (place - first) * (at[first + 1] - at[first]))
+    return np.stack(columns, axis=-1)
 
 
 @frozen_dataclass(eq=False)

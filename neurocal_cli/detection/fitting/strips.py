@@ -102,9 +102,9 @@ def strip_pixels(
 ) -> Strips:
     """Gather the pixels of the strips ``|d| <= half_width`` (E,) [px] between the ends of lines.
 
-    `trim` (E, 2) [px] is the length to leave out at the two ends. Only every `stride`-th column is used. A
-    strip is selected from a parallelogram of whole pixels: columns along the line (rows if the line is more
-    vertical than horizontal), and in each column the pixels around the line.
+    Pixels that are NaN are left out. `trim` (E, 2) [px] is the length to leave out at the two ends. Only
+    every `stride`-th column is used. A strip is selected from a parallelogram of whole pixels: columns along
+    the line (rows if it is more vertical than horizontal), and in each column the pixels around the line.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -147,6 +147,10 @@ def strip_pixels(
     row *= image.shape[1]
     place += row
     value = image.reshape(-1).take(place, mode="clip").astype(np.float32)  # padding may lie outside
+    if image.dtype.kind == "f":
+        known = np.isfinite(value)
+        inside &= known
+        value[~known] = 0
     return Strips(s, d, value, inside, u, v, 1 - used / np.maximum(total, 1))
 
 

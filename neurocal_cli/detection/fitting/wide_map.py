@@ -122,7 +122,7 @@ class WideMap(SmoothMap):
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:
     """Fit the map of an equidistant lens to vertices in an image of a size; None if no plane fits them."""
-    fit = fit_wide_lens(grid, pixels, size)
+    fit = fit_wide_lens(frame.places(grid), pixels, size)
     if not np.isfinite(fit.rms):
         return None
     scaled = fit.matrix @ np.array(

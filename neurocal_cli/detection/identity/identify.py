@@ -36,6 +36,7 @@ from neurocal_cli.detection.identity.placement import (
     trimmed,
     wrong_size,
 )
+from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.observations.board import Board, Plane, is_flat
 
 _ROUNDING = 1e-6  # greatest error of a motion that maps the board onto itself, relative to its extent
@@ -58,6 +59,7 @@ class Located:
     grid: Grid
     plane: Plane
     placement: Placement
+    ink: Ink | None = None  # the markers on it
 
 
 @frozen_dataclass(eq=False)
@@ -66,6 +68,7 @@ class Identified:
 
     located: tuple[Located, ...]
     warnings: tuple[str, ...] = ()  # their texts do not depend on the image
+    notes: tuple[str, ...] = ()  # what the image told of the board; the same
 
 
 def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> Identified:

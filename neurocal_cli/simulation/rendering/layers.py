@@ -17,12 +17,11 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.simulation.rendering.areas import half_plane
 from neurocal_cli.simulation.rendering.scene import Cover, Occluder, Scene, Target
 
 # Cells farther than this from the paper [squares] are skipped; this also excludes the horizon.
 _NEARBY = 2.0
-# Least component of a normal, to avoid division by 0; the error of the area is below 1e-5.
-_LEAST_COMPONENT = 1e-5
 _FINEST = 8  # divisions of the side of a cell with more than one edge
 _PIXEL_SLACK = 0.1  # px; greatest bend of an edge between the centre and the corner of a pixel
 
@@ -86,16 +85,27 @@ class BoardLayer:
             return Cover(alpha, light, depth, edges)
         a, b, w = a[at], b[at], w[at]
         au, av, bu, bv = self.slopes(rays.some(at), a, b, w)
-        paper, pattern = self.target.paper_box, self.target.pattern_box
-        along_x = _axis(a, au, av, pattern[:2], paper[:2], cell, slack)
-        along_y = _axis(b, bu, bv, pattern[2:], paper[2:], cell, slack)
-        alpha[at] = along_x.paper * along_y.paper
-        sign = 1.0 if self.target.first_black else -1.0
-        ink = 0.5 * (along_x.pattern * along_y.pattern + sign * along_x.signed * along_y.signed)
+        alpha[at], ink, edges[at] = self._printed(a, b, (au, av, bu, bv), cell, slack)
         light[at] = self.target.white * alpha[at] - (self.target.white - self.target.black) * ink
         depth[at] = np.where(alpha[at] > 0, 1 / w, np.inf)
-        edges[at] = along_x.edges + along_y.edges
         return Cover(alpha, light, depth, edges)
+
+    def _printed(
+        self, a: Array, b: Array, slopes: tuple[Array, Array, Array, Array], cell: float, slack: float
+    ) -> tuple[Array, Array, NDArray[np.int8]]:
+        """Shares of cells with paper and with ink, and the number of edges in each."""
+        au, av, bu, bv = slopes
+        paper, printed = self.target.paper_box, self.target.printed
+        if printed is not None:
+            ends = _ends(a, au, av, paper[:2], cell, slack), _ends(b, bu, bv, paper[2:], cell, slack)
+            ink, edges = printed.inked(a, b, slopes, cell, slack)
+            return ends[0][0] * ends[1][0], ink, edges + ends[0][1] + ends[1][1]
+        pattern = self.target.pattern_box
+        along_x = _axis(a, au, av, pattern[:2], paper[:2], cell, slack)
+        along_y = _axis(b, bu, bv, pattern[2:], paper[2:], cell, slack)
+        sign = 1.0 if self.target.first_black else -1.0
+        ink = 0.5 * (along_x.pattern * along_y.pattern + sign * along_x.signed * along_y.signed)
+        return along_x.paper * along_y.paper, ink, along_x.edges + along_y.edges
 
 
 class _Axis(NamedTuple):
@@ -123,49 +133,21 @@ def _axis(
     line = np.clip(np.rint(a), np.floor(pattern[0]) + 1, np.ceil(pattern[1]) - 1)
     beyond, crossed = half_plane((a - line) * to_pixels, nu, nv, cell, slack)
     sign = 1 - 2 * (line - 2 * np.floor(0.5 * line))
-    inside, at_end = half_plane(_inward(a, pattern) * to_pixels, nu, nv, cell, slack)
+    inside, at_end = _ends(a, au, av, pattern, cell, slack)
     edges = crossed.astype(np.int8) + at_end
     if paper == pattern:
         return _Axis(inside, inside, inside * sign * (2 * beyond - 1), edges)
-    covered, at_border = half_plane(_inward(a, paper) * to_pixels, nu, nv, cell, slack)
+    covered, at_border = _ends(a, au, av, paper, cell, slack)
     return _Axis(covered, inside, inside * sign * (2 * beyond - 1), edges + at_border)
 
 
-def _inward(a: Array, ends: tuple[float, float]) -> Array:
-    """Distance from the nearer end, positive between the ends."""
-    return np.minimum(a - ends[0], ends[1] - a)
-
-
-def half_plane(
-    distance: Array, normal_u: Array, normal_v: Array, cell: float, slack: float = 0.0
+def _ends(
+    a: Array, au: Array, av: Array, ends: tuple[float, float], cell: float, slack: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Share of square cells on the positive side of straight edges, and whether the edge crosses the cell.
-
-    `distance` [px] is from the edge to the cell's centre, positive on the positive side. The signs of the
-    unit normals do not matter. Cells with an edge as close as `slack` [px] count as touched, too.
-    """
-    support = (np.abs(normal_u) + np.abs(normal_v)) * (0.5 * cell)
-    touched = np.abs(distance) < support + slack
-    share = (distance > 0).astype(float)
-    if touched.any():
-        share[touched] = _area(distance[touched] / cell, normal_u[touched], normal_v[touched])
-    return share, touched
-
-
-def _area(distance: Array, normal_u: Array, normal_v: Array) -> Array:
-    """Area of the part of the unit square with ``n . x > -distance``, as a second difference of ramps."""
-    p = np.maximum(np.abs(normal_u), _LEAST_COMPONENT)
-    q = np.maximum(np.abs(normal_v), _LEAST_COMPONENT)
-    outer, inner = 0.5 * (p + q), 0.5 * (p - q)
-    total = (
-        _ramp(distance + outer) - _ramp(distance + inner) - _ramp(distance - inner) + _ramp(distance - outer)
-    )
-    return np.clip(total / (p * q), 0.0, 1.0)
-
-
-def _ramp(x: Array) -> Array:
-    positive = np.maximum(x, 0.0)
-    return 0.5 * positive * positive
+    """Share of cells between two ends along an axis, and whether an end crosses each."""
+    to_pixels = 1 / np.hypot(au, av)
+    inward = np.minimum(a - ends[0], ends[1] - a)  # distance from the nearer end
+    return half_plane(inward * to_pixels, au * to_pixels, av * to_pixels, cell, slack)
 
 
 @frozen_dataclass(eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import field
+from functools import cached_property
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.simulation.rendering.patterns import Circles, Rectangles, pattern_of
 
 
 @frozen_dataclass
@@ -39,9 +41,12 @@ class Sides:
 
 @frozen_dataclass
 class Target:
-    """A printed chessboard."""
+    """A printed board.
 
-    plane: Plane  # its inner vertices
+    `first_black` and `reach` are those of a plain chessboard; other kinds are printed as their plane says.
+    """
+
+    plane: Plane
     black: float = 30 / 255  # reflectance of the ink
     white: float = 226 / 255  # reflectance of the paper
     first_black: bool = True  # whether the square beyond vertex (0, 0), towards growing x and y, is black
@@ -56,10 +61,17 @@ class Target:
             if min(sides.x_low, sides.x_high, sides.y_low, sides.y_high) < 0:
                 raise InputError("reach and margin must not be negative")
 
+    @cached_property
+    def printed(self) -> Rectangles | Circles | None:
+        """What is printed on the plane; None for a plain chessboard."""
+        return pattern_of(self.plane)
+
     @property
     def pattern_box(self) -> tuple[float, float, float, float]:
         """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
         reach, plane = self.reach, self.plane
+        if self.printed is not None:
+            return self.printed.box
         return -reach.x_low, plane.cols - 1 + reach.x_high, -reach.y_low, plane.rows - 1 + reach.y_high
 
     @property

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.board_kinds import CirclePlane
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
@@ -19,7 +20,10 @@ _STEP = 1e-4  # squares; step of the differences that give directions in the ima
 
 @frozen_dataclass(eq=False)
 class PlaneTruth:
-    """Points of a plane in the picture: its vertices, and the N mid-points of its edges."""
+    """Points of a plane in the picture: its vertices, and the N mid-points of its edges.
+
+    The vertices of a grid of circles are their centres, and it has no edges.
+    """
 
     plane: Plane
     vertices: Array  # (rows, cols, 2) [px] exact positions; NaN if the camera cannot project them
@@ -58,7 +62,8 @@ def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
     plane = target.plane
     columns, rows = np.meshgrid(np.arange(plane.cols), np.arange(plane.rows))
     vertex_grid = np.stack([columns, rows], axis=-1).astype(float)
-    grid = plane.midpoint_grid()
+    circles = isinstance(plane, CirclePlane)
+    grid = np.zeros((0, 2)) if circles else plane.midpoint_grid()
     half = np.where(grid % 1 > 0, 0.5, 0.0)  # along the edge
     vertices, vertices_visible = sight.look(vertex_grid)
     midpoints, midpoints_visible = sight.look(grid)
@@ -74,7 +79,7 @@ def _plane_truth(target: Target, sight: _Sight) -> PlaneTruth:
         vertex_ids=plane.vertex_ids(),
         vertices_visible=vertices_visible,
         midpoints=midpoints,
-        midpoint_ids=plane.midpoint_ids(),
+        midpoint_ids=() if circles else plane.midpoint_ids(),
         midpoints_visible=midpoints_visible,
         edges_visible=edges_visible,
         ends=np.stack([first, second], axis=-1),
@@ -101,13 +106,14 @@ class _Sight:
         self.scene = scene
         self.clearance = clearance
         self.camera = scene.camera
+        self.plane = scene.targets[index].plane
         self.matrix = scene.plane_to_camera(scene.targets[index])
         self.others = [BoardLayer.of(scene, target) for target in scene.targets]
         self.layer = self.others.pop(index)
 
     def project(self, grid: Array) -> tuple[Array, Mask]:
         """Pixels of grid coordinates, NaN if the camera does not see them, and which it sees."""
-        points = grid @ self.matrix[:, :2].T + self.matrix[:, 2]
+        points = self.plane.spread(grid) @ self.matrix[:, :2].T + self.matrix[:, 2]
         pixels, seen = self.camera.project(points)[0], self.camera.sees(points)
         return np.where(seen[..., None], pixels, np.nan), seen
 

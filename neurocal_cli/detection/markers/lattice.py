@@ -1,0 +1,236 @@
+"""Place the markers of an image on the board, and find the vertices around them.
+
+A marker counts if another one agrees with it: one homography takes the corners of both from the board to the
+image. So a marker that is read wrongly, or is not on the board, is left out. Of the ways in which a board may
+be printed (`Print`), the one with the most such markers is taken.
+
+Vertices are predicted by homographies of the markers around them, and refined to the saddle points of the
+brightness. From there, further vertices are predicted by those already found.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.saddles import Image, interpolate, refine_saddles
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.marked_cells import Cells, Print, marked_cells, prints
+
+_NEAR = 4.5  # squares between markers that are compared
+_AGREE, _AGREE_PX = 0.03, 0.6  # squares and px; rms error of two markers in one homography
+_AROUND = 2.3  # squares; markers that predict a vertex
+_REACH = 1.6  # squares between a vertex and the nearest marker or vertex that predicts it
+_MOVED, _MOVED_PX = 0.12, 1.2  # squares and px; greatest distance between prediction and saddle point
+_BESIDE = 0.25  # of a cell; where the four colours around a vertex are looked at
+_LEAST_CONTRAST = 0.3  # relative to that of most vertices
+_FEWEST = 4  # vertices
+# Vertices that are enough to find one that does not fit those around it, and its distance: squares and px.
+_FEWEST_AROUND, _STRAY, _STRAY_PX = 8, 0.04, 0.7
+_SAME = 1e-6  # squares
+
+
+@frozen_dataclass(eq=False)
+class Placed:
+    """Markers with their places on the board."""
+
+    marks: Marks
+    how: Print
+    cells: Cells
+    at: NDArray[np.intp]  # (N,) their positions among the cells
+    ground: Array  # (N, 4, 2) [squares] their corners on the board
+
+
+def place(plane: Plane, marks: Marks) -> Placed | None:
+    """The markers that agree with others, in the print with the most of them; None if there are not two."""
+    best: Placed | None = None
+    for how in prints(plane):
+        cells = marked_cells(plane, how)
+        known = np.isin(marks.number, cells.number)
+        some = marks.only(known)
+        at = cells.of(some.number)
+        ground = plane.spread(cells.corners[at])
+        kept = _agreeing(ground, some.corners)
+        if len(kept) >= 2 and (best is None or len(kept) > len(best.at)):
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept])
+    return best
+
+
+def _agreeing(ground: Array, pixels: Array) -> NDArray[np.intp]:
+    """Indices of the largest set of markers (N, 4, 2) that is connected by pairs that agree."""
+    n = len(ground)
+    if n < 2:
+        return np.zeros(0, dtype=np.intp)
+    middle = ground.mean(axis=1)
+    first, second = np.triu_indices(n, 1)
+    near = np.abs(middle[first] - middle[second]).max(axis=1) < _NEAR
+    first, second = first[near], second[near]
+    both = np.concatenate([ground[first], ground[second]], axis=1)
+    seen = np.concatenate([pixels[first], pixels[second]], axis=1)
+    error = np.sqrt(((homography_at(homographies(both, seen), both) - seen) ** 2).sum(axis=2).mean(axis=1))
+    side = np.sqrt(np.minimum(*(_area(pixels[k]) / _area(ground[k]) for k in (first, second))))
+    agree = error < _AGREE * side + _AGREE_PX
+    label = np.arange(n)
+    while True:
+        before = label.copy()
+        for a, b in zip(first[agree].tolist(), second[agree].tolist(), strict=True):
+            label[a] = label[b] = min(label[a], label[b])
+        if (label == before).all():
+            break
+    return np.flatnonzero(label == np.bincount(label).argmax())
+
+
+def _area(corners: Array) -> Array:
+    """Areas (N,) of quadrangles (N, 4, 2)."""
+    one, two = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    return np.maximum(0.5 * np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]), 1e-9)
+
+
+def homographies(ground: Array, pixels: Array, weight: Array | None = None) -> Array:
+    """Homographies (M, 3, 3) by linear least squares through K points each, (M, K, 2) to (M, K, 2)."""
+    centre, middle = ground.mean(axis=1, keepdims=True), pixels.mean(axis=1, keepdims=True)
+    size, scale = (np.maximum(np.abs(x).max(axis=(1, 2)), 1e-9) for x in (ground - centre, pixels - middle))
+    (x, y), (u, v) = (
+        np.moveaxis(moved / by[:, None, None], 2, 0)
+        for moved, by in ((ground - centre, size), (pixels - middle, scale))
+    )
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = [[x, y, one, zero, zero, zero, -u * x, -u * y], [zero, zero, zero, x, y, one, -v * x, -v * y]]
+    A = np.concatenate([np.stack(row, axis=-1) for row in rows], axis=1)
+    b = np.concatenate([u, v], axis=1)
+    if weight is not None:
+        double = np.concatenate([weight, weight], axis=1)
+        A, b = A * double[..., None], b * double
+    normal = A.swapaxes(1, 2) @ A + 1e-12 * np.eye(8)
+    h = np.linalg.solve(normal, (A.swapaxes(1, 2) @ b[..., None]))[..., 0]
+    H = np.concatenate([h, np.ones((len(h), 1))], axis=1).reshape(-1, 3, 3)
+    to, back = np.zeros_like(H), np.zeros_like(H)
+    to[:, [0, 1], [0, 1]], to[:, 2, 2] = 1 / size[:, None], 1
+    to[:, :2, 2] = -centre[:, 0] / size[:, None]
+    back[:, [0, 1], [0, 1]], back[:, 2, 2] = scale[:, None], 1
+    back[:, :2, 2] = middle[:, 0]
+    return np.asarray(back @ H @ to)
+
+
+def homography_at(H: Array, ground: Array) -> Array:
+    """Pixels of places by homographies; (M, 3, 3) and (M, K, 2)."""
+    mapped = ground @ H[:, :, :2].swapaxes(1, 2) + H[:, None, :, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+
+def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tuple[int, int]] | None:
+    """The vertices of a board around its markers, as a grid, and the vertex (c, r) of its first place.
+
+    `image` has the grey levels of 8 bits. The grid's columns are the plane's; so are its rows, or reversed if
+    the plane's axes have the other handedness.
+    """
+    grid = np.stack(np.meshgrid(np.arange(plane.cols), np.arange(plane.rows)), axis=-1).astype(float)
+    ground = plane.spread(grid)
+    found = np.full(grid.shape, np.nan)
+    contrast = np.full(grid.shape[:2], np.nan)
+    corners, pixels = placed.ground.reshape(-1, 2), placed.marks.corners.reshape(-1, 2)
+    dark = int(placed.how.legacy)  # the cell at (c, r) is dark where c + r plus this is even
+    count = 0
+    while True:
+        missing = np.isnan(contrast)
+        at = np.argwhere(missing)
+        start, cell = _predicted(ground[missing], corners, pixels)
+        near = np.isfinite(start[:, 0])
+        at, start, cell = at[near], start[near], cell[near]
+        new, size = _refined(plane, image, grid[tuple(at.T)], start, cell, dark)
+        every = np.concatenate([contrast.ravel(), size])
+        usual = float(np.nanmedian(every)) if np.isfinite(every).any() else np.inf
+        good = size > _LEAST_CONTRAST * max(usual, 0.0)
+        found[tuple(at[good].T)], contrast[tuple(at[good].T)] = new[good], size[good]
+        _leave_out_strays(ground, found, contrast)
+        seen = np.isfinite(contrast)
+        if seen.sum() < _FEWEST or seen.sum() <= count:
+            break
+        count = int(seen.sum())
+        # Vertices that were too far from the markers may be near the new ones.
+        corners, pixels = ground[seen], found[seen]
+    seen = np.isfinite(found[..., 0])
+    if seen.sum() < _FEWEST:
+        return None
+    rows, cols = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    first = int(cols[0]), int(rows[0])
+    part = found[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    dark = (dark + sum(first)) % 2
+    if isinstance(plane, TagPlane):
+        part, dark = part[::-1], (dark + len(part)) % 2
+    return Grid(np.ascontiguousarray(part), dark), first
+
+
+def _leave_out_strays(ground: Array, found: Array, contrast: Array) -> None:
+    """Remove found vertices that are not where those around them predict, in place."""
+    while (seen := np.isfinite(contrast)).sum() > _FEWEST_AROUND:
+        places, pixels = ground[seen], found[seen]
+        start, cell = _predicted(places, places, pixels, itself=False)
+        off = np.hypot(*(pixels - start).T)
+        side = np.sqrt(np.abs(np.linalg.det(cell)))
+        near = np.abs(places[:, None] - places).max(axis=2) < _AROUND
+        stray = (off > _STRAY * side + _STRAY_PX) & (off >= np.where(near, off, 0.0).max(axis=1))
+        if not stray.any():
+            return
+        at = np.argwhere(seen)[stray]
+        found[tuple(at.T)], contrast[tuple(at.T)] = np.nan, np.nan
+
+
+def _predicted(ground: Array, known: Array, pixels: Array, itself: bool = True) -> tuple[Array, Array]:
+    """Pixels (N, 2) of places (N, 2) by homographies of the known places around each; NaN far from these.
+
+    Also (N, 2, 2) the steps of a square along both axes [px]. If not `itself`, a known place says nothing of
+    the same place.
+    """
+    away = np.abs(ground[:, None] - known).max(axis=2)
+    if not itself:
+        away[away < _SAME] = np.inf
+    count = min(24, len(known))
+    order = np.argsort(away, axis=1)[:, :count]
+    near = np.take_along_axis(away, order, axis=1)
+    weight = np.where(near < np.maximum(_AROUND, near[:, min(7, count - 1), None] + 1e-9), 1.0, 0.0)
+    H = homographies(known[order], pixels[order], weight)
+    step = 0.05
+    around = np.array([[0, 0], [step, 0], [-step, 0], [0, step], [0, -step]])
+    places = homography_at(H, ground[:, None] + around)
+    start = np.where((near[:, 0] < _REACH)[:, None], places[:, 0], np.nan)
+    along = np.stack([places[:, 1] - places[:, 2], places[:, 3] - places[:, 4]], axis=1) / (2 * step)
+    return start, along
+
+
+def _refined(
+    plane: Plane, image: Image, grid: Array, start: Array, cell: Array, dark: int
+) -> tuple[Array, Array]:
+    """Saddle points (N, 2) near predicted vertices, NaN for none, and the contrast (N,) around them."""
+    # The cells on both sides may have different sizes.
+    steps = [plane.spread(grid + shift) - plane.spread(grid) for shift in np.array([[1, 1], [-1, -1]])]
+    least = np.abs(np.stack(steps)).min(axis=0)  # (N, 2) [squares]
+    sides = np.hypot(cell[..., 0], cell[..., 1]) * least  # (N, 2) [px]
+    twist = np.abs(cell[:, 0, 0] * cell[:, 1, 1] - cell[:, 0, 1] * cell[:, 1, 0])
+    narrow = np.minimum(sides.min(axis=1), twist * least.prod(axis=1) / np.maximum(sides.max(axis=1), 1e-9))
+    new = np.full(start.shape, np.nan)
+    for sigma in (1.0, 1.5, 2.5):
+        mine = (sigma <= np.maximum(narrow / 6, 1.0)) & np.isfinite(start).all(axis=1)
+        if mine.any():
+            refined = refine_saddles(image, start[mine], sigma)
+            # Wide windows reach beyond the image earlier.
+            new[mine] = np.where(np.isfinite(refined), refined, new[mine])
+    moved = np.hypot(*(new - start).T)
+    side = sides.min(axis=1)
+    new[~(moved < np.maximum(_MOVED * side, _MOVED_PX))] = np.nan
+    quadrant = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    # Between the vertex and the markers of a ChArUco board.
+    tags = isinstance(plane, TagPlane) or plane.markers is None
+    room = 1.0 if tags else 2 * (1 - plane.markers.side / plane.square)  # type: ignore[union-attr]
+    offsets = (_BESIDE * min(room, 1.0) * quadrant * least[:, None]) @ cell
+    levels = interpolate(image, np.nan_to_num(new)[:, None] + offsets)
+    parity = (grid.sum(axis=1) + dark) % 2 == 0
+    sign = np.where(parity, -1.0, 1.0)
+    size = 0.5 * sign * (levels[:, 0] + levels[:, 2] - levels[:, 1] - levels[:, 3])
+    return new, np.where(np.isfinite(new[:, 0]), size, np.nan)

@@ -1,0 +1,132 @@
+"""Locate boards with markers in an image, whatever they were printed with."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.saddles import grey_levels
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.identify import Identified, Located
+from neurocal_cli.detection.identity.placement import NoBoardError, Placement
+from neurocal_cli.detection.markers.ink import Ink
+from neurocal_cli.detection.markers.lattice import Placed, find_vertices, place
+from neurocal_cli.detection.markers.reading import USUAL, eight_bits, read_markers
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.marked_cells import Cells, marked_cells, pattern_lines, patterns, prints
+from neurocal_cli.observations.markers import DICTIONARIES, code_count
+
+_ENOUGH = 4  # markers that agree, after which no other dictionary is tried
+_MOST = 0.5  # share of the markers after which no other scale is tried
+_STRANGE = 4  # markers of another dictionary that are worth a word
+_MIRRORED = ((1, 0), (0, -1))
+
+
+def locate(board: Board, image: NDArray[np.generic]) -> Identified:
+    """Locate the planes of a board by their markers.
+
+    Raises NoBoardError if there are not two markers of one plane, with the reason as far as it is known.
+    """
+    grey, light = eight_bits(image), grey_levels(image)
+    located, notes = [], []
+    for index, plane in enumerate(board.planes):
+        if plane.markers is None:
+            raise InputError("a board has markers on all its planes, or on none; describe them in two files")
+        placed = _placed(plane, grey)
+        found = None if placed is None else find_vertices(plane, placed, light)
+        if placed is None or found is None:
+            continue
+        located.append(_located(plane, index, placed, *found))
+        notes.append(_told(plane, placed))
+    if not located:
+        raise NoBoardError(_reason(board, grey))
+    return Identified(tuple(located), notes=tuple(dict.fromkeys(note for note in notes if note)))
+
+
+def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
+    """The markers of a plane, of the dictionary of which most agree with each other."""
+    markers = plane.markers
+    assert markers is not None
+    count = len(marked_cells(plane, next(prints(plane))).number)
+    border = plane.border if isinstance(plane, TagPlane) else 1
+    named, first = markers.dictionary, markers.first_id
+    if named and first + count > code_count(named):
+        last = code_count(named) - 1
+        raise InputError(
+            f"the board has markers up to {first + count - 1}, and {named} up to {last}; correct the "
+            "dictionary or the number of squares"
+        )
+    best: Placed | None = None
+    for dictionary in (named,) if named else USUAL:
+        for marks in read_markers(grey, dictionary, first, count, border):
+            placed = place(plane, marks)
+            if placed is not None and (best is None or len(placed.at) > len(best.at)):
+                best = placed
+            if best is not None and len(best.at) >= _MOST * count:
+                break
+        if best is not None and len(best.at) >= _ENOUGH:
+            break
+    return best
+
+
+def _located(plane: Plane, index: int, placed: Placed, grid: Grid, first: tuple[int, int]) -> Located:
+    """The grid with its place on the plane, its lines, and its ink."""
+    cols, rows = grid.shape
+    dictionary = placed.marks.dictionary
+    cell = placed.cells.cell - np.array(first)
+    dark = patterns(plane, placed.cells, dictionary, placed.how)
+    within = pattern_lines(plane, dictionary)
+    if not isinstance(plane, TagPlane):
+        ink = Ink(cell, within, np.where(dark, -1.0, 1.0), np.ones(len(cell)))
+        return Located(grid, plane, Placement(index, ((1, 0), (0, 1)), first), ink)
+    # The plane's y points upwards, the grid's rows downwards.
+    cell = np.stack([cell[:, 0], rows - 2 - cell[:, 1]], axis=-1)
+    ink = Ink(cell, within, np.where(dark[:, ::-1], -1.0, 1.0), -np.ones(len(cell)))
+    counts = [first[0] + np.arange(-1.0, cols + 1), first[1] + rows - 1 - np.arange(-1.0, rows + 1)]
+    x, y = (
+        plane.spread(np.stack([one if axis == k else 0 * one for k in (0, 1)], axis=-1))[:, axis]
+        for axis, one in enumerate(counts)
+    )
+    whole = Grid(grid.pixels, grid.dark, (x - x[0], y[0] - y))
+    return Located(whole, plane, Placement(index, _MIRRORED, (first[0], first[1] + rows - 1)), ink)
+
+
+def _told(plane: Plane, placed: Placed) -> str:
+    """What the image told of the markers beyond the board's description; its text suits all images."""
+    markers = plane.markers
+    assert markers is not None
+    words = []
+    if not markers.dictionary:
+        words.append(f"the markers are of {smallest(placed.marks.dictionary, placed.cells)}")
+    if markers.legacy is None and placed.how.legacy:
+        words.append("the board has the legacy pattern, whose first square is light")
+    return "; ".join(words)
+
+
+def smallest(dictionary: str, cells: Cells) -> str:
+    """The smallest dictionary with the same codes for the cells, since larger ones begin like it."""
+    bits = dictionary.rpartition("_")[0]
+    last = int(cells.number.max())
+    return next(
+        (d for d in DICTIONARIES if d.rpartition("_")[0] == bits and code_count(d) > last), dictionary
+    )
+
+
+def _reason(board: Board, grey: NDArray[np.uint8]) -> str:
+    """Why no plane was located."""
+    named = {plane.markers.dictionary for plane in board.planes if plane.markers is not None} - {""}
+    for dictionary in USUAL if named else ():
+        if any(dictionary.rpartition("_")[0] == one.rpartition("_")[0] for one in named):
+            continue
+        marks = next(read_markers(grey, dictionary, 0, min(code_count(dictionary), 50)), None)
+        if marks is not None and len(np.unique(marks.number)) >= _STRANGE:
+            return (
+                f"the image shows markers of {dictionary} instead of {' and '.join(sorted(named))}; correct "
+                "the dictionary of the board"
+            )
+    return (
+        "no two markers of the board can be read together; show more of it, sharp and evenly lit, or correct "
+        "its description"
+    )

@@ -1,0 +1,153 @@
+"""Fit the edges of a board with markers: the ink is taken off the image, with what the last fit says of it.
+
+The first look comes from profiles across the edges, which include the border of the marker beside the edge.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.finding.saddles import interpolate
+from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
+from neurocal_cli.detection.fitting.common_parameters import correlation
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, erf_and_density
+from neurocal_cli.detection.fitting.grid_edges import GridImage
+from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_from, map_of_vertices
+from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
+from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, fit_shading, square_levels
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.fitting.strips import Lines, grid_lines
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.markers.ink import Appearance, Ink, without_ink
+from neurocal_cli.detection.medians import upper_median
+
+# Greatest change of the light by the ink, in half contrasts, that is taken off in each fit. The first look is
+# not accurate enough for more; without more, the light side of blurred edges is not seen.
+_MOST = (0.1, 0.1, 0.5)
+_OFFSET_SIGMA = 0.05  # px, of an edge's offset from its profile
+_SIGMAS = np.geomspace(0.4, 6.0, 12)  # px, tried first
+_OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
+_FINER = np.geomspace(0.75, 1.33, 9)  # factors on the blur tried afterwards
+_INTERPOLATED = 1 / 6  # px^2, variance that linear interpolation adds to the blur
+_PLACES = 13  # samples across an edge
+_ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
+
+
+def fit_without_ink(image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink) -> GridFit:
+    """Fit a board whose cells have patterns."""
+    raw = GridImage(image, grid, floor)
+    look, mapped, levels, noise = _first_look(raw, ink)
+    for most in _MOST:
+        plain = GridImage(without_ink(image, ink, look, most), grid, floor)
+        sigma = upper_median(look.blur[:, 0])
+        fitted = fit_from(plain, mapped, sigma, look.shading, levels, max(noise, floor))
+        look, mapped = _look_of(fitted, ink), fitted.map
+        levels = look.shading.at(plain.edges.lines(mapped.map).middle)
+    return fitted
+
+
+def _look_of(fitted: GridFit, ink: Ink) -> Appearance:
+    """How the board looks by a fit."""
+    at, blur = fitted.map.map, fitted.blur
+    lines = _crossing(at, ink)
+    (along_a, _), (along_b, _) = (blur.at(line) for line in lines)
+    spread = np.stack([along_a, along_b, correlation(blur, lines)], axis=-1)
+    shape = fitted.fit.shape
+    tails = shape.tails.mean(axis=0)
+    return Appearance(at, spread, float(fitted.map.shift[0]), fitted.shading, tails, shape.nonlinearity)
+
+
+def _first_look(raw: GridImage, ink: Ink) -> tuple[Appearance, MapFit, tuple[Array, Array], float]:
+    """How the board looks by the found vertices and by profiles across the edges between them.
+
+    Returns also the map of the edges, their mean levels and half contrasts, and the noise [DN^2].
+    """
+    found = map_of_vertices(raw)
+    noise = _noise(raw, found.map)
+    gaps = _gaps(raw, ink)
+    sigmas, offsets = _SIGMAS, _OFFSETS
+    for _ in range(2):
+        lines = raw.edges.lines(found.map)
+        values, offset = _profiles(raw, lines, gaps, sigmas, offsets)
+        variance = np.full(len(offset), _OFFSET_SIGMA**2)
+        observations = raw.observations(lines, offset, variance, np.ones((len(offset), 1)))
+        found = fit_map(found.map, observations, found.shift)
+        usual = upper_median(values[:, 2])
+        sigmas, offsets = usual * _FINER, 0.3 * _OFFSETS
+    sigma = float(np.sqrt(max(usual**2 - _INTERPOLATED, LEAST_BLUR**2)))
+    mean, contrast = values[:, 0], values[:, 1]
+    variance = np.ones(len(mean))
+    dark, light = (Levels(lines.middle, mean + sign * contrast, variance) for sign in (-1, 1))
+    shading = fit_shading(found.map.frame, dark, light)
+    crossing, ones = _crossing(found.map, ink), np.ones(len(ink.cell))
+    rho = (crossing[0].normal * crossing[1].normal).sum(axis=1)
+    blur = np.stack([sigma * ones, sigma * ones, rho], axis=-1)
+    look = Appearance(found.map, blur, float(found.shift[0]), shading, np.zeros(2), np.zeros(RESPONSE_TERMS))
+    return look, found, (mean, contrast), noise
+
+
+def _noise(raw: GridImage, at: SmoothMap) -> float:
+    """Variance of a pixel [DN^2], in the squares of the colour that has no patterns."""
+    dark, light, _ = square_levels(raw.image, raw.grid, at)
+    return min(upper_median(one.variance) for one in (dark, light)) / LEVEL_VARIANCE
+
+
+def _crossing(at: SmoothMap, ink: Ink) -> tuple[Lines, Lines]:
+    """Lines through the middles of cells, along b and along a."""
+    middle, ones = np.asarray(ink.cell + 0.5, dtype=float), np.ones(len(ink.cell))
+    vertical = np.ones(len(middle), dtype=np.bool_)
+    return grid_lines(at, middle, vertical, ones), grid_lines(at, middle, ~vertical, ones)
+
+
+def _profiles(
+    raw: GridImage, lines: Lines, gaps: tuple[Array, Array], sigmas: Array, offsets: Array
+) -> tuple[Array, Array]:
+    """Mean level, half contrast and blur (E, 3) of edges, and their offsets (E,) [px], by profiles across.
+
+    The first line of a marker, at a known distance on one side, is part of the profile: the marker is of the
+    other colour than the cell in which it is.
+    """
+    share, side = gaps
+    gap, near = share * lines.width, share < 0.5
+    room = np.minimum(np.where(near, 1.6 * gap, np.inf), 0.4 * lines.width)
+    d = np.linspace(-1, 1, _PLACES) * room[:, None]
+    image = np.asarray(raw.image, dtype=np.float32)
+    seen = np.zeros(d.shape)
+    for part in _ALONG:
+        middle = lines.middle + (part * lines.length)[:, None] * lines.tangent
+        seen += interpolate(image, middle[:, None] + d[..., None] * lines.normal[:, None]) / len(_ALONG)
+    least, best, offset_of = np.full(len(d), np.inf), np.zeros((len(d), 3)), np.zeros(len(d))
+    for sigma, offset in product(sigmas.tolist(), offsets.tolist()):
+        beyond = (side[:, None] * (d - offset) - gap[:, None]) / sigma
+        x = erf_and_density((d - offset) / sigma)[0]
+        x -= (side * near)[:, None] * (1 + erf_and_density(beyond)[0])
+        A = np.stack([np.ones_like(d), x], axis=-1)
+        level = np.linalg.solve(A.swapaxes(1, 2) @ A + 1e-9 * np.eye(2), A.swapaxes(1, 2) @ seen[..., None])
+        cost = ((seen[..., None] - A @ level) ** 2).sum(axis=(1, 2))
+        better = (cost < least) & (level[:, 1, 0] > 0)
+        least[better], offset_of[better] = cost[better], offset
+        best[better] = np.column_stack([level[..., 0], np.full(len(d), sigma)])[better]
+    return best, offset_of
+
+
+def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array]:
+    """Distance (E,) [cells] of each edge from the nearest pattern, and (E,) +1 if it is on the light side."""
+    edges = raw.edges
+    patterned = {tuple(cell): k for k, cell in enumerate(ink.cell.tolist())}
+    gap, sign = np.ones(len(edges.index)), np.ones(len(edges.index))
+    for e, ((c, r), vertical, light) in enumerate(
+        zip(edges.index.tolist(), edges.vertical, edges.light, strict=True)
+    ):
+        for after in (0, 1):
+            cell = (c - 1 + after, r) if vertical else (c, r - 1 + after)
+            if cell in patterned:
+                k = patterned[cell]
+                ring = ink.light[k][:, 0] if vertical else ink.light[k][0]
+                if (ring != ink.base[k]).all():
+                    gap[e] = ink.lines[0]
+                    sign[e] = light * (1 if after else -1)
+    return gap, sign

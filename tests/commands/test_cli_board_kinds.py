@@ -1,0 +1,70 @@
+"""Boards of all kinds, printed and detected again."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.command_line import run
+
+from neurocal_cli import read_board
+from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.observations.board_kinds import CirclePlane
+
+DPI = 100
+
+
+@pytest.mark.parametrize(
+    ("form", "points"),
+    [("charuco:6x5:30:22", 20), ("aprilgrid:3x3:40:0.3", 36), ("aprilgrid:2x3:40:0.4:tag16h5", 24)],
+)
+def test_a_printed_board_is_found_by_its_file(tmp_path: Path, form: str, points: int) -> None:
+    picture = tmp_path / "board.png"
+    result = run("board", "--board", form, "--dpi", DPI, "-o", picture)
+    assert result.exit_code == 0, result.stderr
+    board = read_board(tmp_path / "board.yaml")
+    image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    # A camera blurs, and has noise.
+    noise = np.random.default_rng(1).normal(0, 1.5, image.shape)
+    image = np.clip(0.8 * cv2.GaussianBlur(image, (0, 0), 0.7) + 20 + noise, 0, 255).astype(np.uint8)
+    found = detect_points(image, board, "vertices")
+    assert len(found.ids) == points
+    # One similarity takes the millimetres of the board to the pixels of the print.
+    world = found.world[:, :2] - found.world[:, :2].mean(axis=0)
+    pixels = found.pixels - found.pixels.mean(axis=0)
+    linear = np.linalg.lstsq(world, pixels, rcond=None)[0]
+    upwards = -1 if form.startswith("april") else 1
+    np.testing.assert_allclose(linear, DPI / 25.4 * np.diag([1, upwards]), atol=2e-3)
+    assert np.abs(world @ linear - pixels).max() < 0.08
+
+
+def test_circles_are_printed_at_their_places_in_all_formats(tmp_path: Path) -> None:
+    form = "asymmetric_circles:4x5:20"
+    for name in ("b.svg", "b.pdf", "b.png"):
+        result = run("board", "--board", form, "--dpi", DPI, "-o", tmp_path / name)
+        assert result.exit_code == 0, result.stderr
+    (plane,) = read_board(tmp_path / "b.yaml").planes
+    assert isinstance(plane, CirclePlane)
+    assert plane.diameter == pytest.approx(0.6 * np.sqrt(2) * 20, abs=1e-3)
+    circles = re.findall(
+        r'<circle cx="([\d.]+)" cy="([\d.]+)" r="([\d.]+)"', (tmp_path / "b.svg").read_text("utf-8")
+    )
+    drawn = np.array(circles, dtype=float)
+    world = plane.midpoints()[1][:, :2]
+    np.testing.assert_allclose(drawn[:, :2] - drawn[0, :2], world - world[0], atol=1e-5)
+    assert (tmp_path / "b.pdf").read_bytes().count(b" c") >= 4 * 20
+    image = cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    x, y = np.rint(drawn[:, :2].T * DPI / 25.4 - 0.5).astype(int)
+    assert (image[y, x] == 0).all()
+
+
+def test_a_board_of_too_many_markers_is_refused(tmp_path: Path) -> None:
+    result = run("board", "--board", "charuco:70x70:3:2", "--paper", "A0", "-o", tmp_path / "b.svg")
+    assert result.exit_code == 1
+    assert "no dictionary has a marker 2449" in result.stderr
+    assert not list(tmp_path.iterdir())

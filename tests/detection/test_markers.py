@@ -1,0 +1,210 @@
+"""Boards with markers: read, placed and measured; markers do not disturb the edges."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from support.marked import errors_of, marked_scene, plane_of, taken
+from support.picture_bound import scene_bound
+from support.real_data import RealFiles
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.markers.ink import _Blurred
+from neurocal_cli.detection.markers.lattice import place
+from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.marked_cells import Print, marked_cells
+from neurocal_cli.simulation.rendering import Illumination, Scene
+
+CHARUCO = "charuco:6x5:40:30:DICT_4X4_50"
+APRIL = "aprilgrid:3x3:40:0.3"
+
+
+def untold(plane: Plane) -> Board:
+    """A board whose dictionary and pattern are not said."""
+    assert plane.markers is not None
+    return Board((replace(plane, markers=replace(plane.markers, dictionary="", legacy=None)),))
+
+
+def vertex_bound(scene: Scene) -> float:
+    """Rms bound of the vertices, from the squares alone."""
+    target = scene.targets[0]
+    plain = replace(scene, targets=(replace(target, plane=replace(target.plane, markers=None)),))
+    bound = scene_bound(plain)[0].vertex
+    return float(np.sqrt((bound**2).mean()))
+
+
+def test_charuco_vertices_are_measured_to_the_bound_of_plain_squares() -> None:
+    scene = marked_scene(plane_of(CHARUCO), 1)
+    picture = taken(scene, 1)
+    found = detect_points(picture.image, untold(scene.targets[0].plane), "vertices")
+    error, squared = errors_of(found, picture)
+    assert len(error) == 20
+    assert np.sqrt((error**2).mean()) < 1.35 * vertex_bound(scene)
+    assert 0.5 < squared.mean() < 1.6
+    assert found.notes == ("the markers are of DICT_4X4_50",)
+
+
+def test_blurred_markers_near_the_edges_do_not_move_them() -> None:
+    scene = marked_scene(plane_of(CHARUCO), 2, psf=1.6)
+    picture = taken(scene, 2, 4)
+    found = detect_points(picture.image, scene.board, "midpoints")
+    error, squared = errors_of(found, picture)
+    assert len(error) == 31
+    assert np.sqrt((error**2).mean()) < 0.02  # as if of the plain board: 0.009
+    assert 0.4 < squared.mean() < 2
+
+
+def test_the_legacy_pattern_is_told_from_the_image() -> None:
+    scene = marked_scene(plane_of("charuco:5x6:40:30:DICT_5X5_100", legacy=True), 3)
+    picture = taken(scene, 3, 4)
+    found = detect_points(picture.image, untold(scene.targets[0].plane), "vertices")
+    assert len(errors_of(found, picture)[0]) == 20
+    assert found.notes == (
+        "the markers are of DICT_5X5_50; the board has the legacy pattern, whose first square is light",
+    )
+    assert np.abs(errors_of(found, picture)[0]).max() < 0.05
+
+
+def test_a_corner_of_the_board_is_enough() -> None:
+    scene = marked_scene(plane_of("charuco:8x8:40:30:DICT_4X4_50"), 4, square=60, shift=(150.0, 90.0))
+    picture = taken(scene, 4, 4)
+    (plane,) = picture.truth.planes
+    found = detect_points(picture.image, scene.board, "vertices")
+    error, _ = errors_of(found, picture)
+    assert 8 <= plane.vertices_visible.sum() <= 16
+    assert len(error) >= 0.65 * plane.vertices_visible.sum()  # those at the image border are too near to it
+    assert np.abs(error).max() < 0.05
+
+
+def test_another_dictionary_is_named() -> None:
+    scene = marked_scene(plane_of(CHARUCO), 1)
+    wrong = Board((plane_of("charuco:6x5:40:30:DICT_6X6_250"),))
+    with pytest.raises(NoBoardError, match=r"markers of DICT_4X4_1000 instead of DICT_6X6_250"):
+        detect_points(taken(scene, 1).image, wrong)
+
+
+def test_too_many_markers_for_a_dictionary_are_refused() -> None:
+    board = Board((plane_of("charuco:12x10:40:30:DICT_4X4_50"),))
+    with pytest.raises(InputError, match="markers up to 59, and DICT_4X4_50 up to 49"):
+        detect_points(np.zeros((100, 100), np.uint8), board)
+
+
+def test_no_markers_are_no_board() -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (200, 300)).astype(np.uint8)
+    with pytest.raises(NoBoardError, match="no two markers"):
+        detect_points(noise, Board((plane_of(CHARUCO),)))
+
+
+@pytest.mark.parametrize(("points", "count"), [("vertices", 36), ("midpoints", 36)])
+def test_tags_are_measured_at_their_corners_and_edges(points: str, count: int) -> None:
+    scene = marked_scene(plane_of(APRIL), 5, square=45)
+    picture = taken(scene, 5, 4)
+    found = detect_points(picture.image, scene.board, points)  # type: ignore[arg-type]
+    error, squared = errors_of(found, picture)
+    assert len(error) == count == len(set(found.ids))
+    assert np.sqrt((error**2).mean()) < 0.01
+    assert 0.4 < squared.mean() < 2
+    assert {name.split(":")[0] for name in found.ids} == {str(k) for k in range(9)}
+
+
+def test_a_marker_that_was_read_wrongly_is_left_out() -> None:
+    plane = plane_of(CHARUCO)
+    cells = marked_cells(plane, Print())
+    H = np.array([[40.0, 6, 30], [-5, 35, 60], [1e-2, 2e-2, 1]])
+    mapped = cells.corners @ H[:, :2].T + H[:, 2]
+    corners = mapped[..., :2] / mapped[..., 2:]
+    number = cells.number.copy()
+    number[[3, 4]] = number[[4, 3]]
+    placed = place(plane, Marks(number, corners, "DICT_4X4_50"))
+    assert placed is not None
+    assert set(placed.marks.number) == set(cells.number) - {3, 4}
+    assert place(plane, Marks(number[:1], corners[:1], "DICT_4X4_50")) is None
+
+
+def test_the_light_of_a_pattern_is_that_of_the_blurred_pattern() -> None:
+    rng = np.random.default_rng(0)
+    n, fine, sigma = 4, 25, 1.3
+    lines = np.linspace(0.1, 0.9, n + 1)
+    cells = rng.choice([0.0, -2.0], (n, n))
+    inverse = np.linalg.inv(np.array([[20.0, 6.0], [-5.0, 12.0]]))
+
+    def sampled(a: Array, b: Array) -> Array:
+        column, row = (np.floor((x - 0.1) / 0.8 * n).astype(int) for x in (a, b))
+        inside = (column >= 0) & (column < n) & (row >= 0) & (row < n)
+        return np.where(inside, cells[row.clip(0, n - 1), column.clip(0, n - 1)], 0.0)
+
+    def places(u: Array, v: Array) -> tuple[Array, Array]:
+        return inverse[0, 0] * u + inverse[0, 1] * v, inverse[1, 0] * u + inverse[1, 1] * v
+
+    ticks = (np.arange(-20 * fine, 40 * fine) + 0.5) / fine - 0.5
+    blurred = gaussian_filter(sampled(*places(*np.meshgrid(ticks, ticks))), sigma * fine)
+    pixel = np.arange(-6, 26)
+    at = np.rint((pixel + 20.5) * fine - 0.5).astype(int)
+    a, b = places(*(x.ravel().astype(float) for x in np.meshgrid(pixel, pixel)))
+    slopes = [np.full(len(a), x) for x in inverse.ravel()]
+    rho = inverse[0] @ inverse[1] / (np.linalg.norm(inverse[0]) * np.linalg.norm(inverse[1]))
+    blur = _Blurred.of(tuple(slopes), np.array([sigma, sigma, rho]), 0.0, np.zeros(2))  # type: ignore[arg-type]
+    light = blur.pattern(a, b, lines, cells)
+    np.testing.assert_allclose(light, blurred[np.ix_(at, at)].ravel(), atol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("condition", "most"),
+    [
+        ({}, 1.2),
+        ({"noise": 8.0}, 1.2),
+        ({"psf": 2.0}, 1.2),
+        ({"tilt": 60.0}, 1.2),
+        ({"k1": -0.3}, 1.2),
+        ({"illumination": Illumination(0.6, (0.8, 0.5))}, 1.2),
+    ],
+)
+def test_charuco_errors_over_the_bound(condition: dict[str, float], most: float) -> None:
+    every, bounds, normal = [], [], []
+    for seed in range(4):
+        scene = marked_scene(plane_of("charuco:8x8:25.4:19.05:DICT_4X4_50"), seed, **{
+            "square": 50.0, "size": (640, 480), **condition})  # type: ignore[arg-type]  # fmt: skip
+        picture = taken(scene, seed, 8)
+        error, squared = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
+        assert len(error) == picture.truth.planes[0].vertices_visible.sum()
+        every.append(error)
+        normal.append(squared)
+        bounds.append(vertex_bound(scene))
+    rms = np.sqrt((np.concatenate(every) ** 2).mean())
+    assert rms < most * np.sqrt(np.mean(np.square(bounds)))
+    assert 0.8 < np.concatenate(normal).mean() < 1.3
+
+
+@pytest.mark.slow
+def test_squares_of_14_pixels_whose_ink_is_within_two_sigma_of_all_edges() -> None:
+    every, bounds, visible = [], [], 0
+    for seed in range(4):
+        scene = marked_scene(
+            plane_of("charuco:8x8:25.4:19.05:DICT_4X4_50"), seed, square=14.0, size=(640, 480)
+        )
+        picture = taken(scene, seed, 8)
+        visible += int(picture.truth.planes[0].vertices_visible.sum())
+        every.append(errors_of(detect_points(picture.image, scene.board, "vertices"), picture)[0])
+        bounds.append(vertex_bound(scene))
+    errors = np.concatenate(every)
+    assert len(errors) >= 0.98 * visible
+    assert np.sqrt((errors**2).mean()) < 1.6 * np.sqrt(np.mean(np.square(bounds)))
+
+
+@pytest.mark.slow
+def test_all_vertices_of_photographs_are_found(real_files: RealFiles) -> None:
+    from neurocal_cli.files.images import read_image
+
+    board = Board((plane_of("charuco:8x8:25.4:19.05"),))
+    for name, least in (("new", 763), ("legacy", 615)):
+        images = real_files(f"charuco_lifecam/{name}*.jpg")
+        found = [detect_points(read_image(path).grey, board, "vertices") for path in images]
+        assert sum(len(one.ids) for one in found) >= least
