@@ -44,7 +44,7 @@ def board(
     output: str,
     as_json: bool,
 ) -> None:
-    """Draw a target to print: a chessboard, squares with markers (ChArUco), AprilTags or circles.
+    """Draw a target to print: chessboard, ChArUco, tags or circles.
 
     Without a size, the board has 9 x 6 inner vertices and the largest squares, in whole mm, that fit on the
     paper. One of these numbers is odd and one is even, so the board looks different after a turn of 180
@@ -64,8 +64,8 @@ def board(
       neurocal board --cols 8 --rows 5 --square 1 --unit inch --paper letter \\
           --dpi 150 -o letter.png
       neurocal board --board target.yaml --json -o again.pdf
-      neurocal board --board charuco:8x6:30:22 -o charuco.pdf
-      neurocal board --board aprilgrid:6x6:22:0.3 -o tags.svg
+      neurocal board --board charuco:8x6:28:21 -o charuco.pdf
+      neurocal board --board aprilgrid:6x6:20:0.3 -o tags.svg
       neurocal board --board asymmetric_circles:4x11:20 --paper A3 -o circles.pdf
     """  # noqa: D301 - as in the group
     ending = os.path.splitext(output)[1].lower()

@@ -28,7 +28,7 @@ def other_target(grey: NDArray[np.generic]) -> str:
     if _shows_markers(small):
         return (
             "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; describe them by "
-            "--board, for example charuco:8x6:30:22"
+            "--board, for example charuco:8x6:28:21"
         )
     if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
         return (

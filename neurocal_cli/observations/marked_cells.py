@@ -141,7 +141,7 @@ def named_dictionary(plane: Plane) -> str:
     assert plane.markers is not None
     if not plane.markers.dictionary:
         raise InputError(
-            "the dictionary of the markers is not known; name it, for example charuco:8x6:30:22:DICT_4X4_50"
+            "the dictionary of the markers is not known; name it, for example charuco:8x6:28:21:DICT_4X4_50"
         )
     return plane.markers.dictionary
 
