@@ -25,11 +25,11 @@ __all__ = ["neurocal"]
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "advise": "Advise which views of the target to photograph next.",
-    "board": "Draw a chessboard target to print.",
+    "board": "Draw a target to print: chessboard, ChArUco, tags or circles.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
     "compare": "Compare calibration methods on the same points.",
     "convert": "Convert cameras, rigs and points to the formats of other programs.",
-    "detect": "Detect chessboards in images and measure points on them.",
+    "detect": "Detect boards in images and measure points on them.",
     "drift": "Tell whether a camera has changed since an earlier calibration.",
     "evaluate": "Measure the error of a calibrated camera or rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",

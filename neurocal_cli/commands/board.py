@@ -44,7 +44,7 @@ def board(
     output: str,
     as_json: bool,
 ) -> None:
-    """Draw a target to print: squares, tags or circles.
+    """Draw a target to print: chessboard, ChArUco, tags or circles.
 
     Without a size, the board has 9 x 6 inner vertices and the largest squares, in whole mm, that fit on the
     paper. One of these numbers is odd and one is even, so the board looks different after a turn of 180
