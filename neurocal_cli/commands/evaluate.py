@@ -11,7 +11,7 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
 from neurocal_cli.commands.streams import first_of, note, print_summary, tell_written, warn
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import FormatError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
@@ -29,6 +29,8 @@ class _Group(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in self.commands and os.path.isfile(args[0]):
             args = [_kind_of(args[0]), *args]
+        elif args and args[0] not in self.commands and {".", os.sep} & set(args[0]):
+            raise FormatError("there is no such file; check the path", args[0])
         return super().resolve_command(ctx, args)
 
 

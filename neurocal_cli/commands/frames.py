@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.detect import Detection
 
+_TRIMMED = 4  # px; a larger difference is no accident
 _PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
 
 
@@ -78,9 +79,20 @@ def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
     for name, detection in found.items():
         if detection.image_size != most:
             both = "{} x {} px and most have {} x {}".format(*detection.image_size, *most)
-            problem = f"{name}: the image has {both}; run detect for each camera separately"
+            problem = f"{name}: the image has {both}{_why_another_size(detection.image_size, most)}"
             kept[name] = replace(outcomes[name], detection=None, overlay=None, problem=problem)
     return kept
+
+
+def _why_another_size(size: tuple[int, int], most: tuple[int, int]) -> str:
+    """What probably happened to an image of another size than most, and what to do."""
+    if size == most[::-1]:
+        return ": it was held or turned upright; turn it back, as each way has its own image centre"
+    if max(abs(a - b) for a, b in zip(size, most, strict=True)) <= _TRIMMED:
+        return ": it was probably cut or scaled by a program; give the file of the camera"
+    if abs(size[0] * most[1] - size[1] * most[0]) <= _TRIMMED * max(most):
+        return ": it was probably scaled; give the file of the camera"
+    return "; run detect for each camera separately"
 
 
 def watch_for_images(

@@ -79,7 +79,8 @@ class Command(click.Command):
     """A command whose help lists its arguments before its options."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse, and explain where --quiet and --verbose belong."""
+        """Parse, and explain where --quiet and --verbose belong, and what to do with images."""
+        words = list(args)  # parsing empties args
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
@@ -88,6 +89,19 @@ class Command(click.Command):
             line = " ".join(["neurocal", error.option_name, *ctx.command_path.split()[1:]])
             told = f"{error.option_name} stands before the command: {line}"
             raise click.NoSuchOption(error.option_name, told, ctx=ctx) from None
+        except click.UsageError as error:
+            images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
+            if not images:
+                raise
+            some = f"{', '.join(images[:2])}{', ...' if len(images) > 2 else ''}"
+            raise click.UsageError(
+                f"{some}: these are images; find the points in those of each camera first: neurocal detect "
+                "IMAGE... -o POINTS.csv",
+                ctx,
+            ) from None
+
+    def _reads_points(self) -> bool:
+        return any(".csv" in metavar for metavar, _ in arguments(self))
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the arguments, then the options."""
@@ -98,6 +112,13 @@ class Command(click.Command):
             records = [record for option in options if (record := option.get_help_record(ctx))]
             with formatter.section(title):
                 formatter.write_dl([(names, _without_noise(text)) for names, text in records])
+
+
+def _images(words: Iterable[str]) -> list[str]:
+    """Those of the words that are names of images."""
+    from neurocal_cli.files.image_files import is_image
+
+    return [word for word in words if is_image(word)]
 
 
 def grouped(command: click.Command, ctx: click.Context) -> list[tuple[str, list[click.Option]]]:

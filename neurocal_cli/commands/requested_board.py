@@ -71,15 +71,20 @@ def _spread(paths: Sequence[str]) -> list[str]:
 
 
 def _readable(paths: Sequence[str]) -> Iterator[NDArray[np.generic]]:
-    """The grey images of files, without those that cannot be read, which detection reports."""
+    """The grey images of files, without those that cannot be read, unless no file can be."""
     from neurocal_cli.files.images import read_image
 
+    problem, read = None, False
     for path in paths:
         try:
             grey = read_image(path).grey
-        except NeurocalError:
+        except NeurocalError as error:
+            problem = problem or error
             continue
+        read = True
         yield grey
+    if problem is not None and not read:
+        raise problem
 
 
 def check_size(outcomes: Collection[Outcome], board: Board) -> None:

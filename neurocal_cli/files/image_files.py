@@ -32,6 +32,7 @@ _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 
 # Other kinds of files, by their first bytes.
 _VIDEO = "video"
+_PHONES = ("HEIC", "AVIF")  # kinds that phones save
 _OTHERS = (
     (rb".{4}ftyp(heic|heix|hevc|mif1|msf1)", "HEIC"),
     (rb".{4}ftypavi[fs]", "AVIF"),
@@ -149,6 +150,12 @@ def read_header(data: bytes, source: str) -> Header:
             raise FormatError(
                 "is a video, but images are wanted; extract some, as with "
                 "`ffmpeg -i VIDEO -vf fps=1 frame%03d.png`",
+                source,
+            )
+        if other in _PHONES:
+            raise FormatError(
+                f"is a {other} file, which is not read; convert it, as with `heif-convert IN.heic OUT.jpg`, "
+                "or let the phone save JPEG",
                 source,
             )
         if other is not None:

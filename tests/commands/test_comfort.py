@@ -100,3 +100,45 @@ def test_the_shell_can_complete(shell: str) -> None:
     assert "_NEUROCAL_COMPLETE" in completed(_NEUROCAL_COMPLETE=f"{shell}_source")
     words = {"COMP_WORDS": "neurocal calib", "COMP_CWORD": "calib" if shell == "fish" else "1"}
     assert "calibrate" in completed(_NEUROCAL_COMPLETE=f"{shell}_complete", **words)
+
+
+@pytest.mark.parametrize("command", ["stereo", "compare"])
+def test_images_instead_of_points_are_recognised(command: str) -> None:
+    result = run(command, *(SAMPLES / f"board0{k}.png" for k in range(1, 5)))
+    assert result.exit_code == 2
+    assert "these are images; find the points in those of each camera first: neurocal detect" in result.stderr
+
+
+def test_a_file_to_judge_that_is_not_there_is_no_mistyped_command() -> None:
+    result = run("evaluate", "nothere.yaml")
+    assert (result.exit_code, result.stderr) == (
+        1,
+        "Error: nothere.yaml: there is no such file; check the path\n",
+    )
+    assert run("evaluate", "camra").exit_code == 2
+
+
+def test_what_a_phone_saves_is_named_with_how_to_convert_it(tmp_path: Path) -> None:
+    file = tmp_path / "IMG_1.heic"
+    file.write_bytes(b"\0\0\0\x18ftypheic" + bytes(200))
+    for words in ((), ("--cols", 9, "--rows", 6)):
+        result = run("detect", file, "--square", 25, *words)
+        assert result.exit_code == 1
+        assert "is a HEIC file, which is not read; convert it, as with `heif-convert" in result.stderr
+
+
+def test_an_image_of_another_size_is_explained(tmp_path: Path) -> None:
+    image = cv2.imread(str(SAMPLES / "board01.png"))
+    cv2.imwrite(str(tmp_path / "larger.png"), cv2.resize(image, (401, 300)))
+    cv2.imwrite(str(tmp_path / "upright.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
+    cv2.imwrite(str(tmp_path / "twice.png"), cv2.resize(image, (800, 600)))
+    others = [SAMPLES / f"board0{k}.png" for k in range(1, 4)]
+    result = run("detect", tmp_path, *others, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
+    assert result.exit_code == 0
+    for name, why in {
+        "larger": "cut or scaled by a program",
+        "upright": "held or turned upright",
+        "twice": "probably scaled",
+    }.items():
+        (line,) = [line for line in result.stderr.splitlines() if line.startswith(f"{name}: ")]
+        assert why in line

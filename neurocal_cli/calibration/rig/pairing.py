@@ -3,7 +3,8 @@
 Views with equal names are a pair. If the cameras have no name in common, names are compared without the word
 for the side: ``left``, ``l`` or ``cam0`` in names of the left camera, ``right``, ``r`` or ``cam1`` in names
 of the right one. The word may have any case and must not be next to other letters (``left01`` and
-``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``). The order of the views never matters.
+``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``); but one with a capital may follow a
+small letter (``imageL0`` and ``imageR0``). The order of the views never matters.
 
 The points of a pair of views are paired by their ids or, if one of the files has none, by X, Y, Z.
 """
@@ -23,8 +24,16 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.observations.points import Correspondences
 
 _SIDES = (
-    re.compile(r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])", re.IGNORECASE),
-    re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),
+    re.compile(
+        r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])"
+        r"|(?-i:(?<=[a-z])L(?:eft)?(?![A-Za-z]))",
+        re.IGNORECASE,
+    ),
+    re.compile(
+        r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])"
+        r"|(?-i:(?<=[a-z])R(?:ight)?(?![A-Za-z]))",
+        re.IGNORECASE,
+    ),
 )
 _LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
 _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size

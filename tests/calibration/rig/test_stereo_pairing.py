@@ -128,3 +128,11 @@ def test_several_points_at_one_place_are_refused() -> None:
     message = refusal(twice, right)
     assert "left.csv, row 163: the point is at the same X, Y, Z" in message
     assert "left.csv, row 8" in message
+
+
+def test_a_capital_after_a_small_letter_names_the_side() -> None:
+    for left, right in (("imageL{}", "imageR{}"), ("camLeft{}", "camRight{}"), ("frame{}L", "frame{}R")):
+        names = [[side.format(k) for k in range(3)] for side in (left, right)]
+        assert pair_views(*names).both == tuple(zip(*names, strict=True))
+    with pytest.raises(InputError, match="no view of the left camera has a partner"):
+        pair_views(["xL0", "xLa1"], ["xLb0"])
