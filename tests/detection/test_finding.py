@@ -396,3 +396,18 @@ def test_saddles_settle_where_they_are() -> None:
     assert again.max() < 0.2
     assert (again < 1e-9).mean() > 0.8
     assert np.isnan(refine_saddles(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()
+
+
+@pytest.mark.parametrize("light", slow_but((0.35,), (0.5, 0.35, 0.2)))
+@pytest.mark.parametrize("seed", slow_but((0,), range(4)))
+def test_a_board_half_in_a_deep_shadow_is_found(light: float, seed: int) -> None:
+    shot = picture("base", FIRST + seed)
+    (truth,) = shot.truth.planes
+    middle = truth.vertices.mean(axis=(0, 1))
+    v, u = np.indices(shot.image.shape)
+    away = (u - middle[0]) * np.cos(seed) + (v - middle[1]) * np.sin(seed)
+    lit = light + (1 - light) * 0.5 * (1 + np.tanh(away / 1.5))
+    image = np.rint(8 + (shot.image.astype(float) - 8) * lit).astype(np.uint8)
+    hit, wrong = best_match(find_grids(image), truth)
+    assert wrong == 0
+    assert hit.mean() > 0.8
