@@ -20,9 +20,11 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.opencv_names import camera_info, opencv_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.plane_points import PlaneErrors, PlanePoints
 from neurocal_cli.camera.projected_points import ProjectedPoints
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.camera.state import CameraState
+from neurocal_cli.errors import InputError
 from neurocal_cli.observations.measured_directions import equations
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
@@ -213,6 +215,53 @@ class Calibration(Presented):
         """
         found: ProjectedPoints = late("calibration.point_projection", "project")(self, points, view)
         return found
+
+    def on_plane(self, pixels: Array, view: str, sigma: float | None = None) -> PlanePoints:
+        """Convert pixels to points on the target of a view, such as millimetres on a board on a table.
+
+        Parameters
+        ----------
+        pixels : (N, 2) array [px]
+            Of the original images.
+        view : str
+            The view of this calibration whose target is the plane Z = 0.
+        sigma : float, optional [px]
+            Standard deviation of the pixels, in u and in v. Default: that of the calibration.
+
+        Returns
+        -------
+        PlanePoints
+            `points` and their `covariance`, with the shares of the calibration and of the pixels.
+
+        Raises
+        ------
+        InputError
+            There is no such view, or its target has no point with Z = 0.
+        """
+        found: PlanePoints = late("calibration.plane_measurement", "on_plane")(self, pixels, view, sigma)
+        return found
+
+    def errors_at(self, distance: float) -> PlaneErrors:
+        """How well lengths and points are measured on a plane at a distance from the camera [world unit].
+
+        The plane faces the camera, and its distance is taken as exact. Raises InputError for a distance that
+        is not positive, and without image size.
+        """
+        found: PlaneErrors = late("calibration.plane_measurement", "errors_at")(self, distance)
+        return found
+
+    def pose_of(self, view: str) -> Pose:
+        """The pose of a view; an InputError names those that there are."""
+        if view not in self.views:
+            known = list(self.views)
+            some = ", ".join(known[:5]) + (", ..." if len(known) > 5 else "")
+            raise InputError(f"the calibration has no view {view!r}; give one of {some}")
+        return self.views[view].pose
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
+        return self.rmse_px / float(np.sqrt(2.0))
 
     @property
     def cv2_distortion(self) -> Array:

@@ -18,10 +18,7 @@ def project(calibration: Calibration, points: Array, view: str | None = None) ->
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points must have the shape (N, 3), found {points.shape}")
     if view is not None:
-        if view not in calibration.views:
-            known = ", ".join(list(calibration.views)[:5])
-            raise InputError(f"the calibration has no view {view!r}; give one of {known} ...")
-        points = calibration.views[view].pose.to_camera(points)
+        points = calibration.pose_of(view).to_camera(points)
     pixels, seen = calibration.camera.project(points)
     covariance = pixel_covariance_of(calibration, points[seen], view)
     if covariance is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from typing import TYPE_CHECKING
 
 import click
@@ -79,9 +81,16 @@ def evaluate() -> None:
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
+@click.option(
+    "--at",
+    metavar="DISTANCE",
+    show_default="none",
+    help="Also say how well lengths and points are measured on a plane at this distance, such as 1000mm or "
+    "1m; without a unit, in that of the calibration.",
+)
 @panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
-def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
+def camera(calibration: str, points: str | None, at: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
     The residuals of a point are du and dv, its projected pixel minus its observed pixel. The rms error
@@ -92,6 +101,11 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     The pose of any other view is fitted first, with the intrinsic parameters fixed, and the view is
     marked `fitted`; so is another image that only has the name of a calibrated view. Points behind the
     camera are counted, but all averages leave them out.
+
+    With --at, a table says what the uncertainty means for measurements on a plane that faces the camera at
+    this distance, which is taken as exact: the std of a length half as long as what the image shows, of a
+    point in the middle of the image relative to the camera, and of the least certain point; each with the
+    shares of the calibration and of the noise of the pixels.
 
     A calibration also gets a verdict. It uses the points of the calibration: the cross-validation error,
     the noise floor, the agreement of two halves of the data, the coverage of the image and the uncertainty
@@ -105,6 +119,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       neurocal evaluate camera camera.yaml sample_data/stereo_left.csv --json
+      neurocal evaluate camera camera.yaml --at 1000mm
       neurocal evaluate camera camera.yaml --plot errors.png \\
           --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
@@ -120,10 +135,19 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
     from neurocal_cli.commands.show.drift_report import drift_json, since_lines
+    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
+    if at is not None and not isinstance(judged, Calibration):
+        raise UsageError(
+            "--at needs a calibration of neurocal, because others do not say how certain they are"
+        )
+    on_plane, unit = None, ""
+    if at is not None and isinstance(judged, Calibration):
+        unit = judged.unit
+        on_plane = judged.errors_at(_distance(at, unit))
     evaluation = evaluate_camera(judged, seen)
     verdict, drift = None, None
     if isinstance(judged, Calibration):
@@ -144,9 +168,12 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     warn(*evaluation.warnings)
     if as_json:
         since = {} if drift is None else {"drift": drift_json(drift)}
-        print_summary(evaluation_json(evaluation, verdict) | since)
+        work = {} if on_plane is None else {"at": plane_json(on_plane)}
+        print_summary(evaluation_json(evaluation, verdict) | since | work)
     else:
-        show(evaluation_tables(evaluation), [*since_lines(drift), *verdict_lines(verdict)])
+        tables = [*evaluation_tables(evaluation)]
+        tables += [] if on_plane is None else [plane_table(on_plane, unit)]
+        show(tables, [*since_lines(drift), *verdict_lines(verdict)])
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
@@ -304,6 +331,22 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
         print_summary(rig_evaluation_json(evaluation))
     else:
         show(rig_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
+
+
+def _distance(text: str, unit: str) -> float:
+    """A distance such as ``1000mm``, in a unit."""
+    from neurocal_cli.observations.printed_sheet import millimetres
+
+    found = re.fullmatch(r"\s*([0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    try:
+        value = float(found[1]) if found else 0.0
+    except ValueError:
+        value = 0.0
+    if not (found and 0 < value < math.inf):
+        raise UsageError(f"--at {text}: give a distance, such as 1000mm or 1m")
+    if found[2] in ("", unit):
+        return value
+    return value * millimetres(found[2]) / millimetres(unit)
 
 
 def _evaluate_stereo(

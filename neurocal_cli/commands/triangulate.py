@@ -50,10 +50,22 @@ _MANY_OFF = 0.5  # share of the points that chance does not explain
     without="5 sigma",
     positive=True,
 )
+@click.option(
+    "--plane",
+    metavar="VIEW",
+    show_default="none",
+    help="Of a single camera: compute points on the plane of the target of this view, such as a board that "
+    "lay on a table. Give CAMERA.yaml and a CSV file with the columns u,v and optionally point.",
+)
 @options.summary
 @options.output("XYZ.csv", "Write the points to this file.")
 def triangulate(
-    inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, as_json: bool, output: str
+    inputs: tuple[str, ...],
+    sigma: float | None,
+    epipolar_limit: float | None,
+    plane: str | None,
+    as_json: bool,
+    output: str,
 ) -> None:
     """Compute points in space from their pixels in two images or more.
 
@@ -78,6 +90,10 @@ def triangulate(
       cameras     number of cameras that were used
       without     the camera that contradicts the others and was left out, if any
 
+    With --plane, a single camera is enough: each pixel shows the point of the plane on its ray. The plane is
+    Z = 0 of the target in a view of the calibration, and X, Y, Z are in the target's coordinates. The
+    covariance sXX, sXY, sYY is that of the pixel and of the calibration with the pose of the view.
+
     If the rays of a row do not determine a point, its X, Y and Z are nan. No row is dropped. The rows are
     processed in batches, so the file may have any length.
 
@@ -93,6 +109,8 @@ def triangulate(
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
           sample_data/rig_cam2.csv -o three.yaml
       neurocal triangulate three.yaml sample_data/sightings.csv -o xyz.csv
+      neurocal calibrate sample_data/flat.csv -o camera.yaml
+      echo 320,240 | neurocal triangulate camera.yaml - --plane view01
     """  # noqa: D301 - as in the group
     if len(inputs) not in (2, 3):
         given = plural(len(inputs), "file")
@@ -102,6 +120,14 @@ def triangulate(
     preparation.check_one_stdin(*inputs)
     preparation.check_summary(as_json, output)
     preparation.check_outputs((output,), inputs)
+    if plane is not None:
+        if len(inputs) != 2:
+            raise UsageError("--plane is of a single camera; give CAMERA.yaml PIXELS.csv")
+        options.note_unused("with --plane", "epipolar_limit")
+        from neurocal_cli.commands.on_plane import points_on_plane
+
+        points_on_plane(inputs[0], inputs[1], plane, sigma, as_json, output)
+        return
     if len(inputs) == 2 and _of_many(inputs[0], inputs[1]):
         _triangulate_many(inputs[0], inputs[1], sigma, epipolar_limit, as_json, output)
         return

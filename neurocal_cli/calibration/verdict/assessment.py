@@ -108,6 +108,9 @@ def camera_and_covariance(calibration: Calibration) -> tuple[Camera, Array]:
     m, camera, shared = found.opened()
     whole = np.zeros((len(m.free), len(m.free)))
     whole[np.ix_(m.free, m.free)] = shared
+    if m.state.square:  # A22 is A11
+        whole[2], whole[:, 2] = whole[0], whole[:, 0]
+        whole[2, 2] = whole[0, 0]
     to_pixels = np.array([found.views.pixel_scale] * 5 + [1.0] * (len(m.free) - 5))
     return camera, to_pixels[:, None] * whole * to_pixels
 

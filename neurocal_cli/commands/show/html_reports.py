@@ -30,6 +30,7 @@ from neurocal_cli.commands.show.html_page import (
     table,
     verdict_block,
 )
+from neurocal_cli.commands.show.plane_report import plane_table
 from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
 from neurocal_cli.commands.show.rig_report import pose_rows
 from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
@@ -55,6 +56,7 @@ def calibration_page(
         f'<p class="soft">{escape(head)}</p>',
         verdict_block(calibration.verdict),
         section("Parameters", table(parameter_rows(calibration))),
+        _measurements(calibration),
         *_camera_parts(calibration, photographs or {}),
         _repeat("neurocal calibrate POINTS.csv", calibration, origin),
     ]
@@ -192,6 +194,25 @@ def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) ->
         parts.append(section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'))
         parts += _view_parts(calibration, residuals, size, scale, photographs)
     return [*parts, _rejected(calibration), _warnings(calibration.warnings)]
+
+
+def _measurements(calibration: Calibration) -> str:
+    """Section on what is measured how well on a plane at the distance of the targets."""
+    points = calibration.points
+    if not len(points) or calibration.image_size is None or not np.isfinite(calibration.sigma):
+        return ""
+    poses = [calibration.views[name].pose for name in points.view_names]
+    depths = [pose.to_camera(points.world[points.view_index == k])[:, 2] for k, pose in enumerate(poses)]
+    distance = float(f"{np.median(np.concatenate(depths)):.3g}")
+    if distance <= 0:
+        return ""
+    text = (
+        "On a plane that faces the camera at this distance, which is taken as exact: the length is half of "
+        "what the image shows, and the points are relative to the camera. neurocal evaluate camera --at has "
+        "other distances."
+    )
+    rows = plane_table(calibration.errors_at(distance), calibration.unit)
+    return section("What it means for measurements", table(rows), f'<p class="soft">{escape(text)}</p>')
 
 
 def _uncertainty(calibration: Calibration) -> str:

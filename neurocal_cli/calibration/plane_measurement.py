@@ -1,0 +1,99 @@
+"""Pixels to points on a plane, and what the uncertainty of a camera means for lengths on it.
+
+A pixel moves by J dc with the camera's parameters c and by B dX with a point X of the plane. So a pixel that
+is measured with an error du shows the point X + B^-1 (du - J dc).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.verdict.assessment import camera_and_covariance, pixel_covariance_of
+from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.given_values import real_array
+from neurocal_cli.camera.plane_points import PlaneErrors, PlanePoints, Spread
+from neurocal_cli.errors import InputError
+
+_STEEPEST = np.cos(np.radians(75.0))  # of the rays of a wide lens that are judged
+_ON_PLANE = 1e-3  # largest |Z| of a point of the plane, as a share of the target's size
+
+
+def on_plane(calibration: Calibration, pixels: Array, view: str, sigma: float | None) -> PlanePoints:
+    """Points of a view's plane Z = 0; see `Calibration.on_plane`."""
+    pixels = real_array("pixels", pixels)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
+    pose, camera = calibration.pose_of(view), calibration.camera
+    _check_flat(calibration, view)
+    sigma = calibration.sigma if sigma is None else sigma
+    rays = camera.unproject(pixels)
+    normal = pose.R[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        along = float(normal @ pose.t) / (rays @ normal)
+        in_camera = along[:, None] * rays
+    seen = np.isfinite(in_camera).all(axis=1) & (along > 0)
+    points = np.full((len(pixels), 3), np.nan)
+    points[seen] = (in_camera[seen] - pose.t) @ pose.R
+    points[seen, 2] = 0.0
+    _, by_point = camera.project_jacobian(in_camera[seen])
+    back = np.linalg.inv(by_point @ pose.R[:, :2])
+    by_pixel = np.full((len(pixels), 2, 2), np.nan)
+    by_pixel[seen] = sigma**2 * back @ np.swapaxes(back, 1, 2)
+    predicted = pixel_covariance_of(calibration, in_camera[seen], view)
+    by_calibration = None
+    if predicted is not None:
+        by_calibration = np.full((len(pixels), 2, 2), np.nan)
+        by_calibration[seen] = back @ predicted @ np.swapaxes(back, 1, 2)
+    return PlanePoints(points, by_calibration, by_pixel, seen)
+
+
+def _check_flat(calibration: Calibration, view: str) -> None:
+    """Refuse a view whose target has no points with Z = 0, so that this is not its plane."""
+    points = calibration.points
+    if view not in points.view_names:
+        return
+    world = points.world[points.view_index == points.view_names.index(view)]
+    if (
+        np.abs(world[:, 2]).min() > _ON_PLANE * float(np.ptp(world, axis=0).max())
+        and calibration.target is None
+    ):
+        raise InputError(f"no point of the view {view!r} has Z = 0, which is the plane that is measured on")
+
+
+def errors_at(calibration: Calibration, distance: float) -> PlaneErrors:
+    """Errors on a plane that faces the camera; see `Calibration.errors_at`."""
+    size = calibration.image_size
+    if size is None:
+        raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+    if not (np.isfinite(distance) and distance > 0):
+        raise InputError(f"the distance must be a positive number, found {distance}")
+    if not np.isfinite(calibration.sigma):
+        raise InputError("the calibration does not say how accurate its pixels are; calibrate from points")
+    camera, covariance = camera_and_covariance(calibration)
+    width, height = size
+    half = np.array([[0.25, 0.5], [0.75, 0.5], [0.5, 0.5]]) * (width - 1, height - 1)
+    rays = camera.unproject(np.concatenate([half, image_grid(size)]))
+    with np.errstate(invalid="ignore"):
+        rays = rays[rays[:, 2] > _STEEPEST]  # nan too
+    if len(rays) < len(half):
+        raise InputError("the camera does not see a plane in front of it")
+    X = distance * rays / rays[:, 2:]
+    J, by_point = camera.project_jacobian(X)
+    back = np.linalg.inv(by_point[:, :, :2])
+    moved = back @ J  # (N, 2, c) of the points on the plane, by the camera
+    traces = np.einsum("nic,cd,nid->n", moved, covariance, moved)
+    noise = calibration.sigma**2 * (back**2).sum(axis=(1, 2))
+    spreads = [Spread(*np.sqrt([a, b]).tolist()) for a, b in zip(traces, noise, strict=True)]
+    between = X[1, :2] - X[0, :2]
+    length = float(np.linalg.norm(between))
+    along = between / length
+    by_camera = along @ (moved[1] - moved[0])
+    by_pixels = np.concatenate([along @ back[0], along @ back[1]])
+    of_length = Spread(
+        float(np.sqrt(max(by_camera @ covariance @ by_camera, 0.0))),
+        calibration.sigma * float(np.linalg.norm(by_pixels)),
+    )
+    worst = max(spreads[2:], key=lambda spread: spread.std)
+    return PlaneErrors(distance, calibration.sigma, length, of_length, spreads[2], worst)
