@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from neurocal_cli.observations.points import Correspondences
 
 
+Distance = tuple[float, str]  # a number and its unit
+
+
 class _Group(click.Group):
     """A group that also takes a file, and judges it as what it is."""
 
@@ -69,6 +72,24 @@ def evaluate() -> None:
     """  # noqa: D301 - as in the group
 
 
+def _distance(ctx: click.Context, param: click.Parameter, text: str | None) -> Distance | None:
+    """The number and the unit, perhaps empty, of a distance such as ``1000mm``."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*([0-9]+\.?[0-9]*(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    if found is None or not 0 < float(found[1]) < math.inf:
+        raise click.BadParameter(f"{text!r} is no distance; give one, such as 1000mm or 1m.")
+    return float(found[1]), found[2]
+
+
+def _in_unit(distance: Distance, unit: str) -> float:
+    """A distance in a unit."""
+    from neurocal_cli.observations.printed_sheet import millimetres
+
+    value, own = distance
+    return value if own in ("", unit) else value * millimetres(own) / millimetres(unit)
+
+
 @evaluate.command(cls=options.Command)
 @options.argument(
     "calibration",
@@ -84,13 +105,14 @@ def evaluate() -> None:
 @click.option(
     "--at",
     metavar="DISTANCE",
+    callback=_distance,
     show_default="none",
     help="Also say how well lengths and points are measured on a plane at this distance, such as 1000mm or "
     "1m; without a unit, in that of the calibration.",
 )
 @panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
-def camera(calibration: str, points: str | None, at: str | None, plots: Plots, as_json: bool) -> None:
+def camera(calibration: str, points: str | None, at: Distance | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
     The residuals of a point are du and dv, its projected pixel minus its observed pixel. The rms error
@@ -147,7 +169,7 @@ def camera(calibration: str, points: str | None, at: str | None, plots: Plots, a
     on_plane, unit = None, ""
     if at is not None and isinstance(judged, Calibration):
         unit = judged.unit
-        on_plane = judged.errors_at(_distance(at, unit))
+        on_plane = judged.errors_at(_in_unit(at, unit))
     evaluation = evaluate_camera(judged, seen)
     verdict, drift = None, None
     if isinstance(judged, Calibration):
@@ -331,22 +353,6 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
         print_summary(rig_evaluation_json(evaluation))
     else:
         show(rig_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
-
-
-def _distance(text: str, unit: str) -> float:
-    """A distance such as ``1000mm``, in a unit."""
-    from neurocal_cli.observations.printed_sheet import millimetres
-
-    found = re.fullmatch(r"\s*([0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", text.lower())
-    try:
-        value = float(found[1]) if found else 0.0
-    except ValueError:
-        value = 0.0
-    if not (found and 0 < value < math.inf):
-        raise UsageError(f"--at {text}: give a distance, such as 1000mm or 1m")
-    if found[2] in ("", unit):
-        return value
-    return value * millimetres(found[2]) / millimetres(unit)
 
 
 def _evaluate_stereo(
