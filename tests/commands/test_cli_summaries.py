@@ -161,7 +161,7 @@ def test_what_undistorts_converts_and_prints_sums_up_as_json(tmp_path: Path) -> 
     assert (told["n_points"], told["n_views"]) == (len(read_points(SAMPLES / "fisheye.csv")), 9)
 
     told = summary("board", *BOARD, "--paper", "A3", "-o", tmp_path / "board.svg")
-    assert told["planes"] == [{"name": "", "cols": 9, "rows": 6, "square": 25.0}]
+    assert told["planes"] == [{"kind": "chessboard", "name": "", "cols": 9, "rows": 6, "square": 25.0}]
     assert (told["paper_mm"], told["board_file"]) == ([297.0, 420.0], str(tmp_path / "board.yaml"))
     assert run("convert", tmp_path / "f.yaml", "--to", "ros", "--json").exit_code == 2
 
