@@ -11,8 +11,10 @@ from support.real_data import RealFiles
 from support.rendered import picture
 
 from neurocal_cli.detection.batch import retain_freed_memory
+from neurocal_cli.detection.board_size import seen_board
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.observations.board import Board
 
@@ -44,6 +46,31 @@ def test_neurocal_finds_and_measures(benchmark: BenchmarkFixture, condition: str
     benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
     points = benchmark(lambda: [measure(image, grid) for grid in find_grids(image)])
     assert bool(points) == (condition != "clutter only")
+
+
+@pytest.mark.parametrize("condition", ["clutter only", "clutter only 5 Mpx"])
+def test_neurocal_says_what_an_image_without_a_board_shows(
+    benchmark: BenchmarkFixture, condition: str
+) -> None:
+    image, board = seen(condition), Board.single(9, 6, 25.0)
+    benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
+
+    def refused() -> bool:
+        try:
+            detect_points(image, board)
+        except NoBoardError:
+            return True
+        return False
+
+    assert benchmark(refused)
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_neurocal_finds_the_size_of_the_board(benchmark: BenchmarkFixture, condition: str) -> None:
+    image = seen(condition)
+    benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
+    board = benchmark(lambda: seen_board(image))
+    assert (board is not None) == (condition != "clutter only")
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)

@@ -31,7 +31,7 @@ from neurocal_cli.detection.grid import Grid
 
 _STEP, _FARTHEST = 0.25, 8.0  # px; width of the profile's bins, and greatest distance from the edges
 _NARROWEST = 4.0  # px; least such distance, so narrow squares tell nothing
-_FEWEST = 12  # edges
+_FEWEST, _MOST = 12, 60  # edges
 # Sharpening is undone if the fitted profile overshoots the levels by this share of the contrast, and leaves
 # less than this share of the squares that a profile without sharpening leaves.
 _OVERSHOOT, _CLEARLY = 0.05, 0.8
@@ -58,16 +58,18 @@ def edge_profile(strips: Strips, offset: Array, mean: Array, contrast: Array) ->
     wide = reach >= _NARROWEST
     if np.count_nonzero(wide) < _FEWEST:
         return None
-    inside = strips.inside & wide[:, None]
-    most = int(min(float(np.median(reach[wide])), _FARTHEST) / _STEP)
-    d = (strips.d - offset.astype(np.float32)[:, None])[inside]
-    light = ((strips.value - mean.astype(np.float32)[:, None]) / contrast.astype(np.float32)[:, None])[inside]
+    some = np.flatnonzero(wide)[:: -(-np.count_nonzero(wide) // _MOST)]
+    most = int(min(float(np.median(reach[some])), _FARTHEST) / _STEP)
+    inside = strips.inside[some]
+    zero, middle, half = (x[some].astype(np.float32)[:, None] for x in (offset, mean, contrast))
+    d = (strips.d[some] - zero)[inside]
+    light = ((strips.value[some] - middle) / half)[inside]
     place = np.rint(d / np.float32(_STEP)).astype(np.intp) + most
     used = (place >= 0) & (place <= 2 * most)
     place, d, light = place[used], d[used], light[used]
     count, sum_d, sum_light = (np.bincount(place, w, 2 * most + 1) for w in (np.ones_like(d), d, light))
-    some = count > 0
-    return EdgeProfile(sum_d[some] / count[some], sum_light[some] / count[some], count[some].astype(float))
+    full = count > 0
+    return EdgeProfile(sum_d[full] / count[full], sum_light[full] / count[full], count[full].astype(float))
 
 
 @frozen_dataclass(eq=False)
