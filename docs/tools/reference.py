@@ -14,6 +14,7 @@ import click
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
+from neurocal_cli.files.exchange.reading import FORMATS, READ
 
 DOCS = Path(__file__).resolve().parents[1]
 MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
@@ -42,7 +43,7 @@ TOPICS = {
 def pages() -> dict[str, str]:
     """Paths below ``docs`` and texts of all pages that are made here."""
     made = {f"commands/{_file(ctx)}": _command_page(ctx) for ctx in _walk(_root())}
-    return made | {"reference/api.md": _api_page()}
+    return made | {"reference/api.md": _api_page(), "reference/formats.md": _formats_page()}
 
 
 def _root() -> click.Context:
@@ -120,6 +121,61 @@ def _option(ctx: click.Context, option: click.Option) -> tuple[str, str]:
 
 def _list(title: str, rows: list[tuple[str, str]]) -> list[str]:
     return [f"## {title}", "\n".join(f"* {term}<br>{_prose(text)}" for term, text in rows)] if rows else []
+
+
+def _formats_page() -> str:
+    """Each format of other programs, from the tables by which it is read and written."""
+    targets = {id(one): name for name, one in FORMATS.items()}
+    every = [*READ, *(one for one in FORMATS.values() if one not in READ)]
+    rows = [
+        "| program | files | `--to` | cameras | poses between them | poses of views | skew | first pixel |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    models = ["| program | distortion models |", "| --- | --- |"]
+    pixels = {0.0: "0", 0.5: "1/2", 1.0: "1"}
+    for one in every:
+        name = targets.get(id(one))
+        cells = [
+            one.program,
+            one.files,
+            f"`{name}`" if name else "read only",
+            "any number" if one.most_cameras > 2 else str(one.most_cameras),
+            (one.rig or "no") + (", in metres" if one.metres else ""),
+            "yes" if one.poses else "no",
+            "yes" if one.skew else "no",
+            pixels[one.first_pixel],
+        ]
+        rows.append("| " + " | ".join(cells) + " |")
+        models.append(f"| {one.program} | {', '.join(f'`{model}`' for model in one.models)} |")
+    parts = [
+        MADE,
+        "# Formats of other programs",
+        "`neurocal convert` and all options that take a camera recognise these files by their content. "
+        "OpenCV's reader takes any dictionary whose keys are called anything like `camera_matrix` and "
+        "`dist_coeffs`; [Exchange with other programs](../how-to/other-programs.md) has examples.",
+        "\n".join(rows),
+        "*Read only*: there is no `--to`. Formats without skew get the nearest camera without it, with a "
+        "warning of the pixels that it moves. Standard deviations, the verdict and points are in "
+        "neurocal's own files alone. If a rig's unit is not metres, it is the file's own, and `--unit` "
+        "gives one that the file does not state. The pose of a single camera in a body or a world becomes"
+        " its view `body`, `imu`, `world` or `reference`.",
+        "## Where the first pixel is",
+        "![The centre of the first pixel is (0, 0), (1/2, 1/2) or (1, 1)](../pictures/pixels.svg)",
+        "Principal points are shifted from one convention to the other, so that a camera projects to the "
+        "same place of the image in each program.",
+        "## Distortion models",
+        "A model of fewer coefficients is written as a special case of a larger one. A model that a "
+        "format does not have is refused, with the error of the nearest one in pixels; `--force` writes "
+        "that one.",
+        "\n".join(models),
+        "## What is refused",
+        "Four coefficients that may be those of an ordinary lens or of a fisheye, unless the file or "
+        "`--distortion` says which; numbers that may be the distortion and are under no known name; two "
+        "values of one thing; two cameras without a pose between them; pickles of Python and objects of "
+        "MATLAB's classes; OCamCalib's polynomial, lensfun, OpenPTV and the raw calibration of an Azure "
+        "Kinect, whose models are others.",
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def _api_page() -> str:

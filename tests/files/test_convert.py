@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -329,6 +330,39 @@ def test_colmap_projects_as_the_camera_does(model: str, tmp_path: Path) -> None:
     right = next(image for image in found.images.values() if image.name == "camera2/view1.png")
     expected = np.column_stack([RIGHT.R @ POSES["view1.png"].R, RIGHT.R @ POSES["view1.png"].t + RIGHT.t])
     assert np.abs(right.cam_from_world().matrix() - expected).max() < 1e-9
+
+
+def test_binary_models_of_colmap_are_those_of_its_text(tmp_path: Path) -> None:
+    """Written as COLMAP's documentation describes them: little endian, cameras, rigs, images."""
+    views = {"a.png": POSES["view1.png"], "b.png": POSES["view2.png"]}
+    given = CameraSet((lens("k1k2p1p2"), lens("none")), (RIGHT,), views, "mm")
+    written(given, "colmap", tmp_path / "text")
+    packed = {
+        "cameras": [struct.pack("<Q", 2)],
+        "images": [struct.pack("<Q", 4)],
+        "rigs": [struct.pack("<Q", 1)],
+    }
+    for line in (tmp_path / "text" / "cameras.txt").read_text().splitlines()[2:]:
+        number, model, width, height, *rest = line.split()
+        head = struct.pack("<iiQQ", int(number), {"OPENCV": 4, "PINHOLE": 1}[model], int(width), int(height))
+        packed["cameras"].append(head + struct.pack(f"<{len(rest)}d", *map(float, rest)))
+    for line in (tmp_path / "text" / "images.txt").read_text().splitlines()[::2]:
+        number, *seven, camera, name = line.split()
+        head = struct.pack("<i7di", int(number), *map(float, seven), int(camera))
+        packed["images"].append(head + name.encode() + b"\0" + struct.pack("<QddqQ", 1, 0, 0, -1, 0)[:32])
+    seven = (tmp_path / "text" / "rigs.txt").read_text().split()[7:]
+    packed["rigs"].append(struct.pack("<IIiIiIB7d", 1, 2, 0, 1, 0, 2, 1, *map(float, seven)))
+    (tmp_path / "binary").mkdir()
+    for name, parts in packed.items():
+        (tmp_path / "binary" / f"{name}.bin").write_bytes(b"".join(parts))
+    found, expected = (read_cameras([tmp_path / name]) for name in ("binary", "text"))
+    for one, other in zip(found.cameras, expected.cameras, strict=True):
+        same(one, other, 1e-12)
+    same_pose(found.relative[0], expected.relative[0], tolerance=1e-12)
+    assert list(found.poses) == list(expected.poses)
+    (tmp_path / "binary" / "images.bin").write_bytes(b"".join(packed["images"])[:-5])
+    with pytest.raises(FormatError, match=r"images.bin: is a damaged images.bin of COLMAP"):
+        read_cameras([tmp_path / "binary"])
 
 
 def test_colmap_gets_names_without_blanks(tmp_path: Path) -> None:

@@ -118,7 +118,10 @@ class CameraKeys:
             if found is None and fewest:
                 at(root, lens.places[0])
         else:
-            fields = [find(root, path) for path in lens.places]
+            whole = lens.ours not in (*_POLYNOMIAL, "fisheye")
+            fields = [at(root, path) if whole else find(root, path) for path in lens.places]
+            if fields and fields[0] is None and any(entry is not None and entry.value for entry in fields):
+                at(root, lens.places[0])  # later coefficients alone are no distortion
             values = np.array([0.0 if entry is None else entry.number() for entry in fields])
             self._refuse_others(root, lens)
         if lens.ours in _POLYNOMIAL:
@@ -207,18 +210,20 @@ def at(root: Field, path: str) -> Field:
         if isinstance(here.value, list):
             found = find(here, key)
             if found is None:
-                here.fail(f"a list of {int(key) + 1} or more")
+                here.fail(
+                    f"a list of {int(key) + 1} or more" if key.isdecimal() else "a mapping (key: value)"
+                )
             here = found
         else:
             here = here[key]
     return here
 
 
-def numbers(entry: Field) -> Array:
+def numbers(entry: Field, count: int = -1) -> Array:
     """Numbers in a list, in nested lists or in ``{rows, cols, data}``, in one row."""
     if isinstance(entry.value, dict) and "rows" not in entry.value:
-        return entry["data"].array(-1)
-    return matrix_data(entry, -1)
+        return entry["data"].array(count)
+    return matrix_data(entry, count)
 
 
 def transform(entry: Field) -> Pose:

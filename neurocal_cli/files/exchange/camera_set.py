@@ -40,6 +40,8 @@ class CameraSet:
     rectified: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
+        if not self.cameras:
+            raise InputError("holds no camera; give another file")
         if len(self.relative) != len(self.cameras) - 1:
             raise InputError(
                 f"holds {len(self.cameras)} cameras, but not their relative poses; give a file with "
@@ -100,7 +102,7 @@ class Format:
     needs_size: bool = False  # whether the image size must be known
     rectified: bool = False  # whether it contains the rectification of a camera
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
-    frame: str = ""  # what the poses of its cameras are relative to
+    rig: str = ""  # how the poses of several cameras are stated, for the documentation
 
 
 def mounted(
@@ -111,6 +113,8 @@ def mounted(
     frame: str = "body",
 ) -> CameraSet:
     """Cameras with their poses, from one frame to each; that of a single camera is its view named `frame`."""
+    if not cameras:
+        raise InputError("holds no camera; give another file")
     first = poses[0]
     if len(cameras) == 1:
         views = {} if first is None else {frame: first}

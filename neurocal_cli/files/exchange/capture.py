@@ -96,7 +96,7 @@ ANIPOSE = Format(
     skew=True,
     most_cameras=99,
     needs_size=True,
-    frame="world, of a single camera",
+    rig="`rotation, translation` from the world to each camera",
 )
 
 # BoofCV, also its stereo rigs: ``rightToLeft`` maps the right camera's frame to the left one's.
@@ -140,17 +140,19 @@ def _read_boofcv(document: Document) -> CameraSet:
     if "pinhole" in root:
         return CameraSet((_boofcv_camera(root),), program="BoofCV")
     back = root["rightToLeft"]
-    pose = Pose(numbers(back["rotation"]).reshape(3, 3), np.array([back[key].number() for key in "xyz"]))
+    pose = Pose(numbers(back["rotation"], 9).reshape(3, 3), np.array([back[key].number() for key in "xyz"]))
     cameras = [_boofcv_camera(root[side], side) for side in ("left", "right")]
     return mounted(cameras, [Pose(np.eye(3), np.zeros(3)), inverse(pose)], "BoofCV", None)
 
 
 BOOFCV = Format(
     "BoofCV",
+    _BOOFCV.models,
     matches=lambda document: "pinhole" in document.tree or "rightToLeft" in document.tree,
     read=_read_boofcv,
     files="intrinsic.yaml, stereo.yaml",
     skew=True,
+    rig="`rightToLeft`",
 )
 
 # Stereolabs' ZED: sections for each camera and resolution; rows of both images agree after stereoRectify with
@@ -185,7 +187,9 @@ def _read_zed(document: Document) -> CameraSet:
 
 ZED = Format(
     "ZED",
+    ("none", "plumb_bob", "rational"),
     matches=lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
     read=_read_zed,
     files="SN*.conf of Stereolabs",
+    rig="R of the vector (RX, CV, RZ), T = -(Baseline, TY, TZ)",
 )

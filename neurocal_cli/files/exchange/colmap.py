@@ -44,12 +44,15 @@ _MODELS: dict[str, tuple[int, str, int, tuple[int | None, ...]]] = {
     "FULL_OPENCV": (6, "rational", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
     "SIMPLE_RADIAL_FISHEYE": (8, "fisheye", 1, (0, None, None, None)),
     "RADIAL_FISHEYE": (9, "fisheye", 1, (0, 1, None, None)),
-    # Since version 4, whose numbers of these are not used here.
-    "SIMPLE_FISHEYE": (-1, "fisheye", 1, (None, None, None, None)),
-    "FISHEYE": (-1, "fisheye", 2, (None, None, None, None)),
-    "EUCM": (-1, "eucm", 2, (0, 1)),
+    # Since version 4.
+    "SIMPLE_FISHEYE": (14, "fisheye", 1, (None, None, None, None)),
+    "FISHEYE": (15, "fisheye", 2, (None, None, None, None)),
+    "EUCM": (16, "eucm", 2, (0, 1)),
 }
-_OTHERS = {7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
+_OTHERS = {
+    7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION",
+    13: "DIVISION", 17: "EQUIRECTANGULAR",
+}  # fmt: skip
 _LINE = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
 _NAMES = {
     "none": "PINHOLE",
@@ -128,7 +131,7 @@ def _unpacked(data: bytes, name: str, source: str) -> _Lines:
         return values
 
     def cameras() -> Iterator[object]:
-        names = {number: model for model, (number, *_) in _MODELS.items() if number >= 0}
+        names = {number: model for model, (number, *_) in _MODELS.items()}
         one, model, width, height = take("iiQQ")
         if model not in names:
             other = _OTHERS.get(model, f"number {model}")
@@ -301,4 +304,5 @@ FORMAT = Format(
     most_cameras=99,
     needs_size=True,
     first_pixel=0.5,
+    rig="`rigs.txt`, from the first camera",
 )

@@ -12,7 +12,6 @@ columns of the board. Kalibr has no file of corners: it detects them in a bag in
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -24,7 +23,7 @@ import numpy as np
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.document import arrays_of
+from neurocal_cli.files.exchange.document import array_of, arrays_of
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
 from neurocal_cli.files.failures import value_failures
@@ -74,10 +73,7 @@ def read_corners(
     data, source = read_bytes(names[0])
     given = _Given(board, unit, what == "points", advice, notes)
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
-        try:
-            array = np.load(io.BytesIO(data), allow_pickle=False)
-        except (ValueError, OSError, EOFError) as error:
-            raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+        array = array_of(data, source)
         if array.shape == (3, 3):
             return None  # a camera matrix
         return _corners(Field({"corners": array.tolist()}, source), given)

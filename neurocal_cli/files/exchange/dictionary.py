@@ -155,7 +155,10 @@ def _sides(keys: LooseKeys) -> tuple[str, str] | None:
 
 def _poses(root: Field) -> dict[str, Pose]:
     if "extrinsic_parameters" in root:
-        rows = matrix_data(root["extrinsic_parameters"], -1).reshape(-1, 6)
+        rows = matrix_data(root["extrinsic_parameters"], -1)
+        if len(rows) % 6:
+            root["extrinsic_parameters"].fail("six numbers for each view")
+        rows = rows.reshape(-1, 6)
     elif "rvecs" in root and "tvecs" in root:
         vectors = [_flat(root[key]).reshape(-1, 3) for key in ("rvecs", "tvecs")]
         if len(vectors[0]) != len(vectors[1]):
@@ -258,9 +261,16 @@ OPENCV = Format(
     read,
     files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
     poses=True,
+    rig="`R, T`: `X_2 = R X_1 + T`",
 )
 JSON = Format(
-    "JSON", _ALL, lambda set_, _: {"": json_text(entries(set_))}, files="dictionary", skew=True, poses=True
+    "JSON",
+    _ALL,
+    lambda set_, _: {"": json_text(entries(set_))},
+    files="dictionary of the same names",
+    skew=True,
+    poses=True,
+    rig="`R, T`: `X_2 = R X_1 + T`",
 )
 NPZ = Format(
     "NumPy",
@@ -269,4 +279,5 @@ NPZ = Format(
     files=".npz; .npy of the matrix, and of the coefficients",
     skew=True,
     poses=True,
+    rig="`R, T`: `X_2 = R X_1 + T`",
 )

@@ -10,7 +10,9 @@ import io
 import re
 import sys
 import zipfile
+import zlib
 from functools import cached_property
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,11 @@ from neurocal_cli.files.file_storage import parse_tree
 from neurocal_cli.files.reading import decode, read_bytes
 from neurocal_cli.files.tree_fields import Field, is_number
 
+# What NumPy's and Python's readers raise; the header of an array is an expression.
+_DAMAGED = (
+    ValueError, OSError, EOFError, KeyError, MemoryError, SyntaxError, TokenError, NotImplementedError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*;", re.MULTILINE)
@@ -68,7 +75,7 @@ class Document:
         if self.data.startswith(b"PK\x03\x04"):
             return Field(arrays_of(self.data, self.source, self.notes), self.source)
         if self.data.startswith(b"\x93NUMPY"):
-            return Field({"K": _array(self.data, self.source).tolist()}, self.source)
+            return Field({"K": array_of(self.data, self.source).tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
         if _SECTION(text):
             return Field(_sections(text, self.source), self.source)
@@ -104,15 +111,16 @@ def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
                     )
     except FormatError:
         raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except _DAMAGED as error:
         raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
     return tree
 
 
-def _array(data: bytes, source: str) -> np.ndarray[Any, Any]:
+def array_of(data: bytes, source: str) -> np.ndarray[Any, Any]:
+    """Read the array of an ``.npy`` file."""
     try:
         return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
-    except (ValueError, OSError, EOFError) as error:
+    except _DAMAGED as error:
         raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
 
 

@@ -137,4 +137,5 @@ FORMAT = Format(
     most_cameras=99,
     metres=True,
     needs_size=True,
+    rig="`T_cn_cnm1` from the camera before; `T_cam_imu`; `T_imu_cam` into the IMU",
 )

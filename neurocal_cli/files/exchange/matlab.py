@@ -309,4 +309,5 @@ FORMAT = Format(
     poses=True,
     needs_size=True,
     first_pixel=1.0,
+    rig="`RotationOfCamera2`, transposed; `om, T` of Bouguet",
 )

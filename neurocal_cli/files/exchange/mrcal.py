@@ -103,5 +103,5 @@ FORMAT = Format(
     files=".cameramodel",
     most_cameras=99,
     needs_size=True,
-    frame="reference, of a single camera",
+    rig="a file for each camera, `extrinsics` from a common reference",
 )

@@ -185,4 +185,5 @@ FORMAT = Format(
     skew=True,
     poses=True,
     most_cameras=99,
+    rig="`X_name = R X_first + t`",
 )

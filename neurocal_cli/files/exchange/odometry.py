@@ -80,6 +80,7 @@ ORB_SLAM = Format(
     _read_orb,
     files="settings of ORB-SLAM2 and 3, YAML",
     most_cameras=1,
+    rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
 
 # VINS and camodocal. Their Kannala-Brandt is r = theta + k2 theta^3 + ..., so its k2 is our k1.
@@ -149,7 +150,7 @@ EUROC = Format(
     files="sensor.yaml of the EuRoC data set",
     most_cameras=1,
     needs_size=True,
-    frame="body",
+    rig="two files, `T_BS` from each camera to the body (read)",
 )
 
 # Basalt: lists of cameras, of their sizes, and of their poses into the IMU.
@@ -211,7 +212,7 @@ BASALT = Format(
     most_cameras=99,
     metres=True,
     needs_size=True,
-    frame="the IMU, of a single camera",
+    rig="`T_imu_cam` from each camera to the IMU",
 )
 
 # OKVIS and SVO: lists of cameras with their poses into the body.
@@ -259,21 +260,23 @@ def _first_camera(document: Document) -> Mapping[str, Any]:
 
 OKVIS = Format(
     "OKVIS",
+    _OKVIS.models,
     matches=lambda document: "focal_length" in _first_camera(document),
     read=_listed(_OKVIS, "T_SC"),
     files="its configuration, YAML",
     most_cameras=99,
     metres=True,
-    frame="body, of a single camera",
+    rig="`T_SC` from each camera to the body",
 )
 SVO = Format(
     "SVO",
+    _SVO.models,
     matches=lambda document: "camera" in _first_camera(document),
     read=_listed(_SVO, "T_B_C"),
     files="SVO, rpg_vikit, maplab: YAML",
     most_cameras=99,
     metres=True,
-    frame="body, of a single camera",
+    rig="`T_B_C` from each camera to the body",
 )
 
 # KITTI: cameras of the recording, each posed relative to the first, and rectified ones of the odometry.
@@ -317,9 +320,11 @@ def _rectified_kitti(document: Document, lines: Mapping[str, Sequence[float]]) -
 
 KITTI = Format(
     "KITTI",
+    _KITTI.models,
     matches=lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),
     read=_read_kitti,
     files="calib_cam_to_cam.txt; calib.txt of the odometry",
     most_cameras=99,
     metres=True,
+    rig="`R_`, `T_` from camera 0; `P0` to `P3`",
 )

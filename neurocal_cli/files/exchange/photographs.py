@@ -7,7 +7,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, numbers
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, transform
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
     Format,
@@ -64,8 +64,8 @@ def _read_nerf(document: Document) -> CameraSet:
     for k, frame in enumerate(root["frames"].items() if "frames" in root else ()):
         name = frame["file_path"].text() if "file_path" in frame else str(k)
         if "transform_matrix" in frame:
-            T = numbers(frame["transform_matrix"]).reshape(-1, 4)
-            poses[name] = inverse(Pose(T[:3, :3] @ _FLIP, T[:3, 3]))
+            pose = transform(frame["transform_matrix"])
+            poses[name] = inverse(Pose(pose.R @ _FLIP, pose.t))
     return CameraSet((_NERF.camera(root),), (), poses, program="nerfstudio")
 
 
@@ -187,7 +187,6 @@ OPEN3D = Format(
     files="PinholeCameraIntrinsic, PinholeCameraParameters, JSON",
     most_cameras=1,
     needs_size=True,
-    frame="world, of a single camera",
 )
 
 

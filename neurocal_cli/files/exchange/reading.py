@@ -77,7 +77,7 @@ READ: tuple[Format, ...] = (
     ros.FORMAT,
     dictionary.OPENCV,
 )
-_ORI = re.compile(r"\s*".join([r"(?:\s*[-+.\deE]+){3}"] * 5) + r"(?:\s+[-+.\deE]+){6}\s*\Z").match
+_ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines of OpenPTV's file
 
 # What is known and cannot be read: how to tell it, what it is, and what to do.
 _REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
@@ -127,7 +127,11 @@ _REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
-        lambda d: not d.tree and len(d.text) < 2000 and _ORI(d.text),
+        lambda d: (
+            not d.tree
+            and len(d.text) < 2000
+            and [len(line.split()) for line in d.text.splitlines() if line.strip()] == _ORIENTATION
+        ),
         "is an orientation of OpenPTV, in mm of the sensor; calibrate from its points",
     ),
 )

@@ -140,4 +140,5 @@ FORMAT = Format(
     metres=True,
     needs_size=True,
     rectified=True,
+    rig="two files; `projection_matrix` of the right one holds the baseline",
 )

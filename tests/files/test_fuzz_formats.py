@@ -1,0 +1,136 @@
+"""Damaged files of every format: each is read or refused in one line, and no changed number is overlooked."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.distorted import LENSES
+from support.slow_cases import slow_but
+from test_fuzz import damaged
+from test_other_programs import DIALECTS
+
+from neurocal_cli import Camera, Intrinsics, Pose
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.files.exchange.adapt_cameras import adapt_cameras
+from neurocal_cli.files.exchange.camera_set import CameraSet
+from neurocal_cli.files.exchange.corners import read_corners
+from neurocal_cli.files.exchange.reading import FORMATS, read_cameras
+
+COUNT = int(os.environ.get("NEUROCAL_FUZZ", "10000"))
+SIZE = (640, 480)
+POSES = {
+    "a": Pose.from_euler(0.1, 0.2, 0.3, np.array([1.0, -2, 700])),
+    "b": Pose.from_euler(0, 1, 0, np.ones(3)),
+}
+RIGHT = Pose.from_euler(0.01, -0.2, 0.03, np.array([-120.0, 3.0, 4.0]))
+A = (600.123456789, 611.7, 321.1, 239.3)
+
+
+def lens(model: str) -> Camera:
+    return Camera(Intrinsics(*A), Distortion(model, np.array(LENSES[model])), SIZE)
+
+
+def sets(target: str) -> Iterator[tuple[str, CameraSet]]:
+    """Cameras of each model of a format, with poses if it has them, and a rig."""
+    wanted = FORMATS[target]
+    for model in wanted.models:
+        if model in LENSES:
+            yield model, CameraSet((lens(model),), (), POSES if wanted.poses else {}, "m")
+    if wanted.most_cameras > 1:
+        first = lens(next(m for m in wanted.models if m != "none"))
+        yield "rig", CameraSet((first, lens(wanted.models[0])), (RIGHT,), unit="m")
+
+
+def contents(target: str, cameras: CameraSet) -> dict[str, bytes]:
+    adapted = adapt_cameras(cameras, FORMATS[target], force=False)
+    files = FORMATS[target].text(adapted.cameras, ".yaml")
+    return {name: text.encode() if isinstance(text, str) else text for name, text in files.items()}
+
+
+def read(files: dict[str, bytes], folder: Path) -> CameraSet:
+    folder.mkdir(exist_ok=True)
+    for old in folder.iterdir():
+        old.unlink()
+    for name, data in files.items():
+        (folder / (name or "file")).write_bytes(data)
+    if "cameras.txt" in files:
+        return read_cameras([folder])
+    return read_cameras([folder / (name or "file") for name in files])
+
+
+def numbers(cameras: CameraSet) -> Array:
+    """All that a file says, as numbers."""
+    points = np.random.default_rng(1).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1.5], (30, 3))
+    pixels = [camera.project(points)[0].ravel() for camera in cameras.cameras]
+    poses = [pose.D.ravel() for pose in (*cameras.relative, *cameras.poses.values())]
+    return np.nan_to_num(np.concatenate([*pixels, *poses]), nan=-1e9)
+
+
+READ = [name for name in FORMATS if name != "dlt"]
+TEXTS = [name for name in READ if name not in ("npz", "matlab", "neurocal")]
+NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:[eE][-+]?\d+)?(?![\w.])")
+
+
+@pytest.mark.parametrize("target", TEXTS)
+def test_no_changed_number_of_a_camera_is_overlooked(target: str, tmp_path: Path) -> None:
+    for model, cameras in sets(target):
+        files = contents(target, cameras)
+        before = numbers(read(files, tmp_path / "f"))
+        for camera in cameras.cameras:
+            own = [*camera.entries, *camera.distortion.coefficients.tolist()]
+            for value in filter(None, own):
+                # Formats count pixels from 0 or 1/2, or from the middle of the image; b1 is a difference.
+                middles = [0.0, -0.5, *(0.5 * side - shift for side in SIZE for shift in (0.5, 0.0))]
+                forms = [value - middle for middle in middles] + [value - camera.entries[2]]
+                places = [
+                    (name, match)
+                    for name, data in files.items()
+                    for match in NUMBER.finditer(data)
+                    if any(abs(float(match[0]) - form) < 1e-9 for form in forms if form)
+                ]
+                assert places, (model, value)
+                # Some are repeated in what follows from them, such as OpenCV's rectified projections.
+                assert any(matters(files, *place, before, tmp_path) for place in places), (model, value)
+
+
+def matters(files: dict[str, bytes], name: str, match: re.Match[bytes], before: Array, folder: Path) -> bool:
+    """Whether another number at this place is refused, or changes what is read."""
+    data, new = files[name], repr(float(match[0]) * 1.01).encode()
+    try:
+        after = numbers(
+            read({**files, name: data[: match.start()] + new + data[match.end() :]}, folder / "f")
+        )
+    except NeurocalError:
+        return True
+    return bool(np.abs(after - before).max() > 1e-9)
+
+
+def answered(files: dict[str, bytes], folder: Path) -> None:
+    """The files are read, or refused in one line."""
+    messages = []
+    first = folder / (next(iter(files)) or "file")
+    for reader in (lambda: read(files, folder), lambda: read_corners([first], None, [])):
+        try:
+            reader()
+        except NeurocalError as error:
+            messages.append(str(error))
+    assert all(message.isprintable() and len(message) < 1500 for message in messages)
+
+
+@pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 1.0)))
+def test_damaged_files_of_all_formats_are_read_or_refused(share: float, tmp_path: Path) -> None:
+    given = [contents(target, cameras) for target in READ for _, cameras in sets(target)]
+    given += [{"": text.encode()} for text in DIALECTS]
+    for trial in range(int(share * COUNT)):
+        rng = np.random.default_rng([trial, 45])
+        files = dict(given[int(rng.integers(len(given)))])
+        name = list(files)[int(rng.integers(len(files)))]
+        files[name] = damaged(files[name], rng)
+        answered(files, tmp_path / "f")
