@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.locate import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grey import grey_image
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
@@ -22,6 +23,7 @@ from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.observations.board import Board, Plane
+from neurocal_cli.observations.board_kinds import CirclePlane
 
 _FEWEST = 8  # points; fewer determine little more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: step from a point's index to the other end of its edge
@@ -133,7 +135,7 @@ def detect_points(
     image = grey_image(image)
     identified = _identified(image, board, grids)
     located = identified.located
-    measured = tuple(_named(one, _sound(measure(image, one.grid, points, gamma, one.ink))) for one in located)
+    measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
     count, rejected = (int(n) for n in np.sum([(len(one.kind), one.rejected) for one in measured], axis=0))
     if count < _FEWEST:
         share = f"{count} of {count + rejected} points"
@@ -149,7 +151,9 @@ def detect_points(
         joined(one.world for one in labels),
         joined(one.pixels for one in measured),
         joined(one.covariance for one in measured),
-        None if points == "vertices" else joined(_directions(one) for one in measured),
+        None
+        if points == "vertices" or located[0].circles is not None
+        else joined(_directions(one) for one in measured),
         (image.shape[1], image.shape[0]),
         rejected,
         identified.warnings,
@@ -171,6 +175,8 @@ def is_plain(board: Board) -> bool:
 
 def _identified(image: NDArray[np.generic], board: Board, grids: list[Grid] | None) -> Identified:
     """Locate the board, by its markers if it has any."""
+    if any(isinstance(plane, CirclePlane) for plane in board.planes):
+        return locate_circles(board, image)
     if not is_plain(board):
         return locate(board, image)
     found = grids_in(image, board) if grids is None else grids
@@ -181,6 +187,13 @@ def _identified(image: NDArray[np.generic], board: Board, grids: list[Grid] | No
         if other:
             raise NoBoardError(other) from error
         raise
+
+
+def _measured(image: NDArray[np.generic], located: Located, points: Points, gamma: float | None) -> Measured:
+    """Measure the points of a located plane."""
+    if located.circles is not None and isinstance(located.plane, CirclePlane):
+        return measure_located(image, located.plane, located.circles)
+    return measure(image, located.grid, points, gamma, located.ink)
 
 
 def _named(located: Located, measured: Measured) -> Measured:

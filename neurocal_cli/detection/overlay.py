@@ -42,7 +42,10 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     plane (`plane_residuals`), enlarged by the factor in the title. A circle marks vertex (0, 0), from which
     the axes of the plane start; the outermost vertices carry their ids.
     """
-    residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
+    residuals = [
+        plane_residuals(measured, detection.image_size, located)
+        for located, measured in zip(detection.located, detection.measured, strict=True)
+    ]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
     square = min(one.grid.square for one in detection.located)
     typical = max(float(np.median(lengths)), 1e-9)
@@ -91,7 +94,7 @@ def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
     if (0, 0) in at:
         canvas.circle(at[0, 0], _WHITE)
     for key in sorted({min(at, key=lambda p: p[0] * a + p[1] * b) for a in (-1, 1) for b in (-1, 1)}):
-        canvas.text(at[key], f"{located.plane.prefix}{key[0]}:{key[1]}", _WHITE)
+        canvas.text(at[key], located.plane.label("", *key), _WHITE)
 
 
 class _Canvas:
@@ -152,15 +155,19 @@ def _put(picture: Picture, text: str, place: tuple[int, int], colour: Colour, si
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
-def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
+def plane_residuals(
+    measured: Measured, size: tuple[int, int] | None = None, located: Located | None = None
+) -> Array:
     """Residuals (N, 2) [px] of points from a smooth map of their plane, to show the noise without a camera.
 
     The plane is projected by a pinhole or an equidistant lens, whichever fits better; only by a pinhole if
     the size of the image is not given. A polynomial models the deviations of the real lens; its degree is
     five, or less for few points. Residuals are zero for fewer than five points, because a homography fits
-    four exactly.
+    four exactly. The plane that was `located` tells where its lines are, if not at equal distances.
     """
     grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
+    if located is not None:
+        grid = located.plane.spread(located.placement.apply(grid))
     H = cv2.findHomography(grid, measured.pixels, 0)[0] if len(grid) >= 5 else None
     if H is None:
         return np.zeros_like(measured.pixels)

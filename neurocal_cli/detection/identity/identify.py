@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.lattice import PlacedCircles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends, surrounded
 from neurocal_cli.detection.identity.placement import (
@@ -60,6 +61,7 @@ class Located:
     plane: Plane
     placement: Placement
     ink: Ink | None = None  # the markers on it
+    circles: PlacedCircles | None = None  # if it is a grid of these
 
 
 @frozen_dataclass(eq=False)

@@ -1,0 +1,185 @@
+"""Measure the centres of circles to the limit set by the pixel noise.
+
+The image of a circle's centre is not the centre of its ellipse: perspective moves it by up to a tenth of a
+pixel and more, lenses as well. So the outline is not fitted by an ellipse. A smooth map of the board gives
+the outline that a circle has at its place, and only its shift from there is measured, with a change of its
+radius, by all pixels around it. The shift is added to the map's image of the centre, which makes it that of
+the circle's centre in space. Then the map is fitted to the measured centres, and all is done again.
+
+With d the distance of a pixel from the outline, positive outside, n the normal there, and k its curvature,
+
+    I = A + B E((d - n . shift - growth + k sigma^2 / 2) / sigma)
+
+E is `edge_profile.profile`. The last term is what blur makes of a bent edge, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.lattice import PlacedCircles
+from neurocal_cli.detection.circles.outlines import CirclePixels, outline_pixels
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    BatchFit,
+    LevelPrior,
+    Linearised,
+    ProfileShape,
+    fit_batch,
+    rows_for,
+)
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, profile
+from neurocal_cli.detection.fitting.grid_edges import GridImage
+from neurocal_cli.detection.fitting.grid_fit import map_of_vertices
+from neurocal_cli.detection.fitting.initial_fit import is_reliable
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
+from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.grid import VERTEX, Grid, Measured
+from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.observations.board_kinds import CirclePlane
+
+_ROUNDS = 3
+_STEPS = 8  # Gauss-Newton steps
+_FIRST_BLUR = 1.2  # px
+_LOOSE = 0.3  # relative prior standard deviation of levels and blur
+_LEAST_SCALE = 0.1  # least ratio of the noise variance from the residuals to the first estimate
+
+
+def measure_circles(
+    image: NDArray[np.generic], plane: CirclePlane, circles: PlacedCircles, floor: float
+) -> Measured:
+    """Measure the centres of dark circles in a grey image; `floor` [DN^2] is the least noise of a pixel."""
+    light = np.asarray(image, dtype=np.float32)
+    places = plane.spread(circles.place.astype(float))
+    grid = _sparse(places, circles.centre)
+    raw = GridImage(light, grid, floor)
+    found = map_of_vertices(raw)
+    order = {tuple(one): k for k, one in enumerate(places.astype(int).tolist())}
+    places = raw.vertices
+    kept = np.array([order[tuple(one)] for one in places.astype(int).tolist()], dtype=np.intp)
+    radius = _radius(found.map, places, circles.area[kept])
+    apart = np.sqrt(2) if plane.asymmetric else 1.0
+    blur, shading = _FIRST_BLUR, None
+    for _ in range(_ROUNDS):
+        pixels = outline_pixels(light, found.map, places, radius, blur, apart, shading)
+        fit = _fitted(pixels, blur, floor)
+        centre = found.map.at(places) + fit.values[:, :2]
+        mapped, departure = _mapped(found, places, centre, fit)
+        good = is_reliable(fit, departure)
+        found = mapped
+        if not good.any():
+            break
+        blur = upper_median(fit.values[good, BLUR])
+        radius *= 1 + upper_median(fit.values[good, 2]) / _pixel_radius(found.map, places, radius)
+        shading = _shading(found.map, places, fit, good)
+    uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
+    spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None]
+    covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
+    index = circles.place[kept]
+    vertices = np.full((plane.rows, plane.cols, 2), np.nan)
+    vertices[index[good, 1], index[good, 0]] = centre[good]
+    return Measured(
+        kind=np.full(len(index), VERTEX, dtype=np.int64),
+        index=index,
+        pixels=centre,
+        covariance=covariance,
+        across=None,
+        vertices=vertices,
+        rejected=0,
+        polarity=0.0,
+    ).only(good)
+
+
+def _sparse(places: Array, centre: Array) -> Grid:
+    """A grid with a vertex at each whole place (N, 2), and nothing between them."""
+    x, y = places.astype(int).T
+    pixels = np.full((y.max() + 1, x.max() + 1, 2), np.nan)
+    pixels[y, x] = centre
+    return Grid(pixels, 0)
+
+
+def _radius(at: SmoothMap, places: Array, area: Array) -> float:
+    """Radius of the circles in the unit of the places, from the areas of their ellipses."""
+    return upper_median(np.sqrt(area / (np.pi * np.abs(np.linalg.det(_steps(at, places))))))
+
+
+def _steps(at: SmoothMap, places: Array) -> Array:
+    """(N, 2, 2) derivatives of the map: rows are the steps along x and along y [px]."""
+    step = 1e-3
+    shifts = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    seen = at.at(places[:, None] + shifts)
+    return np.asarray(np.stack([seen[:, 0] - seen[:, 1], seen[:, 2] - seen[:, 3]], axis=1) / (2 * step))
+
+
+def _pixel_radius(at: SmoothMap, places: Array, radius: float) -> float:
+    """Typical radius of the circles in the image [px]."""
+    return radius * upper_median(np.sqrt(np.abs(np.linalg.det(_steps(at, places)))))
+
+
+def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
+    """Fit all circles: shift (2,), growth, levels and blur."""
+    used = pixels.root > 0
+    values = np.where(used, pixels.value, np.nan)
+    with np.errstate(invalid="ignore"):
+        dark = np.nanmedian(np.where(pixels.d < -0.5 * blur, values, np.nan), axis=1)
+        light = np.nanmedian(np.where(pixels.d > 0.5 * blur, values, np.nan), axis=1)
+    usual = [float(np.nanmedian(one)) for one in (dark, light)]
+    dark, light = (
+        np.where(np.isfinite(one), one, other) for one, other in zip((dark, light), usual, strict=True)
+    )
+    mean, contrast = 0.5 * (dark + light), np.maximum(0.5 * (light - dark), 1e-3)
+    prior_mean = np.stack([mean, contrast, np.full(len(mean), blur)], axis=-1)
+    spread = np.stack([_LOOSE * contrast, _LOOSE * contrast, np.full(len(mean), _LOOSE * blur)], axis=-1)
+    prior = LevelPrior(prior_mean, (1 / spread**2)[:, :, None] * np.eye(3))
+    shape = ProfileShape(np.zeros((len(mean), 2)), np.zeros(RESPONSE_TERMS))
+    start = np.concatenate([np.zeros((len(mean), 3)), prior_mean], axis=1)
+    noise = max(floor, (0.02 * upper_median(contrast)) ** 2)
+    unit = replace(pixels, root=pixels.root / np.float32(np.sqrt(noise)))
+    fit = fit_batch(circle_model, unit, start, prior, shape, _STEPS)
+    return fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise))
+
+
+def circle_model(data: CirclePixels, values: Array, shape: ProfileShape) -> Linearised:
+    """Intensity around circles with given values, and its derivatives."""
+    along_u, along_v, growth, mean, contrast, sigma = values.T.astype(data.value.dtype)[:, :, None]
+    z = data.d - data.u * along_u - data.v * along_v - growth + data.bend * sigma**2
+    z /= sigma
+    x, slope, _ = profile(z, shape.tails)
+    gain = data.gain * data.root
+    rows = rows_for(len(z), 6, z.shape[1], x.dtype)
+    steep = slope * gain * (contrast / sigma)
+    rows[:, 0] = (data.value - mean) * data.root - contrast * x * gain
+    rows[:, 1] = -steep * data.u
+    rows[:, 2] = -steep * data.v
+    rows[:, 3] = -steep
+    rows[:, 4] = data.root
+    rows[:, 5] = x * gain
+    rows[:, 6] = -steep * (z - 2 * data.bend * sigma)
+    return Linearised(rows, z, x)
+
+
+def _mapped(found: MapFit, places: Array, centre: Array, fit: BatchFit) -> tuple[MapFit, Array]:
+    """The map through measured centres, and their departures from it in standard deviations."""
+    n = len(places)
+    variance = np.concatenate([np.maximum(fit.covariance[:, k, k], 1e-12) for k in (0, 1)])
+    points = replace(Observations.of_points(places, centre, 1.0), variance=variance)
+    mapped = select_map(found.map, points, np.zeros(0))
+    expected = variance + np.concatenate(
+        [mapped.map.variance(places, np.tile(axis, (n, 1))) for axis in np.eye(2)]
+    )
+    departure = np.abs(mapped.residual) / np.sqrt(expected * mapped.excess)
+    return mapped, departure.reshape(2, n).max(axis=0)
+
+
+def _shading(at: SmoothMap, places: Array, fit: BatchFit, good: NDArray[np.bool_]) -> Shading:
+    """Levels over the image by those of the circles."""
+    place = at.at(places[good])
+    mean, contrast = fit.values[good, 3], fit.values[good, 4]
+    variance = fit.covariance[good, 3, 3] + fit.covariance[good, 4, 4]
+    dark, light = (Levels(place, mean + sign * contrast, variance) for sign in (-1, 1))
+    return fit_shading(at.frame, dark, light)

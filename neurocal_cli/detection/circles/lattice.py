@@ -1,0 +1,230 @@
+"""Find which circle of the board each ellipse is.
+
+The centres of both kinds of grids form a lattice; those of an asymmetric one stand on their corners. From a
+start in the middle, neighbours are added where those before them predict them. The lattice then is compared
+with the board in all ways that keep its handedness. Perspective may make other vectors shorter than those of
+the rows, so the basis may be sheared.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.blobs import Blobs
+from neurocal_cli.detection.identity.placement import SYMMETRIC_BOARD, NoBoardError
+from neurocal_cli.observations.board_kinds import CirclePlane
+
+_ALIKE = 2.2  # greatest ratio of the areas of neighbours
+_NEAR = 0.3  # of the shorter step; distance between prediction and circle
+_GROWTH = 1.5  # greatest ratio of two steps
+_SLANT = 0.35  # least sine of the angle between the steps at the start
+_STARTS = 30  # blobs that are tried as a start
+_FEWEST = 9  # circles
+_LEAST_SHARE = 0.35  # of the circles of a board
+# Bases of the lattice: matrices of determinant 1 with small entries.
+_BASES = tuple(
+    np.array(entries).reshape(2, 2)
+    for entries in product((-2, -1, 0, 1, 2), repeat=4)
+    if entries[0] * entries[3] - entries[1] * entries[2] == 1 and sum(map(abs, entries)) <= 4
+)
+
+
+@frozen_dataclass(eq=False)
+class PlacedCircles:
+    """N circles of a board in an image."""
+
+    place: NDArray[np.int64]  # (N, 2) (c, r)
+    centre: Array  # (N, 2) [px] of the ellipse
+    area: Array  # (N,) [px^2]
+    warnings: tuple[str, ...] = ()
+    light: bool = False  # whether they are light on dark
+
+
+def place_circles(plane: CirclePlane, blobs: Blobs) -> PlacedCircles | None:
+    """The largest lattice of ellipses, placed on the board; None if there is none that may be the board.
+
+    Raises NoBoardError if a part of the board is seen that may be several parts.
+    """
+    count = plane.cols * plane.rows
+    best = _largest(blobs, count)
+    if len(best) < max(min(_FEWEST, count), _LEAST_SHARE * count):
+        return None
+    at = np.array(list(best.values()), dtype=np.int64)
+    index = np.array(list(best.keys()), dtype=np.int64)
+    return _placed(plane, blobs, index, at)
+
+
+def _largest(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
+    """The largest lattice that grows from a start: the blob of each place."""
+    best: dict[tuple[int, int], int] = {}
+    if len(blobs) < 4:
+        return best
+    centre = blobs.centre
+    away = np.hypot(*(centre[:, None] - centre[None]).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    # Starts far from each other: every n-th blob along the image.
+    order = np.lexsort((centre[:, 0], np.round(centre[:, 1] / 50)))
+    step = max(1, len(order) // _STARTS)
+    tried: set[int] = set()
+    for start in order[::step].tolist():
+        if start in tried:
+            continue
+        grown = _grown(blobs, away, start)
+        tried.update(grown.values())
+        if len(grown) > len(best):
+            best = grown
+        if len(best) >= enough:
+            break
+    return best
+
+
+def _grown(blobs: Blobs, away: Array, start: int) -> dict[tuple[int, int], int]:
+    """The lattice around a blob."""
+    steps = _steps(blobs, away, start)
+    if steps is None:
+        return {}
+    place = {(0, 0): start}
+    used = {start}
+    local = {(0, 0): steps}
+    queue = deque([(0, 0)])
+    while queue:
+        i, j = queue.popleft()
+        here, (a, b) = blobs.centre[place[i, j]], local[i, j]
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            new = i + di, j + dj
+            if new in place:
+                continue
+            step = di * a + dj * b
+            off = np.hypot(*(blobs.centre - here - step).T)
+            k = int(off.argmin())
+            ratio = blobs.area[k] / blobs.area[place[i, j]]
+            if (
+                k in used
+                or off[k] > _NEAR * min(np.hypot(*a), np.hypot(*b))
+                or not 1 / _ALIKE < ratio < _ALIKE
+            ):
+                continue
+            place[new] = k
+            used.add(k)
+            local[new] = _local_steps(blobs, place, new, (a, b))
+            queue.append(new)
+    return place
+
+
+def _local_steps(
+    blobs: Blobs, place: dict[tuple[int, int], int], at: tuple[int, int], usual: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The steps at a place by its neighbours, and by those of the place before it where there are none."""
+    steps = []
+    here = blobs.centre[place[at]]
+    for axis, step in enumerate(usual):
+        unit = np.eye(2, dtype=int)[axis]
+        seen = {k: place.get((at[0] + k * unit[0], at[1] + k * unit[1])) for k in (-2, -1, 1, 2)}
+        ways = []
+        for sign in (1, -1):
+            one, two = seen[sign], seen[2 * sign]
+            if one is None:
+                continue
+            way = sign * (blobs.centre[one] - here)
+            if two is not None and seen[-sign] is None:
+                # Perspective goes on shortening or lengthening the steps.
+                before = np.hypot(*(blobs.centre[two] - blobs.centre[one]))
+                way = way * np.clip(np.hypot(*way) / max(before, 1e-9), 1 / _GROWTH, _GROWTH)
+            ways.append(way)
+        steps.append(np.mean(ways, axis=0) if ways else step)
+    return steps[0], steps[1]
+
+
+def _steps(blobs: Blobs, away: Array, start: int) -> tuple[Array, Array] | None:
+    """The steps from a blob to two neighbours, of which the opposite ones are there too."""
+    near = np.argsort(away[start])[:12]
+    near = near[np.isfinite(away[start, near])]
+    ratio = blobs.area[near] / blobs.area[start]
+    near = near[(ratio < _ALIKE) & (ratio > 1 / _ALIKE)]
+    vectors = blobs.centre[near] - blobs.centre[start]
+    first: Array | None = None
+    for vector in vectors:
+        length = np.hypot(*vector)
+        if np.hypot(*(vectors + vector).T).min(initial=np.inf) > _NEAR * length:
+            continue
+        if first is None:
+            first = vector
+            continue
+        cross = first[0] * vector[1] - first[1] * vector[0]
+        if abs(cross) > _SLANT * length * np.hypot(*first):
+            return (first, vector) if cross > 0 else (first, -vector)
+    return None
+
+
+def _placed(
+    plane: CirclePlane, blobs: Blobs, index: NDArray[np.int64], at: NDArray[np.intp]
+) -> PlacedCircles:
+    """Compare a lattice with the board in all bases and places."""
+    board = _lattice_of(plane)
+    found: list[tuple[NDArray[np.int64], Array]] = []
+    for basis in _BASES:
+        turned = index @ basis.T
+        found += [(turned + shift, basis) for shift in _shifts(turned, board)]
+    if not found:
+        size = index.max(axis=0) - index.min(axis=0) + 1
+        raise NoBoardError(
+            f"the image shows {len(index)} circles in {size[0]} x {size[1]} rows, no part of a board "
+            f"of {plane.cols} x {plane.rows} circles; correct its description"
+        )
+    names = [np.array([board[tuple(one)] for one in places.tolist()]) for places, _ in found]
+    if len(found) == 1:
+        return PlacedCircles(names[0], blobs.centre[at], blobs.area[at])
+    # Those of a board that looks the same after a turn contain the same places, turned about its middle.
+    whole = len(index) == plane.cols * plane.rows
+    turns = {tuple(map(tuple, np.unique(one, axis=0))) for one in names}
+    if not whole and len(turns) > 1 and not _are_turns(plane, names):
+        raise NoBoardError(
+            f"the image shows {len(index)} circles, which may be several parts of the board; show all of it"
+        )
+    chosen = max(range(len(found)), key=lambda k: _rightwards(names[k], blobs.centre[at]))
+    return PlacedCircles(names[chosen], blobs.centre[at], blobs.area[at], (SYMMETRIC_BOARD,))
+
+
+def _lattice_of(plane: CirclePlane) -> dict[tuple[int, int], tuple[int, int]]:
+    """The circles (c, r) of a board by their places in its lattice."""
+    circles = list(product(range(plane.cols), range(plane.rows)))
+    if not plane.asymmetric:
+        return {(c, r): (c, r) for c, r in circles}
+    places = {(c, r): (2 * c + r % 2, r) for c, r in circles}
+    return {((x + y) // 2, (y - x) // 2): key for key, (x, y) in places.items()}
+
+
+def _shifts(
+    index: NDArray[np.int64], board: dict[tuple[int, int], tuple[int, int]]
+) -> list[NDArray[np.int64]]:
+    """Shifts with which all places of a lattice are places of the board."""
+    places = np.array(list(board), dtype=np.int64)
+    known = set(board)
+    first = index[0]
+    return [
+        place - first
+        for place in places
+        if all(tuple(one) in known for one in (index + (place - first)).tolist())
+    ]
+
+
+def _are_turns(plane: CirclePlane, names: list[NDArray[np.int64]]) -> bool:
+    """Whether placements differ by turns of the whole board about its middle only."""
+    places = [plane.spread(one.astype(float)) for one in names]
+    every = plane.spread(plane.midpoint_grid())
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    radius = np.hypot(*(places[0] - middle).T)
+    return all(np.allclose(np.hypot(*(one - middle).T), radius) for one in places[1:])
+
+
+def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
+    """How much the board's x axis points to the right, and else down."""
+    known = np.column_stack([place, np.ones(len(place))])
+    axis = np.linalg.lstsq(known, centre, rcond=None)[0][0]
+    return float((axis[0] + 1e-3 * axis[1]) / np.hypot(*axis))

@@ -1,0 +1,146 @@
+"""Grids of circles: found, placed, and measured at the images of their centres."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.marked import errors_of, marked_scene, plane_of, taken
+from support.occluders import Disc
+from support.picture_bound import edge_bound
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.blobs import Blobs
+from neurocal_cli.detection.circles.lattice import place_circles
+from neurocal_cli.detection.detect import Detection, detect_points
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import Board
+from neurocal_cli.observations.board_kinds import CirclePlane
+from neurocal_cli.simulation.rendering import Illumination, Rendered
+
+ASYMMETRIC = "asymmetric_circles:4x7:20:16"
+SYMMETRIC = "circles:5x4:20:12"
+
+
+def turned(found: Detection, plane: CirclePlane) -> Detection:
+    """The same points with the ids of the board after half a turn."""
+    places = [[int(part) for part in name.split(":")] for name in found.ids]
+    return replace(found, ids=tuple(f"{plane.cols - 1 - c}:{plane.rows - 1 - r}" for c, r in places))
+
+
+def errors(found: Detection, picture: Rendered) -> tuple[Array, Array]:
+    """Errors [px] and their squares over the covariance, whichever way a symmetric board is called."""
+    plane = picture.truth.planes[0].plane
+    assert isinstance(plane, CirclePlane)
+    every = [errors_of(one, picture) for one in (found, turned(found, plane))]
+    return min(every, key=lambda one: float(np.abs(one[0]).max(initial=np.inf)))
+
+
+def circle_bound(noise: float, sigma: float, radius: float) -> float:
+    """Bound on each coordinate of a circle's centre: half of its outline is across either axis."""
+    return edge_bound(np.sqrt(noise**2 + 1 / 12), 196.0, sigma, np.pi * radius)
+
+
+@pytest.mark.parametrize(("form", "tilt"), [(ASYMMETRIC, 30.0), (ASYMMETRIC, 60.0), (SYMMETRIC, 30.0)])
+def test_centres_are_measured_to_the_bound_without_the_bias_of_ellipses(form: str, tilt: float) -> None:
+    square = 22.0 if form == ASYMMETRIC else 40.0
+    scene = marked_scene(plane_of(form), 1, square=square, tilt=tilt)
+    picture = taken(scene, 1)
+    found = detect_points(picture.image, scene.board)
+    error, squared = errors(found, picture)
+    plane = scene.targets[0].plane
+    assert isinstance(plane, CirclePlane)
+    assert len(error) == len(found.ids) == plane.cols * plane.rows
+    radius = 0.5 * plane.diameter / plane.square * square * np.sqrt(np.cos(np.radians(tilt)))
+    assert np.sqrt((error**2).mean()) < 1.4 * circle_bound(2.0, scene.sigma_t, radius)
+    assert np.hypot(*error.mean(axis=0)) < 0.002
+    assert 0.6 < squared.mean() < 1.5
+    assert bool(found.warnings) == (form == SYMMETRIC)
+
+
+def test_light_circles_on_dark_are_found_too() -> None:
+    scene = marked_scene(plane_of(ASYMMETRIC), 2, square=22.0)
+    picture = taken(scene, 2)
+    found = detect_points(255 - picture.image, scene.board)
+    error, _ = errors_of(found, picture)
+    assert len(error) == 28
+    assert np.abs(error).max() < 0.03
+
+
+def test_a_hidden_circle_is_left_out() -> None:
+    scene = marked_scene(plane_of(ASYMMETRIC), 3, square=22.0)
+    (u, v) = taken(scene, 3).truth.planes[0].vertices[3, 1]
+    hidden = replace(scene, occluders=(Disc((u, v + 4.0), 7.0, 0.6),))
+    picture = taken(hidden, 3)
+    found = detect_points(picture.image, hidden.board)
+    error, _ = errors_of(found, picture)
+    assert "1:3" not in found.ids
+    assert len(error) >= 26
+    assert np.abs(error).max() < 0.03
+
+
+def test_another_number_of_circles_is_no_board() -> None:
+    scene = marked_scene(plane_of(ASYMMETRIC), 2, square=22.0)
+    image = taken(scene, 2).image
+    with pytest.raises(NoBoardError, match="no part of a board of 3 x 7 circles"):
+        detect_points(image, Board((plane_of("asymmetric_circles:3x7:20:16"),)))
+    with pytest.raises(NoBoardError, match="several parts of the board; show all of it"):
+        detect_points(image, Board((plane_of("asymmetric_circles:5x9:20:16"),)))
+
+
+def test_circles_of_a_board_have_a_file_of_their_own() -> None:
+    planes = (replace(plane_of(SYMMETRIC), name="a"), replace(plane_of(ASYMMETRIC), name="b"))
+    with pytest.raises(InputError, match="one plane"):
+        detect_points(np.zeros((100, 100), np.uint8), Board(planes))
+
+
+def test_strong_perspective_does_not_change_which_circle_is_which() -> None:
+    plane = CirclePlane("", 4, 11, 20.0, diameter=12.0, asymmetric=True)
+    ids, world = plane.midpoints()
+    H = np.array([[3.0, 2.0, 300], [-1.0, 1.2, 200], [2e-3, -1e-3, 1]])
+    mapped = np.column_stack([world[:, :2], np.ones(len(world))]) @ H.T
+    centre = mapped[:, :2] / mapped[:, 2:]
+    blobs = Blobs(centre, 2e4 / mapped[:, 2] ** 3)
+    placed = place_circles(plane, blobs)
+    assert placed is not None
+    names = {f"{c}:{r}": one for (c, r), one in zip(placed.place.tolist(), placed.centre, strict=True)}
+    assert len(names) == 44
+    for name, one in zip(ids, centre, strict=True):
+        np.testing.assert_array_equal(names[name], one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("form", "square"), [("asymmetric_circles:4x11:20:16", 28.0), ("circles:7x6:20:12", 52.0)]
+)
+@pytest.mark.parametrize(
+    "condition",
+    [
+        {},
+        {"noise": 8.0},
+        {"psf": 2.0},
+        {"tilt": 60.0},
+        {"k1": -0.3},
+        {"illumination": Illumination(0.6, (0.8, 0.5))},
+    ],
+)
+def test_errors_over_the_bound(form: str, square: float, condition: dict[str, float]) -> None:
+    plane = plane_of(form)
+    assert isinstance(plane, CirclePlane)
+    every, normal, bounds = [], [], []
+    for seed in range(4):
+        scene = marked_scene(plane, seed, square=square, size=(640, 480), **condition)  # type: ignore[arg-type]
+        picture = taken(scene, seed, 8)
+        error, squared = errors(detect_points(picture.image, scene.board), picture)
+        assert len(error) == picture.truth.planes[0].vertices_visible.sum()
+        every.append(error)
+        normal.append(squared)
+        tilt = np.radians(condition.get("tilt", 30.0))
+        radius = 0.5 * plane.diameter / plane.square * square * np.sqrt(np.cos(tilt))
+        bounds.append(circle_bound(scene.sensor.read_noise, scene.sigma_t, radius))
+    light = 0.6 if "illumination" in condition else 1.0
+    rms = np.sqrt((np.concatenate(every) ** 2).mean())
+    assert rms < 1.25 / light * np.mean(bounds)
+    assert 0.8 < np.concatenate(normal).mean() < 1.3
