@@ -123,6 +123,9 @@ def detect(
     are not given. Vertices and mid-points are measured as on chessboards; on tags they are their corners
     TAG:0 to TAG:3 and the mid-points of their edges TAG:e0 to TAG:e3.
 
+    Of a grid of circles, the images of the circles' centres are measured, which are not the centres of the
+    ellipses. Some circles may be hidden, but the board's ends must be seen. --points does not matter there.
+
     A point has the same id in all images. Vertex 0:0 is the corner where OpenCV's
     findChessboardCorners begins; the inner square there is dark. If the numbers of columns and rows
     are both even or both odd, the board looks the same after a turn of 180 degrees, and a warning

@@ -72,11 +72,13 @@ def measure_circles(
         mapped, departure = _mapped(found, places, centre, fit)
         good = is_reliable(fit, departure)
         found = mapped
-        if not good.any():
+        # The first blur may be far from the true one, which is_reliable does not allow.
+        some = good if good.any() else fit.step < 1
+        if not some.any():
             break
-        blur = upper_median(fit.values[good, BLUR])
-        radius *= 1 + upper_median(fit.values[good, 2]) / _pixel_radius(found.map, places, radius)
-        shading = _shading(found.map, places, fit, good)
+        blur = upper_median(fit.values[some, BLUR])
+        radius *= 1 + upper_median(fit.values[some, 2]) / _pixel_radius(found.map, places, radius)
+        shading = _shading(found.map, places, fit, some)
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
     spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None]
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)

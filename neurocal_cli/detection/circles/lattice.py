@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.blobs import Blobs
-from neurocal_cli.detection.identity.placement import SYMMETRIC_BOARD, NoBoardError
+from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 _ALIKE = 2.2  # greatest ratio of the areas of neighbours
@@ -27,6 +27,10 @@ _SLANT = 0.35  # least sine of the angle between the steps at the start
 _STARTS = 30  # blobs that are tried as a start
 _FEWEST = 9  # circles
 _LEAST_SHARE = 0.35  # of the circles of a board
+_SYMMETRIC = (
+    "the grid of circles looks the same after a turn, so its first circle depends on its orientation in the "
+    "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
+)
 # Bases of the lattice: matrices of determinant 1 with small entries.
 _BASES = tuple(
     np.array(entries).reshape(2, 2)
@@ -188,7 +192,7 @@ def _placed(
             f"the image shows {len(index)} circles, which may be several parts of the board; show all of it"
         )
     chosen = max(range(len(found)), key=lambda k: _rightwards(names[k], blobs.centre[at]))
-    return PlacedCircles(names[chosen], blobs.centre[at], blobs.area[at], (SYMMETRIC_BOARD,))
+    return PlacedCircles(names[chosen], blobs.centre[at], blobs.area[at], (_SYMMETRIC,))
 
 
 def _lattice_of(plane: CirclePlane) -> dict[tuple[int, int], tuple[int, int]]:
