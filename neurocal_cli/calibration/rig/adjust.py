@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.adjust import FLOOR, OPTIONS
+from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.common_noise import weighed
 from neurocal_cli.adjustment.levenberg_marquardt import minimise
 from neurocal_cli.adjustment.normal_equations import ROUNDING, Arrowhead, SharedAndOwn, solve_scaled
@@ -54,6 +55,7 @@ _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is n
 # test_without_noise_the_truth_comes_back checks such data.
 _LEAST_SHARE = 1e-3
 _LEAST_NOISE = 1e-12
+_LEVEL = 3.09  # standard deviations of a normal variable, exceeded by chance once in 1000
 
 Frames = Sequence[NDArray[np.intp]]
 """Of each camera, the frame (V_c,) of each of its views; views of one moment have one frame."""
@@ -561,6 +563,17 @@ def scatter(fit: RigFit) -> tuple[float, int]:
     views = sum(len(observed.view) for observed in problem.observations)
     degrees = 6 * (views - len(problem.scale)) - problem.n_rig
     return max(fit.cost - alone, 0.0), max(degrees, 0)
+
+
+def is_significant(squares: float, degrees: int) -> bool:
+    """Whether a sum of squares is larger than by chance: a chi-squared test at the level of 0.001.
+
+    Examples
+    --------
+    >>> is_significant(70.0, 54), is_significant(100.0, 54)
+    (False, True)
+    """
+    return degrees > 0 and bool(squares / degrees > exceeded_by_chance(degrees, _LEVEL))
 
 
 def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) -> RigFit:

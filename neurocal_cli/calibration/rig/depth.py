@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.calibration.rig.adjust import RigFit, RigState, scatter
-from neurocal_cli.calibration.rig.contradiction import is_significant
+from neurocal_cli.calibration.rig.adjust import RigFit, RigState, is_significant, scatter
 from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points
 from neurocal_cli.calibration.rig.triangulation import triangulate

@@ -25,8 +25,8 @@ from neurocal_cli.calibration.rig.consensus import (
     find_consensus,
     with_shifted,
 )
-from neurocal_cli.calibration.rig.contradiction import MEDIAN, SUSPECT, contradiction
 from neurocal_cli.calibration.rig.frames import groups
+from neurocal_cli.calibration.rig.odd_pairs import MEDIAN, SUSPECT, odd_pairs
 from neurocal_cli.calibration.rig.relative_poses import relative_poses
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -104,7 +104,7 @@ def _edge(problem: RigProblem, pair: Pair) -> Edge:
         faults = {one: why for one, why in faults.items() if why != UNSYNCHRONISED}
         used = np.array([name not in faults for name in poses.names])
         if used.any():
-            odd = zip(poses.names, contradiction(poses, used).odd, strict=True)
+            odd = zip(poses.names, odd_pairs(poses, used), strict=True)
             faults |= {one: UNSYNCHRONISED for one, is_odd in odd if is_odd}
     return Edge(pair, two, consensus, faults)
 
@@ -273,13 +273,12 @@ def at_fit(problem: RigProblem, fit: RigFit) -> RigFit:
     return adjust_rig(problem, state, np.zeros(state.columns.n_shared, dtype=bool))
 
 
-def fitting(problem: RigProblem, fit: RigFit) -> list[NDArray[np.bool_]]:
-    """Which views of each camera, (V_c,), fit the rig of a fit after all, with the frames' poses refined.
+def fitting(still: RigFit) -> list[NDArray[np.bool_]]:
+    """Which views of each camera, (V_c,), fit the rig after all, by the result of `at_fit`.
 
-    `problem` has frames with views that the fit left out. The linearised pose of a view of few points may
-    seem far off, although the points fit the rig.
+    The linearised pose of a view of few points may seem far off, although the points fit the rig.
     """
-    state = at_fit(problem, fit).state
+    problem, state = still.problem, still.state
     more, views = np.zeros(len(problem.scale)), np.zeros(len(problem.scale))
     for side, observed in enumerate(problem.observations):
         cost = observed.weight * squared_errors(observed.batches, problem.camera(state, side))

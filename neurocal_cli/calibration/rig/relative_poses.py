@@ -49,19 +49,10 @@ class RelativePoses:
     pairs: Quadratics  # the cost of the common fit beyond that of the cameras alone, P groups
     frame: NDArray[np.intp]  # (P,) of each pair
     rig: NDArray[np.intp]  # (6,) columns of the rig's step
-    # Columns of alpha_u and alpha_v of each camera, or of the one for both; none if one is given.
-    focal: tuple[NDArray[np.intp], NDArray[np.intp]]
-    reference: Array  # (3,) translation of the reference [`unit`]
     offset: Array  # (P, 6) z
     design: Array  # (P, 6, F) of z by the unknowns
     covariance: Array  # (P, 6, 6) C
-    size: Array  # (P,) of each target [world unit]
-    centre: Array  # (P, 3) of each target, in the left camera's directions turned by the rig
-    # (P, 2, 6) steps of the relative pose if the right image showed the next, or the previous, pair's pose;
-    # nan at the ends.
-    motion: Array
     n_equations: Array  # (P,) of both views of each pair
-    spare: float  # equations of both cameras alone less their unknowns
 
     @property
     def unit(self) -> float:
@@ -130,16 +121,10 @@ def relative_poses(problem: RigProblem, reference: Pose) -> RelativePoses | None
         pairs=pairs,
         frame=frame,
         rig=rig,
-        focal=(places[0][sides[0].focal], places[1][sides[1].focal]),
-        reference=reference.t / problem.unit,
         offset=offset,
         design=design,
         covariance=covariance,
-        size=size,
-        centre=centre * scale[:, None],
-        motion=_motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
         n_equations=counts[0][first] + counts[1][second],
-        spare=sum(side.spare for side in sides),
     )
 
 
@@ -162,10 +147,6 @@ class _Alone:
         times = np.where(larger > _MUCH_LARGER, larger, 1.0)[:, None, None]
         self.covariance = np.asarray(times * variance * own, dtype=float)
         self.quadratics = Quadratics(S / variance, g / variance, cost / variance)
-        alphas = (0,) if problem.cameras[side].square else (0, 2)
-        self.focal = np.flatnonzero(np.isin(np.flatnonzero(free), alphas))
-        if len(self.focal) < len(alphas):
-            self.focal = self.focal[:0]
         self.determined = bool(np.isfinite(solved).all() and np.isfinite(camera).all())
 
 
@@ -185,18 +166,6 @@ def _both(
 
 def _transformed(J: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
-
-
-def _motion(R: Array, t: Array, scale: Array, of_right: Array) -> Array:
-    """Steps of the relative pose from each pair's pose in the right camera to its neighbours' poses."""
-    motion = np.full((len(R), 2, 6), np.nan)
-    for k, neighbour in enumerate((1, -1)):
-        here = np.arange(len(R) - 1) + (neighbour < 0)
-        there = here + neighbour
-        turn = rotation_vector(R[there] @ np.swapaxes(R[here], 1, 2))
-        step = np.concatenate([turn, (t[there] - t[here]) / scale[here, None]], axis=1)
-        motion[here, k] = (of_right[here] @ step[..., None])[..., 0]
-    return motion
 
 
 def in_order(pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.normal_equations import Arrowhead, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, camera_columns, normal_blocks
-from neurocal_cli.calibration.rig.adjust import Motion, RigFit, RigProblem, scatter
-from neurocal_cli.calibration.rig.contradiction import is_significant
+from neurocal_cli.calibration.rig.adjust import Motion, RigFit, RigProblem, is_significant, scatter
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.verdict.findings import Limit, in_sequence
 from neurocal_cli.calibration.verdict.rival import LEVEL
@@ -230,19 +229,24 @@ def log_evidence(before: float, after: float, degrees: int, m: int) -> float:
 
 
 def named_cause(
-    fit: RigFit, names: Sequence[str], causes: Sequence[RigCause] = ()
+    fit: RigFit,
+    names: Sequence[str],
+    causes: Sequence[RigCause] = CAUSES,
+    free: NDArray[np.bool_] | None = None,
 ) -> tuple[Named | None, float]:
     """The cause with the largest evidence, if it is beyond doubt, and the rms left over that of noise.
 
-    By default all causes compete. With some of them, the cameras and the rig stay as they are.
+    `free` (n_shared,) are the shared unknowns that may move with a cause, by default all that the points
+    determine, also of cameras that the fit did not refine.
     """
+    free = fit.problem.estimated_shared if free is None else free
     squares, degrees = scatter(fit)
     if not degrees:
         return None, 0.0
     rest = float(np.sqrt(squares / degrees))
     if not is_significant(squares, degrees):
         return None, rest
-    found = list(_ranked(fit, names, squares, degrees, causes))
+    found = list(_ranked(fit, names, squares, degrees, causes, np.flatnonzero(free)))
     best = max(found, key=lambda one: one.evidence, default=None)
     least = _EXPLAINED if fit.problem.motion is None else _OF_MOTION
     if best is None or best.evidence < LEVEL or best.explained < least:
@@ -251,11 +255,14 @@ def named_cause(
 
 
 def _ranked(
-    fit: RigFit, names: Sequence[str], squares: float, degrees: int, causes: Sequence[RigCause]
+    fit: RigFit,
+    names: Sequence[str],
+    squares: float,
+    degrees: int,
+    causes: Sequence[RigCause],
+    free: NDArray[np.intp],
 ) -> Iterator[Named]:
     problem, motion = fit.problem, motion_of(fit.problem, fit.state, None)
-    # Cameras that the fit did not refine may still move with a cause.
-    free = np.flatnonzero(problem.estimated_shared & (not causes))
     arrow = fit.normal.only(free)
     reduced, _ = arrow.reduced()
     S, g = reduced[:-1, :-1], reduced[:-1, -1]
@@ -264,7 +271,7 @@ def _ranked(
     squares = max(squares - float(g @ step), 0.0)
     sides = range(len(names))
     seen = [_of_camera(fit, side, free) for side in sides]
-    for cause in causes or CAUSES:
+    for cause in causes:
         for subject in _subjects(cause, len(names)):
             members = sides if subject < 0 else (subject,)
             Z = [cause.steps(fit, side, motion) for side in members]
@@ -272,12 +279,7 @@ def _ranked(
                 continue
             frames, labels = _frames_of(problem, members)
             A, X, r = _along(arrow, frames, [seen[side] for side in members], Z)
-            if cause.is_change:
-                A, X, r = (
-                    _from_each(part)[_LEAST_FRAMES : len(frames) - _LEAST_FRAMES + 1] for part in (A, X, r)
-                )
-            else:
-                A, X, r = (part.sum(axis=0, keepdims=True) for part in (A, X, r))
+            A, X, r = (_sums(part, cause.is_change, not len(free)) for part in (A, X, r))
             if not len(A):
                 continue
             left = A - X @ inverse @ np.swapaxes(X, 1, 2)
@@ -288,7 +290,9 @@ def _ranked(
             gain = float(min(gains[k], squares))
             choices = len(gains) * (1 if cause.of_all else len(names))
             evidence = log_evidence(squares, squares - gain, degrees, m) - np.log(choices)
-            at = k + _LEAST_FRAMES if cause.is_change else 0
+            places = max(len(frames) - 2 * _LEAST_FRAMES + 1, 0)
+            at = k % places + _LEAST_FRAMES if cause.is_change else 0
+            found = values[k] if k < places or not cause.is_change else -values[k]
             is_late = 2 * at > len(frames)
             smaller = np.zeros(len(problem.scale), dtype=bool)
             smaller[frames[at:] if is_late else frames[:at]] = True
@@ -308,7 +312,7 @@ def _ranked(
                 subject,
                 float(evidence),
                 float(explained),
-                values[k],
+                found,
                 *ends,
                 size,
                 is_late,
@@ -344,9 +348,16 @@ def _frames_of(problem: RigProblem, members: Sequence[int]) -> tuple[NDArray[np.
     return np.array(places, dtype=np.intp)[order], labels
 
 
-def _from_each(values: Array) -> Array:
-    """Sums from each place on."""
-    return np.asarray(np.cumsum(values[::-1], axis=0)[::-1])
+def _sums(of_frames: Array, is_change: bool, either: bool) -> Array:
+    """Sums over all frames (1, ...), or over those from each place of a change on.
+
+    If the rig stays as it is, `either` part may be that which changed: then those before each place as well.
+    """
+    total = of_frames.sum(axis=0, keepdims=True)
+    if not is_change:
+        return np.asarray(total)
+    after = np.cumsum(of_frames[::-1], axis=0)[::-1][_LEAST_FRAMES : len(of_frames) - _LEAST_FRAMES + 1]
+    return np.concatenate([after, total - after]) if either else np.asarray(after)
 
 
 @frozen_dataclass(eq=False)
