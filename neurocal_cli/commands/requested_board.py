@@ -110,8 +110,12 @@ def check_size(outcomes: Collection[Outcome], board: Board) -> None:
 
 def another_size(shown: Sequence[Size | None], board: Board) -> Size | None:
     """Another size than that of a board of one plane, if most images show it; often squares were counted."""
+    from neurocal_cli.files.board_kinds import kind_of
+
     (size, count), *_ = Counter(shown).most_common(1)
     plane = board.planes[0]
+    if kind_of(plane) != "chessboard":
+        return None  # its parts are told apart by the markers, or it is of circles
     given = size == (plane.cols, plane.rows)
     if given or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
         return None

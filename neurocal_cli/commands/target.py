@@ -14,10 +14,17 @@ from neurocal_cli.errors import InputError
 @options.argument(
     "camera", "CAMERA.yaml", "A calibration that `neurocal calibrate` wrote; - is standard input."
 )
+@options.path(
+    "--board",
+    "BOARD.yaml",
+    "The board that was detected, in a file or in short as for detect. Only a chessboard without markers is "
+    "told from the points.",
+    to="file",
+)
 @plot_option("the heights of the board's points and their shifts")
 @options.summary
 @options.output("BOARD.yaml", "Write the board to this file.")
-def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
+def target(camera: str, file: str | None, plot: str | None, as_json: bool, output: str) -> None:
     """Write the board with its estimated shape.
 
     No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
@@ -33,13 +40,14 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
       neurocal calibrate sample_data/bent.csv -o camera.yaml
       neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
+      neurocal target camera.yaml --board chessboard:9x6:25 -o again.yaml
     """  # noqa: D301 - as in the group
     check_plot(plot, output)
     preparation.check_summary(as_json, output)
-    preparation.check_outputs((output, plot), (camera,))
+    preparation.check_outputs((output, plot), (camera, file))
 
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
-    from neurocal_cli.files.board_yaml import write_board
+    from neurocal_cli.files.board_yaml import read_board, write_board
     from neurocal_cli.files.calibration_tree import read_calibration
     from neurocal_cli.observations.target import board_of
 
@@ -53,7 +61,14 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
         from neurocal_cli.commands.show.camera_panels import draw_target
 
         write_plot(plot, draw_target, calibration.target, calibration.unit)
-    board = board_of(calibration.target, calibration.unit, calibration.points.distances)
+    known = calibration.target, calibration.unit, calibration.points.distances
+    if file is None:
+        board = board_of(*known)
+    else:
+        from neurocal_cli.files.board_kinds import short_board
+        from neurocal_cli.observations.found_planes import with_found_points
+
+        board = with_found_points(short_board(file, calibration.unit) or read_board(file), *known)
     write_board(board, output)
     if as_json:
         print_summary(target_json(calibration.target, calibration.unit) or {})

@@ -28,6 +28,7 @@ from neurocal_cli.observations.points import Correspondences
 TargetChoice = Literal["auto", "given", "flat", "free"]
 TARGETS = get_args(TargetChoice)
 
+_OFF = 0.2  # squares; greatest distance of given points from a chessboard's places
 _DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
 N_SHAPES = 3
 """Number of shapes that a bend has."""
@@ -190,7 +191,7 @@ class Target:
 def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
     """Convert a target that is a chessboard to a `Board` with its estimated points and measured distances.
 
-    Raises InputError if the points have no ids of a chessboard.
+    Raises InputError if the points have no ids of a chessboard, or lie elsewhere than these say.
     """
     if target.point is None:
         raise InputError(
@@ -210,6 +211,8 @@ def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> P
     unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
     sides = np.linalg.norm(unknowns[1:], axis=1)
     square = float(sides.mean())
+    if np.abs(np.column_stack([np.ones(len(grid)), grid]) @ unknowns - given).max() > _OFF * square:
+        raise InputError("the points are not those of a chessboard; give their board by --board")
     # Given points may be those of an estimated board, whose sides are neither equal nor perpendicular. The
     # nearest perpendicular axes are the polar factor.
     U, _, Vt = np.linalg.svd(unknowns[1:] / sides[:, None], full_matrices=False)
@@ -264,7 +267,10 @@ def _place(label: str) -> tuple[str, tuple[float, float]]:
     half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
     # -1 names the edges between the board's rim and the first vertices.
     if half is None or not (c.removeprefix("-").isdecimal() and r.removeprefix("-").isdecimal()):
-        raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
+        raise InputError(
+            f"the point {label!r} has no id of a chessboard; calibrate from points of detect, "
+            "and give another kind of board by --board"
+        )
     return name, (int(c) + half[0], int(r) + half[1])
 
 

@@ -11,7 +11,9 @@ import pytest
 from support.command_line import run
 
 from neurocal_cli import read_board
+from neurocal_cli.commands.requested_board import another_size
 from neurocal_cli.detection.detect import detect_points
+from neurocal_cli.files.board_kinds import short_board
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 DPI = 100
@@ -68,3 +70,14 @@ def test_a_board_of_too_many_markers_is_refused(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "no dictionary has a marker 2449" in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_part_of_a_board_with_markers_is_not_another_board() -> None:
+    for form, asked in (
+        ("charuco:8x8:30:22", None),
+        ("aprilgrid:6x6:40:0.3", None),
+        ("chessboard:7x7:30", (3, 4)),
+    ):
+        board = short_board(form)
+        assert board is not None
+        assert another_size([(3, 4)] * 5, board) == asked

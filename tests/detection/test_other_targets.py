@@ -92,7 +92,7 @@ def test_detect_says_what_the_image_shows(tmp_path: Path) -> None:
         ),
         (b"RIFF\0\0\0\0AVI LIST", "is a video"),
         (b"\x1aE\xdf\xa3\0\0", "is a video"),
-        (b"\0\0\0\x18ftypheic\0\0", "is a HEIC file, which is not read; save it as PNG"),
+        (b"\0\0\0\x18ftypheic\0\0", "is a HEIC file, which is not read; convert it"),
         (b"RIFF\0\0\0\0WEBPVP8 ", "is a WebP file"),
     ],
 )
