@@ -79,6 +79,9 @@ def test_an_edge_that_is_only_blurred_is_not_sharpened(sigma: float) -> None:
     assert find_sharpening(edge(sigma, 0.0, 1.0)) is None
     assert find_sharpening(edge(sigma, -0.4, 1.0)) is None
     assert find_sharpening(None) is None
+    whole = edge(sigma, 2.0, 1.0)
+    for half in (whole.d > 0, whole.d < 0, np.abs(whole.d) > 6, np.abs(whole.d) < 0.1):
+        assert find_sharpening(EdgeProfile(whole.d[half], whole.light[half], whole.count[half])) is None
 
 
 @pytest.mark.parametrize(("amount", "radius"), [kind for kind in KINDS if kind[1] >= 1])

@@ -120,8 +120,10 @@ def find_sharpening(profile: EdgeProfile | None) -> Sharpening | None:
 def _overshoots(profile: EdgeProfile) -> bool:
     """Whether the profile is beyond its outer levels near the edge, before anything is fitted."""
     near = np.abs(profile.d) < 0.6 * np.abs(profile.d).max()
-    low, high = (float(np.average(profile.light[far], weights=profile.count[far]))
-                 for far in (~near & (profile.d < 0), ~near & (profile.d > 0)))  # fmt: skip
+    sides = [~near & (profile.d < 0), ~near & (profile.d > 0)]
+    if not all(side.any() for side in (near, *sides)):
+        return False
+    low, high = (float(np.average(profile.light[far], weights=profile.count[far])) for far in sides)
     most, least = profile.light[near].max(), profile.light[near].min()
     return bool(max(most - high, low - least) > 0.5 * _OVERSHOOT * (high - low))
 
