@@ -1,8 +1,8 @@
 """Find the size of a chessboard from images of it: the most complete grid that enough images agree on.
 
-Each image votes for the size of its foremost grid. A vote for a whole grid, without gaps and within the
-image, counts before one for a part, and a vote is sure if the pattern is seen to stop at all sides. Parts of
-a board, in images that cut it off or hide some of it, have smaller sizes that seldom agree. So the largest
+Each image votes for the size of its foremost grid, unless the image cuts it off. A vote for a grid without
+gaps counts before one with gaps, and a vote is sure if the board is seen to end at all sides. Parts of a
+board, in images in which something hides some of it, have smaller sizes that seldom agree. So the largest
 size with enough votes is the board's.
 """
 
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.identity.ends import End, board_ends, surrounded
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import plural
@@ -28,8 +29,9 @@ Size = tuple[int, int]  # columns and rows of inner vertices, the larger number 
 # test_board_size.py finds the sizes of all boards with these limits.
 _COMPLETE = 0.9  # least share of the vertices of a whole grid that were found
 _OUTER = 0.6  # least share of them in its outer lines
+_BORDER = 2.5  # squares between a grid with gaps and the image border
 _BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
-_ENOUGH = 0.2  # least share of the votes for the board's size
+_ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
 _CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
 _MOST_TRIED = 5  # images without a chessboard that are searched for another target
 
@@ -37,10 +39,10 @@ _MOST_TRIED = 5  # images without a chessboard that are searched for another tar
 class Vote(IntEnum):
     """How much a grid says about the size of its board."""
 
-    NONE = 0  # the pattern goes on beyond it
-    PART = 1  # it has gaps or reaches the image border
+    NONE = 0  # the pattern goes on beyond it, or the image may cut it off
+    PART = 1  # it has gaps
     WHOLE = 2
-    SURE = 3  # the pattern is seen to stop at all sides
+    SURE = 3  # the board is seen to end at all sides
 
 
 @frozen_dataclass
@@ -68,12 +70,12 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
     foremost, *others = grids
     ends = board_ends(grey, foremost)
     states = set(ends.values())
-    if End.PATTERN in states:
+    if {End.PATTERN, End.OUTSIDE} & states:
         vote = Vote.NONE
-    elif End.OUTSIDE in states or not _is_whole(foremost.seen):
-        vote = Vote.PART
+    elif not _is_whole(foremost.seen):
+        vote = Vote.NONE if _near_border(foremost, grey.shape) else Vote.PART
     else:
-        vote = Vote.SURE if surrounded(ends) and End.DIM not in states else Vote.WHOLE
+        vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
     near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
     return SeenBoard(_ordered(foremost.shape), vote, tuple(_ordered(x.shape) for x in near))
 
@@ -81,6 +83,12 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
 def _is_whole(seen: NDArray[np.bool_]) -> bool:
     outer = min(float(line.mean()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
     return bool(seen.mean() >= _COMPLETE and outer >= _OUTER)
+
+
+def _near_border(grid: Grid, shape: tuple[int, ...]) -> bool:
+    """Whether the next line of vertices may lie outside the image."""
+    low, high = np.nanmin(grid.pixels, axis=(0, 1)), np.nanmax(grid.pixels, axis=(0, 1))
+    return bool(min(*low, *(shape[::-1] - high)) < _BORDER * grid.square)
 
 
 def _ordered(shape: Size) -> Size:
@@ -131,17 +139,17 @@ def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
         )
     sure = Counter(one.size for one in seen if one.vote == Vote.SURE)
     enough = _with_enough_votes(seen, Vote.WHOLE) or _with_enough_votes(seen, Vote.PART)
-    if not enough:
-        parts = [size for size, _ in Counter(one.size for one in seen).most_common(3)]
-        raise NoBoardError(
-            f"only parts of a chessboard are seen, of {_names(parts)} inner vertices in "
-            f"{plural(len(seen), 'image')}; give its size by --cols and --rows, or show it whole"
-        )
-    best = max(enough, key=lambda size: (size[0] * size[1], size))
+    best = max(enough, key=lambda size: (size[0] * size[1], size), default=(0, 0))
     if other := next((size for size in enough if not _holds(best, size)), None):
         raise NoBoardError(
             f"the images show boards of different sizes, {_names((best, other))} inner vertices; give the "
             "size of yours by --cols and --rows"
+        )
+    if sum(not _holds(best, one.size) for one in seen) > _ENOUGH * len(seen):
+        parts = [size for size, _ in Counter(one.size for one in seen).most_common(3)]
+        raise NoBoardError(
+            f"only parts of a chessboard are seen, of {_names(parts)} inner vertices in "
+            f"{plural(len(seen), 'image')}; give its size by --cols and --rows, or show it whole"
         )
     if sure and not sure[best]:
         # A smaller one whose ends are seen is no part of a larger one, which may have a false line.

@@ -38,6 +38,7 @@ def votes(*given: tuple[int, int, int, Vote]) -> list[SeenBoard]:
         (votes((1, 9, 6, WHOLE)), (9, 6)),
         (votes((2, 9, 6, WHOLE), (5, 8, 6, WHOLE), (3, 9, 5, WHOLE)), (9, 6)),
         (votes((1, 9, 6, SURE), (4, 8, 6, PART)), (9, 6)),
+        (votes((8, 9, 6, WHOLE), (1, 12, 9, PART)), (9, 6)),  # another pattern in one image
         (votes((1, 10, 6, WHOLE), (20, 9, 6, WHOLE)), (9, 6)),  # a single false line
         (votes((3, 10, 6, WHOLE), (7, 9, 6, SURE)), (9, 6)),  # a false line where the board is seen to end
         (votes((3, 9, 6, PART), (1, 8, 6, PART)), (9, 6)),
@@ -89,6 +90,14 @@ def test_images_without_a_chessboard_are_refused() -> None:
         find_board([np.zeros((480, 640), np.uint8)])
     with pytest.raises(NoBoardError, match="no image shows a chessboard"):
         find_board([])
+
+
+@pytest.mark.slow
+def test_boards_that_all_images_cut_off_are_refused() -> None:
+    seen = [seen_board(picture("board cut", seed).image) for seed in range(FIRST, FIRST + 12)]
+    for first in range(0, 12, 3):
+        with pytest.raises(NoBoardError, match="only parts of a chessboard are seen"):
+            agreed_size([one for one in seen[first:] if one is not None])
 
 
 @pytest.mark.slow

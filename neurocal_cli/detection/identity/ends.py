@@ -112,7 +112,9 @@ def _beyond_ring(
     step, margin = next_to_dark - next_to_light, 0.5 * (next_to_dark + next_to_light)
     if step > _DIFFERENT and agreeing >= _SHARE * len(light):
         return End.PATTERN, margin
-    if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
+    of_each = int(np.count_nonzero(light)), int(np.count_nonzero(~light))
+    few = min(_FEWEST, *of_each)  # a short side may have only one
+    if abs(step) < _SAME and turning >= few and agreeing >= _SHARE * turning:
         return End.BOARD, margin
     return (End.STOPS if -_DIFFERENT < step < _SAME else End.UNKNOWN), margin
 
