@@ -43,6 +43,8 @@ def image_size(root: Field) -> tuple[int, int] | None:
 
 def matrix_data(field: Field, length: int) -> Array:
     """Read a matrix in row order: rows, cols and data, nested lists or a list; any `length` if it is -1."""
+    if isinstance(field.value, dict) and "rows" not in field and "data" in field:
+        return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
         data = field["data"].array(-1)
         rows, cols = field["rows"].integer(), field["cols"].integer()

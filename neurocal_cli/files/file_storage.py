@@ -65,7 +65,7 @@ def _parse_xml(text: str, source: str) -> Any:
         raise FormatError(f"is not valid XML ({error.msg}); correct it", source, error.position[0]) from error
     except (ValueError, LookupError) as error:  # the stated encoding is unknown or not UTF-8
         raise FormatError("is not XML in UTF-8; save it as UTF-8", source) from error
-    if root.tag == "calibration":  # Agisoft's
+    if root.tag == "calibration" and root.find("projection") is not None:  # Agisoft's
         return {root.tag: _element_value(root, source, DEEPEST)}
     if root.tag != "opencv_storage":
         raise FormatError(

@@ -403,6 +403,14 @@ DIALECTS: dict[str, tuple[list[float], list[Any]]] = {
     '"observations": [{"snapshotData": "' + "iVBORw0KGgo" * 3000 + '"}]}': (CAMERA, FIVE),
     f'// of the front camera\n{{"K": {K}, /* k1 k2 p1 p2 k3 */ "D": {D},}}': (CAMERA, FIVE),
     f"[camera]\nmatrix = {K}\ndistortion = {D}\n": (CAMERA, FIVE),
+    f'{{"cam_K": {{"data": {K}}}, "cam_dist": {{"data": {D}}}}}': (CAMERA, FIVE),
+    f'{{"camera_matrix": {K}, "distorsion": {{"model": "equidistant", "coeffs": {FISH}}}}}': (
+        CAMERA, ["fisheye", 0.1, 0.01, -0.02, 0.003]),
+    f'{{"camera_matrix": {{"fx": 800, "fy": 801, "cx": 320, "cy": 240, "K": {K}}}, "distortion": {{"model": '
+    '"none", "coeffs": [0, 0, 0, 0, 0]}}': (CAMERA, []),
+    K: (CAMERA, []),
+    "800 0 320\n0 801 240\n0 0 1\n": (CAMERA, []),
+    "800 0 320 0\n0 801 240 0\n0 0 1 0\n0 0 0 1\n": (CAMERA, []),
     "%YAML:1.0\nmodel_type: MEI\ncamera_name: cam\nimage_width: 640\nimage_height: 480\nmirror_parameters:\n"
     "   xi: 0.0\ndistortion_parameters:\n   k1: -0.3\n   k2: 0.1\n   p1: 0.001\n   p2: 0.002\n"
     "projection_parameters:\n   gamma1: 800\n   gamma2: 801\n   u0: 320\n   v0: 240\n": (CAMERA, FIVE[:4]),
@@ -449,6 +457,8 @@ FAULTS = {
     f'{{"a": {{"K": {K}}}, "b": {{"K": {K}}}}}': "holds several cameras (a, b)",
     '{"fl_x": 800, "cx": 1, "cy": 1, "w": 2, "h": 2, "k4": 0.1}': "the coefficient k4 is not known",
     "#polynomial coefficients for the DIRECT mapping function\n\n5 -1 0 1 2 3\n": "is a camera of OCamCalib",
+    "camera calibration of tuesday\nfocal 800 801\ncentre 320 240\n": "is not a camera file",
+    '<calibration created="x"><cameras/></calibration>': "is <calibration> and not OpenCV's",
     '{"CalibrationInformation": {"Cameras": []}}': "is the raw calibration of an Azure Kinect",
     "model_type: SCARAMUZZA\nprojection_parameters: {a: 1}\n": "the model 'SCARAMUZZA' of VINS is not known",
     "<calibration><projection>fisheye</projection></calibration>": "the projection 'fisheye' of Metashape",
@@ -470,6 +480,26 @@ def test_a_matrix_and_coefficients_in_two_files_of_numpy_are_a_camera(tmp_path: 
     np.save(tmp_path / "dist.npy", np.array([FIVE]))
     for order in (("mtx", "dist"), ("dist", "mtx")):
         check(read_cameras([tmp_path / f"{name}.npy" for name in order]).cameras[0], CAMERA, FIVE)
+
+
+def test_a_matrix_as_text_is_no_corner(tmp_path: Path) -> None:
+    (tmp_path / "K.txt").write_text("800 0 320\n0 801 240\n0 0 1\n")
+    (tmp_path / "d.txt").write_text("-0.3 0.1 0.001 0.002 0.05\n")
+    result = run("convert", tmp_path / "K.txt", tmp_path / "d.txt", "--to", "json")
+    assert json.loads(result.stdout)["distortion_coefficients"] == [FIVE]
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_cameras_with_rotation_vectors_are_a_rig(listed: bool, tmp_path: Path) -> None:
+    one = {"K": json.loads(K), "dist": FIVE}
+    poses = ([0.1, 0.2, 0.3], [1.0, 2, 3]), ([0.3, -0.2, 0.1], [[4.0], [5], [6]])
+    cameras = [{"name": f"c{k}", **one, "rvec": r, "tvec": t} for k, (r, t) in enumerate(poses)]
+    tree = {"cameras": cameras} if listed else {camera["name"]: camera for camera in cameras}
+    (tmp_path / "rig.json").write_text(json.dumps(tree))
+    found = read_cameras([tmp_path / "rig.json"])
+    assert [camera.name for camera in found.cameras] == ["c0", "c1"]
+    first, second = (rotated(r, POINT) + np.ravel(t) for r, t in poses)
+    assert np.abs(found.relative[0].to_camera(first) - second).max() < 1e-9
 
 
 def test_a_stated_model_is_not_overruled(tmp_path: Path) -> None:

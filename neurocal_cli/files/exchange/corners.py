@@ -23,7 +23,7 @@ import numpy as np
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.exchange.document import array_of, arrays_of
+from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
 from neurocal_cli.files.failures import value_failures
@@ -74,7 +74,7 @@ def read_corners(
     given = _Given(board, unit, what == "points", advice, notes)
     if len(names) == 1 and data.startswith(b"\x93NUMPY"):
         array = array_of(data, source)
-        if array.shape == (3, 3):
+        if camera_matrix(array) is not None:
             return None  # a camera matrix
         return _corners(Field({"corners": array.tolist()}, source), given)
     if data.startswith(b"PK\x03\x04"):
@@ -92,6 +92,8 @@ def read_corners(
         )
     if _VNL.match(text):
         return _vnl(text, source, given)
+    if camera_matrix(few_numbers(text)) is not None:
+        return None
     if _NUMBERS.match(text):
         return _separate(names, given)
     if _TABLE.match(text):

@@ -12,6 +12,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import matrix_data
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, to_vector
-from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
+from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.file_storage import storage_text
@@ -57,7 +58,9 @@ def read(document: Document) -> CameraSet:
 
 
 def from_tree(root: Field, document: Document) -> CameraSet:
-    """Read one camera or two from a dictionary, or from the only one in it that holds a camera."""
+    """Read one camera or two from a dictionary, or those in it that have poses of their own."""
+    if (rig := _posed(root, document)) is not None:
+        return rig
     root = _within(root)
     unit = root.read("unit", Field.text)
     keys = LooseKeys(root, document.distortion, document.notes)
@@ -102,15 +105,43 @@ def note_size(camera: Camera, document: Document) -> None:
         )
 
 
+def _posed(root: Field, document: Document) -> CameraSet | None:
+    """Cameras in a list or a mapping, each with its rotation vector and translation as OpenCV has them.
+
+    Those of the Panoptic data set have R and t, from the world as well.
+    """
+    value = root.value.get("cameras", root.value) if isinstance(root.value, dict) else root.value
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    found = [
+        (str(name), Field(part, root.source, str(name)))
+        for name, part in parts
+        if isinstance(part, dict) and LooseKeys(Field(part, "")).has_camera()
+    ]
+    if len(found) < 2:
+        return None
+    cameras, poses = [], []
+    for name, part in found:
+        keys = LooseKeys(part, document.distortion, document.notes)
+        r, t = keys.find(("rvec",)), keys.find(("tvec",))
+        R = None if r is None else from_vector(_flat(r)) if _flat(r).size == 3 else None
+        if "distCoef" in part and "R" in part:
+            R, t = matrix_data(part["R"], 9).reshape(3, 3), keys.find(("t",))
+        if R is None or t is None:
+            return None
+        stated = part.get("name").value
+        cameras.append(replace(keys.camera(), name=stated if isinstance(stated, str) else name))
+        keys.refuse_unread()
+        poses.append(Pose(R, _flat(t)))
+    return mounted(cameras, poses, "OpenCV", root.get("unit").value if isinstance(root.value, dict) else None)
+
+
 def _within(root: Field) -> Field:
     """The mapping that holds the camera: the root, or the only one in it that does, with the other keys."""
     for _ in range(_DEEPEST):
         if isinstance(root.value, list) and len(root.value) == 1:
             root = Field(root.value[0], root.source)
         if not isinstance(root.value, dict):
-            raise InputError(
-                "is not a camera file; give one of the formats that neurocal convert --help lists"
-            )
+            raise InputError(UNKNOWN)
         keys = LooseKeys(root)
         if keys.has_camera() or _sides(keys) is not None or any(keys.has_camera(side) for side in "12lr"):
             break

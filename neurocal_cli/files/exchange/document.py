@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.file_storage import parse_tree
 from neurocal_cli.files.reading import decode, read_bytes
@@ -27,6 +28,7 @@ _DAMAGED = (
     ValueError, OSError, EOFError, KeyError, MemoryError, SyntaxError, TokenError, NotImplementedError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
+UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*;", re.MULTILINE)
@@ -74,12 +76,35 @@ class Document:
         """The tree of the file; a FormatError says what is wrong with it."""
         if self.data.startswith(b"PK\x03\x04"):
             return Field(arrays_of(self.data, self.source, self.notes), self.source)
-        if self.data.startswith(b"\x93NUMPY"):
-            return Field({"K": array_of(self.data, self.source).tolist()}, self.source)
+        if self.array is not None:
+            return Field({"K": self.array.tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
         if _SECTION(text):
             return Field(_sections(text, self.source), self.source)
-        return parse_tree(text, self.source)
+        try:
+            root = parse_tree(text, self.source)
+        except FormatError:
+            lines = [line.strip() for line in text.splitlines() if line.strip()]
+            alike = sum(":" in line or line[0] in "-#{}[]<," for line in lines)
+            if lines and not lines[0].startswith(("%YAML", "---")) and 2 * alike < len(lines):
+                raise FormatError(UNKNOWN, self.source) from None
+            raise
+        if isinstance(root.value, list) and (K := camera_matrix(root.value)) is not None:
+            return Field({"K": K.tolist()}, self.source)
+        return root
+
+    @cached_property
+    def array(self) -> np.ndarray[Any, Any] | None:
+        """The array of an ``.npy`` file, or of a text of a few numbers; None for other files."""
+        if self.data.startswith(b"\x93NUMPY"):
+            found = array_of(self.data, self.source)
+        else:
+            rows = few_numbers(self.text)
+            if rows is None:
+                return None
+            found = np.array(rows)
+        K = camera_matrix(found)
+        return found if K is None else K
 
     @cached_property
     def tree(self) -> dict[str, Any]:
@@ -89,6 +114,32 @@ class Document:
         except FormatError:
             return {}
         return value if isinstance(value, dict) else {}
+
+
+def few_numbers(text: str) -> list[list[float]] | None:
+    """Rows of a text of at most 16 numbers and nothing else; None for other texts."""
+    if len(text) > 1000 or not text.strip():
+        return None
+    lines = [re.split(r"[\s,;]+", line.strip(" \t[],;")) for line in text.splitlines() if line.strip()]
+    numbers = all(is_number(word) for line in lines for word in line)
+    if not numbers or len({len(line) for line in lines}) != 1 or sum(map(len, lines)) > 16:
+        return None
+    return [[float(word) for word in line] for line in lines]
+
+
+def camera_matrix(rows: Any) -> Array | None:
+    """The camera matrix in rows of 3 x 3 numbers, or of 3 x 4 or 4 x 4 as some save it; None if it is none."""
+    try:
+        matrix = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    if matrix.shape == (4, 4) and np.array_equal(matrix[3], [0, 0, 0, 1]):
+        matrix = matrix[:3]
+    if matrix.shape == (3, 4) and not matrix[:, 3].any():
+        matrix = matrix[:, :3]
+    if matrix.shape != (3, 3) or not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0]:
+        return None
+    return matrix if matrix[0, 0] > 1 and matrix[1, 1] > 1 else None
 
 
 def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:

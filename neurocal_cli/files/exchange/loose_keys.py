@@ -30,7 +30,7 @@ _MATRIX = (
     "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
     "cameraintrinsic", "intrinsic", "camintrinsics", "cammatrix", "cammtx", "cameramtx", "kmatrix", "kmat",
     "matrix", "intrinsicmat", "intrinsicparameters", "calibrationmatrix", "intrinsicparams", "camerak",
-    "cameramat", "kk", "m1",
+    "cameramat", "kk", "m1", "cm", "intrinsicmtx", "camk",
 )  # fmt: skip
 _COEFFICIENTS = (
     "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "distortioncoeffs",
@@ -98,8 +98,9 @@ _LENGTHS = (4, 5, 8, 12, 14)
 
 
 def plain(name: str) -> str:
-    """A name in lower-case letters and digits."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+    """A name in lower-case letters and digits, spelt rightly."""
+    letters = re.sub(r"[^a-z0-9]", "", name.lower())
+    return letters.replace("distors", "distort").replace("coefficent", "coefficient")
 
 
 def means(word: str) -> str | None:
@@ -289,6 +290,9 @@ class LooseKeys:
     def _stated_model(self, side: str) -> str | None:
         """ROS's name of the distortion model that the file states; None if it states none."""
         stated: dict[str, str] = {}
+        inner = self.find(_COEFFICIENTS, side, lambda value: isinstance(value, dict) and "data" not in value)
+        if inner is not None and (model := LooseKeys(inner)._stated_model("")) is not None:
+            stated[model] = inner.path
         for names in (_MODEL, _KIND):
             for s in dict.fromkeys((side, "")):
                 field = self.find(names, s, lambda value: isinstance(value, str))

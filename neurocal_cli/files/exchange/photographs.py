@@ -277,7 +277,7 @@ METASHAPE = Format(
     "Metashape",
     _METASHAPE.models,
     _metashape_text,
-    lambda document: "calibration" in document.tree and "<calibration" in document.text,
+    lambda document: "<calibration" in document.text[:1000] and "calibration" in document.tree,
     _read_metashape,
     files="Agisoft calibration, XML",
     skew=True,

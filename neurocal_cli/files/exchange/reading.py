@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.nearest_camera import with_model
@@ -27,7 +25,7 @@ from neurocal_cli.files.exchange import (
     ros,
 )
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
-from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.failures import source_of, value_failures
 from neurocal_cli.files.tree_fields import Field
 
@@ -239,17 +237,15 @@ def _read(document: Document, whole: bool = True) -> CameraSet:
                         f"states its distortion model, {camera.distortion.model}; leave out --distortion"
                     )
             return found
-    raise FormatError(
-        "is not a camera file; give one of the formats that neurocal convert --help lists", document.source
-    )
+    raise FormatError(UNKNOWN, document.source)
 
 
 def _merged(documents: Sequence[Document]) -> CameraSet | None:
     """The camera or the rig of two files with a part each; None if they have none."""
     first, second = documents
     source = f"{first.source}, {second.source}"
-    if all(document.data.startswith(b"\x93NUMPY") for document in documents):
-        arrays = [np.array(document.tree["K"]) for document in documents]
+    arrays = [document.array for document in documents if document.array is not None]
+    if len(arrays) == 2:
         matrix = next((k for k, array in enumerate(arrays) if array.shape == (3, 3)), 0)
         tree = {"K": arrays[matrix].tolist(), "D": arrays[1 - matrix].ravel().tolist()}
     elif all(map(dictionary.is_part, documents)):
