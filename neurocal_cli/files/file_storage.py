@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -35,7 +35,7 @@ def parse_tree(text: str, source: str) -> Field:
 
 def _parse_json(text: str, source: str) -> Any:
     try:
-        return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refuse)
+        return json.loads(text, object_pairs_hook=_distinct)
     except json.JSONDecodeError:
         if (plain := _COMMENT.sub(lambda found: found[1] or "", text)) != text:
             return _parse_json(plain, source)
@@ -50,10 +50,6 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(tree) < len(pairs):
         raise ValueError("a key appears twice")
     return tree
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not a number")
 
 
 def _parse_xml(text: str, source: str) -> Any:

@@ -457,6 +457,8 @@ FAULTS = {
     f'{{"a": {{"K": {K}}}, "b": {{"K": {K}}}}}': "holds several cameras (a, b)",
     '{"fl_x": 800, "cx": 1, "cy": 1, "w": 2, "h": 2, "k4": 0.1}': "the coefficient k4 is not known",
     "#polynomial coefficients for the DIRECT mapping function\n\n5 -1 0 1 2 3\n": "is a camera of OCamCalib",
+    '{"projection_type": "brown", "width": 4000, "height": 3000, "focal_x": 0.85, "focal_y": 0.85, '
+    '"c_x": 0.01, "c_y": 0.02, "k1": 0.1}': "the focal length 0.85 is not in pixels",
     "camera calibration of tuesday\nfocal 800 801\ncentre 320 240\n": "is not a camera file",
     '<calibration created="x"><cameras/></calibration>': "is <calibration> and not OpenCV's",
     '{"CalibrationInformation": {"Cameras": []}}': "is the raw calibration of an Azure Kinect",
@@ -500,6 +502,12 @@ def test_cameras_with_rotation_vectors_are_a_rig(listed: bool, tmp_path: Path) -
     assert [camera.name for camera in found.cameras] == ["c0", "c1"]
     first, second = (rotated(r, POINT) + np.ravel(t) for r, t in poses)
     assert np.abs(found.relative[0].to_camera(first) - second).max() < 1e-9
+
+
+def test_arrays_without_names_are_told_by_their_shape(tmp_path: Path) -> None:
+    views = np.zeros((7, 3, 1))
+    np.savez(tmp_path / "a.npz", np.array(json.loads(K)), np.array([FIVE]), views, views)
+    check(read_intrinsics(tmp_path / "a.npz"), CAMERA, FIVE)
 
 
 def test_a_stated_model_is_not_overruled(tmp_path: Path) -> None:

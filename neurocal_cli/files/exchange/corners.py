@@ -99,7 +99,7 @@ def read_corners(
     if _TABLE.match(text):
         return _table_of(names, given)
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
-    if named or text.lstrip().startswith(("{", "[", "<", "%YAML", "/")):
+    if named or text.lstrip().startswith(("{", "<", "%YAML", "/")):
         return _corners(parse_tree(text, source), given)
     return None
 

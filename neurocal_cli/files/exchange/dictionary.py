@@ -35,6 +35,7 @@ from neurocal_cli.files.yaml_text import nested
 _DEEPEST = 4  # mappings within each other
 # Share of the image's side by which the principal point is far from the middle, and far outside the image.
 _OFF, _OUTSIDE = 0.2, 1.0
+_SHORTEST, _SHORT = 3.0, 0.02  # focal lengths that no camera has, in px and as a share of the image's width
 _SIDES = (
     ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
     ("camera0", "camera1"), ("camera1", "camera2"), ("cameraleft", "cameraright"),
@@ -73,21 +74,29 @@ def from_tree(root: Field, document: Document) -> CameraSet:
         return CameraSet((camera,), (), _poses(root), unit)
     cameras = tuple(keys.camera(side) for side in sides)
     keys.refuse_unread()
-    for camera in cameras:
-        note_size(camera, document)
     R, t = keys.find(_ROTATIONS), keys.find(_TRANSLATIONS)
     if R is None or t is None:
         raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
+    for camera in cameras:
+        note_size(camera, document)
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
 
 def note_size(camera: Camera, document: Document) -> None:
-    """Append a warning if the principal point is far outside the image, or its sides are exchanged."""
+    """Append a warning if the principal point is far outside the image, or its sides are exchanged.
+
+    Raises InputError for a focal length that is not in pixels.
+    """
+    f, (u0, v0) = camera.intrinsics.alpha_u, camera.A[:2, 2]
+    if f < (_SHORTEST if camera.image_size is None else _SHORT * camera.image_size[0]):
+        raise InputError(
+            f"the focal length {f:.6g} is not in pixels, but in mm or relative to the image; convert the "
+            "camera matrix to pixels"
+        )
     if camera.image_size is None:
         return
     width, height = camera.image_size
-    u0, v0 = camera.A[:2, 2]
 
     def off(w: int, h: int) -> float:
         return float(max(abs(u0 - (w - 1) / 2) / w, abs(v0 - (h - 1) / 2) / h))
@@ -131,6 +140,7 @@ def _posed(root: Field, document: Document) -> CameraSet | None:
         stated = part.get("name").value
         cameras.append(replace(keys.camera(), name=stated if isinstance(stated, str) else name))
         keys.refuse_unread()
+        note_size(cameras[-1], document)
         poses.append(Pose(R, _flat(t)))
     return mounted(cameras, poses, "OpenCV", root.get("unit").value if isinstance(root.value, dict) else None)
 

@@ -128,7 +128,7 @@ def few_numbers(text: str) -> list[list[float]] | None:
 
 
 def camera_matrix(rows: Any) -> Array | None:
-    """The camera matrix in rows of 3 x 3 numbers, or of 3 x 4 or 4 x 4 as some save it; None if it is none."""
+    """The camera matrix in rows of 3 x 3 numbers, or of 3 x 4 or 4 x 4 as some save it; None for others."""
     try:
         matrix = np.array(rows, dtype=float)
     except (TypeError, ValueError):
@@ -164,7 +164,18 @@ def arrays_of(data: bytes, source: str, notes: list[str]) -> dict[str, Any]:
         raise
     except _DAMAGED as error:
         raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
-    return tree
+    return _named(tree)
+
+
+def _named(tree: dict[str, Any]) -> dict[str, Any]:
+    """Arrays saved without names, arr_0 and so on: a matrix and coefficients are told by their shape."""
+    if not all(re.fullmatch(r"arr_\d+", name) for name in tree):
+        return tree
+    matrices = [name for name, rows in tree.items() if camera_matrix(rows) is not None]
+    rows = [np.ravel(value).tolist() for value in tree.values() if np.size(value) in (4, 5, 8, 12, 14)]
+    if len(matrices) != 1 or len(rows) > 1:
+        return tree
+    return {"K": tree[matrices[0]], **({"D": rows[0]} if rows else {})}
 
 
 def array_of(data: bytes, source: str) -> np.ndarray[Any, Any]:

@@ -79,6 +79,16 @@ _ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines of OpenPTV's fil
 
 # What is known and cannot be read: how to tell it, what it is, and what to do.
 _REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
+    (lambda d: not d.data.strip() and d.source != "<stdin>", "is empty; give a camera file"),
+    (
+        lambda d: "!!python/object" in d.text[:100_000],
+        "holds objects of Python, which can run code and are not read; save arrays as lists, array.tolist()",
+    ),
+    (
+        lambda d: {"cameraData", "boardName"} <= set(d.tree),
+        "is the calibration of an OAK board, of all its sockets; save one camera with DepthAI: "
+        "getCameraIntrinsics and getDistortionCoefficients of its CalibrationHandler",
+    ),
     (
         lambda d: {"projection", "f", "u0"} <= set(d.tree),
         "is the file of an undistorted panorama; give the camera of the original images",
