@@ -25,6 +25,7 @@ __all__ = ["neurocal"]
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "advise": "Advise which views of the target to photograph next.",
+    "batch": "Calibrate many data sets, and summarise the fleet.",
     "board": "Draw a target to print: chessboard, ChArUco, tags or circles.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
     "compare": "Compare calibration methods on the same points.",

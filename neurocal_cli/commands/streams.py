@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands.screen import drawn_on, is_terminal, wrapped
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
@@ -31,6 +32,28 @@ _NOT_CONVERGED = 3  # exit status
 _PATIENCE = 0.5  # seconds after which the bar appears
 
 T = TypeVar("T")
+
+
+@frozen_dataclass(eq=False)
+class Capture:
+    """What a command says and the summary of its result, when it runs as a part of another one."""
+
+    lines: list[str]
+    summaries: list[dict[str, Any]]
+
+
+_CAPTURE: ContextVar[Capture | None] = ContextVar("capture", default=None)
+
+
+@contextmanager
+def captured() -> Iterator[Capture]:
+    """Capture what is told on stderr and the summaries of results, instead of showing them."""
+    capture = Capture([], [])
+    token = _CAPTURE.set(capture)
+    try:
+        yield capture
+    finally:
+        _CAPTURE.reset(token)
 
 
 class _ClosedOutput(io.RawIOBase):
@@ -67,6 +90,11 @@ def debugging() -> bool:
     return os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
 
 
+def _on_terminal() -> bool:
+    """Whether a reader sees what is told now."""
+    return _CAPTURE.get() is None and is_terminal(sys.stderr)
+
+
 def one_line(text: str) -> str:
     """Put a text on one line, and replace control characters that may come from a file."""
     line = " ".join(text.splitlines())
@@ -75,6 +103,9 @@ def one_line(text: str) -> str:
 
 def tell(text: str) -> None:
     """Show a text on stderr. A full or closed stderr must not cost the user the result."""
+    if (capture := _CAPTURE.get()) is not None:
+        capture.lines.append(text)
+        return
     with suppress(OSError):
         click.echo(wrapped(text, sys.stderr), err=True)
 
@@ -128,8 +159,10 @@ def concluding(
 
     As JSON, it is printed after them. In the end, exit if the training did not converge.
     """
+    if (capture := _CAPTURE.get()) is not None:
+        capture.summaries.append(in_json(result))
     if not as_json:
-        with drawn_on(sys.stderr):
+        with drawn_on(sys.stderr if capture is None else None):
             say(in_words(result))
         warn(*result.warnings)
     yield
@@ -148,7 +181,7 @@ def print_text(made: Callable[[], str]) -> None:
 
 def tell_written(output: str | None, *others: str | None, then: str = "") -> None:
     """Say on a terminal which files were written, and what to do next with the first of them, ``{}``."""
-    if not is_terminal(sys.stderr):
+    if not _on_terminal():
         return
     written = [file for file in (output, *others) if file not in (None, "-")]
     if written:
@@ -182,7 +215,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._task: TaskID | None = None
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
-        if is_terminal(sys.stderr) and not verbose() and _VERBOSITY.get() >= 0:
+        if _on_terminal() and not verbose() and _VERBOSITY.get() >= 0:
             self._timer = threading.Timer(_PATIENCE, self._appear)
             self._timer.daemon = True
             self._timer.start()

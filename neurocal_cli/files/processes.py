@@ -43,7 +43,7 @@ def work_through(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, context, prepare or start_worker)
     try:
-        with _interrupts_held():
+        with interrupts_held():
             results = pool.map(work, tasks)  # starts the processes
         yield from results
     except BrokenProcessPool as error:
@@ -53,7 +53,7 @@ def work_through(
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
+def interrupts_held() -> Iterator[None]:
     """Put interrupts off. Processes that start meanwhile never get any, not even while they load modules."""
     mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
     former = mask(signal.SIG_BLOCK, {signal.SIGINT}) if mask else None

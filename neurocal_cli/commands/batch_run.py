@@ -1,0 +1,209 @@
+"""Do one job of a batch, in a worker process: its commands, as they are typed, in a folder of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from contextvars import Context
+from dataclasses import replace
+from typing import Any
+
+import click
+
+from neurocal_cli import __version__
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.commands import preparation
+from neurocal_cli.commands.batch_jobs import LOG, Job, Words, parsed
+from neurocal_cli.commands.batch_rows import rows_of
+from neurocal_cli.commands.streams import captured, one_line, tell
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.files.job_files import (
+    RECORD,
+    fingerprints,
+    is_of_machine,
+    key_of,
+    publish,
+    read_record,
+    sizes_of,
+    unread_since,
+    work_folder,
+)
+from neurocal_cli.files.reading import read_bytes
+from neurocal_cli.files.writing import all_or_none, write_at_once
+
+# The working folder is that of the whole process, and so are some settings of libraries.
+_ONE_AT_A_TIME = threading.Lock()
+
+
+@frozen_dataclass(eq=False)
+class Task:
+    """A job to do."""
+
+    job: Job
+    results: str  # absolute path of its folder of results
+    force: bool = False
+    # Contents of its inputs by name, if the worker does not see the files; results are sent back then.
+    shipped: Mapping[str, bytes] | None = None
+
+
+@frozen_dataclass(eq=False)
+class Outcome:
+    """What became of a job."""
+
+    # "unchanged" for one that was done before; "stopped" if the machine, not the data, made it fail.
+    status: str
+    record: dict[str, Any]  # as in its file; empty if it was stopped
+    problem: str = ""
+    files: Mapping[str, bytes] | None = None  # results to be written by the client
+
+
+def do_job(task: Task) -> Outcome:
+    """Do a job, unless its results are those of the same commands, inputs and version."""
+    preparation.compute_in_one_thread()
+    with _ONE_AT_A_TIME:
+        try:
+            return Context().run(_done if task.shipped is None else _done_elsewhere, task)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            return Outcome("stopped" if is_of_machine(error) else "failed", {}, one_line(text))
+
+
+def unchanged(task: Task) -> Outcome | None:
+    """The outcome of a job that is done already, told by a glance at its inputs; else None."""
+    record = {} if task.force else read_record(task.results)
+    inputs = record.get("inputs", {})
+    if list(inputs) != list(task.job.inputs) or not unread_since(task.results, inputs):
+        return None
+    key = key_of(task.job.steps, [entry["sha256"] for entry in inputs.values()])
+    return Outcome("unchanged", record, record["problem"]) if record.get("key") == key else None
+
+
+def with_inputs(task: Task) -> Task:
+    """The task with the contents of its inputs, without those that cannot be read."""
+    shipped = {}
+    for name in task.job.inputs:
+        with suppress(NeurocalError):
+            shipped[name] = read_bytes(os.path.normpath(os.path.join(task.results, name)))[0]
+    return replace(task, shipped=shipped)
+
+
+def receive(task: Task, outcome: Outcome) -> Outcome:
+    """Write the results that a worker sent, and their record."""
+    if outcome.files is None:
+        return outcome
+    inputs = fingerprints(task.results, task.job.inputs, {})
+    key = key_of(task.job.steps, [entry["sha256"] for entry in inputs.values()])
+    record = {"key": key, "inputs": inputs} | outcome.record
+    try:
+        work = work_folder(task.results)
+        for name, content in outcome.files.items():
+            write_at_once(os.path.join(work, name), content)
+        write_at_once(os.path.join(work, RECORD), json.dumps(record, indent=1) + "\n")
+        publish(work, task.results)
+    except (NeurocalError, OSError) as error:
+        return Outcome("stopped", {}, one_line(str(error)))
+    return replace(outcome, record=record, files=None)
+
+
+def _done(task: Task) -> Outcome:
+    job, results = task.job, task.results
+    former = {} if task.force else read_record(results)
+    inputs = fingerprints(results, job.inputs, former.get("inputs", {}))
+    key = key_of(job.steps, [entry["sha256"] for entry in inputs.values()])
+    if former.get("key") == key:
+        return Outcome("unchanged", former, former["problem"])
+    work = work_folder(results)
+    try:
+        outcome = _worked(job, work, {"key": key, "inputs": inputs})
+        if outcome.status == "stopped":
+            return outcome
+        publish(work, results)
+        return outcome
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _done_elsewhere(task: Task) -> Outcome:
+    """Do a job whose inputs were sent, in a folder that looks the same from the folder of the results."""
+    assert task.shipped is not None
+    with tempfile.TemporaryDirectory(prefix="neurocal-") as root:
+        up = max((name.split(os.sep).count(os.pardir) for name in task.shipped), default=0)
+        work = os.path.join(root, *("d" * up), os.path.basename(task.results))
+        os.makedirs(work)
+        for name, content in task.shipped.items():
+            path = os.path.normpath(os.path.join(work, name))
+            os.makedirs(os.path.dirname(path), exist_ok=True)
+            write_at_once(path, content)
+        before = set(os.listdir(work))
+        outcome = _worked(task.job, work, {})
+        made = sorted(set(os.listdir(work)) - before - {RECORD})
+        files = {name: read_bytes(os.path.join(work, name))[0] for name in made}
+        return Outcome(outcome.status, outcome.record, outcome.problem, files)
+
+
+def _worked(job: Job, work: str, record: dict[str, Any]) -> Outcome:
+    """Run the commands in a folder, and write the log and the record there."""
+    start, lines = time.perf_counter(), list[str]()
+    summaries: list[dict[str, Any]] = []
+    status, problem, former = "done", "", os.getcwd()
+    os.chdir(work)
+    try:
+        for words in job.steps:
+            lines.append(f"$ {shlex.join(('neurocal', *words))}")
+            code, problem, machine = _run(words, lines, summaries)
+            if machine:
+                return Outcome("stopped", {}, problem)
+            if code == 3:
+                status, problem = "not converged", "training did not converge"
+            elif code:
+                status = "failed"
+                break
+        write_at_once(LOG, "\n".join(lines) + "\n")
+    finally:
+        with suppress(OSError):  # it may be gone
+            os.chdir(former)
+    record |= {
+        "neurocal": __version__,
+        "steps": job.lines,
+        "status": status,
+        "problem": problem,
+        "seconds": round(time.perf_counter() - start, 3),
+        "rows": rows_of(summaries[-1]) if summaries else [],
+        "outputs": sizes_of(work),
+    }
+    write_at_once(os.path.join(work, RECORD), json.dumps(record, indent=1) + "\n")
+    return Outcome(status, record, problem)
+
+
+def _run(words: Words, lines: list[str], summaries: list[dict[str, Any]]) -> tuple[int, str, bool]:
+    """Run one command; return its exit status, its error in one line, and whether that is the machine's."""
+    with captured() as capture:
+        code, problem, machine = 0, "", False
+        try:
+            with all_or_none(finishing=(click.exceptions.Exit,)), parsed(words) as context:
+                context.command.invoke(context)
+        except click.exceptions.Exit as end:
+            code = end.exit_code
+        except click.ClickException as error:
+            code, problem = error.exit_code, error.format_message()
+        except NeurocalError as error:
+            code, problem, machine = error.exit_code, str(error), is_of_machine(error)
+        except Exception as error:
+            code, problem, machine = (
+                1,
+                f"internal error: {type(error).__name__}: {error}",
+                is_of_machine(error),
+            )
+        if problem:
+            problem = one_line(problem)
+            tell(f"Error: {problem}")
+    lines += capture.lines
+    summaries += capture.summaries
+    return code, problem, machine
