@@ -17,8 +17,8 @@ from neurocal_cli.commands.streams import ProgressBar, complain, note, print_sum
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.commands.batch_jobs import Job
-    from neurocal_cli.commands.batch_run import Outcome, Task
+    from neurocal_cli.commands.batch_jobs import Job, Outcome
+    from neurocal_cli.commands.batch_run import Task
 
 _CSV, _HTML = "summary.csv", "summary.html"
 _MOST_TOLD = 10  # problems of jobs
@@ -57,11 +57,8 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
     without="the number of cores",
 )
 @options.count("--jobs", "N", "Number of processes on this machine, without Dask.", without="Dask workers")
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    show_default="none",
-    help="Use the workers of this running Dask scheduler, such as tcp://host:8786.",
+@options.path(
+    "--scheduler", "ADDRESS", "Use the workers of this running Dask scheduler, such as tcp://host:8786."
 )
 @options.flag(
     "--ship", "With --scheduler: send the inputs to workers that do not see the files, and fetch the results."
@@ -116,6 +113,9 @@ def batch(
       neurocal batch sample_data/fleet.csv --set distortion=k1 --jobs 2 -o first
       neurocal batch sample_data/fleet.csv --set distortion=k1 --jobs 1 --force --json \\
           --against first/summary.csv -o second
+      # with the extra fleet:
+      # neurocal batch sample_data/fleet.csv --workers 2 -o third
+      # neurocal batch sample_data/fleet.csv --scheduler tcp://host:8786 --ship -o third
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     chosen = [
@@ -211,7 +211,8 @@ class _Batch:
             click.get_current_context().exit(1)
 
     def _do_jobs(self) -> None:
-        from neurocal_cli.commands.batch_run import Outcome, Task, do_job, unchanged
+        from neurocal_cli.commands.batch_jobs import Outcome
+        from neurocal_cli.commands.batch_run import Task, do_job, unchanged
 
         tasks = []
         for job in self._jobs:
@@ -253,7 +254,8 @@ class _Batch:
             yield with_inputs(task) if self._ship else task
 
     def _received(self, task: Task, result: Outcome | None) -> Outcome:
-        from neurocal_cli.commands.batch_run import Outcome, receive
+        from neurocal_cli.commands.batch_jobs import Outcome
+        from neurocal_cli.commands.batch_run import receive
 
         if result is None:
             return Outcome("failed", {}, "its process was killed twice, perhaps for lack of memory")

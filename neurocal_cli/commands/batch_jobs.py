@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -47,6 +47,17 @@ class Job:
     def lines(self) -> list[str]:
         """The commands as they are typed."""
         return [shlex.join(("neurocal", *words)) for words in self.steps]
+
+
+@frozen_dataclass(eq=False)
+class Outcome:
+    """What became of a job."""
+
+    # "unchanged" for one that was done before; "stopped" if the machine, not the data, made it fail.
+    status: str
+    record: dict[str, Any]  # as in its file; empty if it was stopped
+    problem: str = ""
+    files: Mapping[str, bytes] | None = None  # results to be written by the client
 
 
 def job_of(one: DataSet, common: Mapping[str, str], output: str) -> Job:

@@ -12,8 +12,7 @@ from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
 
 if TYPE_CHECKING:
-    from neurocal_cli.commands.batch_jobs import Job
-    from neurocal_cli.commands.batch_run import Outcome
+    from neurocal_cli.commands.batch_jobs import Job, Outcome
 
 # Parameters that have a column; a rich lens has dozens more.
 _NAMED = re.compile(r"alpha_[uv]|[uv]0|theta|[kps]\d|tau_[xy]|xi|alpha|beta")

@@ -20,7 +20,7 @@ import click
 from neurocal_cli import __version__
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import preparation
-from neurocal_cli.commands.batch_jobs import LOG, Job, Words, parsed
+from neurocal_cli.commands.batch_jobs import LOG, Job, Outcome, Words, parsed
 from neurocal_cli.commands.batch_rows import rows_of
 from neurocal_cli.commands.streams import captured, one_line, tell
 from neurocal_cli.errors import NeurocalError
@@ -51,17 +51,6 @@ class Task:
     force: bool = False
     # Contents of its inputs by name, if the worker does not see the files; results are sent back then.
     shipped: Mapping[str, bytes] | None = None
-
-
-@frozen_dataclass(eq=False)
-class Outcome:
-    """What became of a job."""
-
-    # "unchanged" for one that was done before; "stopped" if the machine, not the data, made it fail.
-    status: str
-    record: dict[str, Any]  # as in its file; empty if it was stopped
-    problem: str = ""
-    files: Mapping[str, bytes] | None = None  # results to be written by the client
 
 
 def do_job(task: Task) -> Outcome:

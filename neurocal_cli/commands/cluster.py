@@ -6,20 +6,22 @@ import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, TypeVar
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, TypeVar
 
 from neurocal_cli import __version__
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.files.processes import interrupts_held
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _AHEAD = 8  # tasks per thread that wait at the workers' side, so that no worker waits
 _WAIT = 30  # seconds for the first worker
+_GONE = 10  # seconds without the scheduler, after which it will not come back
 _TRIES = 1  # after a worker died
 
 
@@ -120,21 +122,31 @@ def _content(path: str) -> str:
 def work_off_by(
     client: Client, work: Callable[[Task], Result], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Result | None]]:
-    """Tasks with their results as they are finished; see `worker_pool.work_off`."""
-    from distributed import as_completed
+    """Tasks with their results as they are finished; see `worker_pool.work_off`.
 
+    Raises NeurocalError if the scheduler is gone.
+    """
     rest, open_tasks = iter(tasks), dict[str, Task]()
+    finished: SimpleQueue[Future] = SimpleQueue()
 
-    def submit(task: Task) -> Any:
+    def submit(task: Task) -> None:
         future = client.submit(work, task, pure=False)
         open_tasks[future.key] = task
-        return future
+        future.add_done_callback(finished.put)
 
-    ahead = _AHEAD * threads(client)
-    first = [submit(task) for _, task in zip(range(ahead), rest, strict=False)]
-    done = as_completed(first, loop=client.loop)
-    del first
-    for future in done:
+    for _, task in zip(range(_AHEAD * threads(client)), rest, strict=False):
+        submit(task)
+    lost = 0
+    while open_tasks:
+        try:
+            future = finished.get(timeout=1.0)
+        except Empty:
+            lost = 0 if client.status == "running" else lost + 1
+            if lost >= _GONE:
+                raise NeurocalError(
+                    "the scheduler is gone; start it, then the same command goes on"
+                ) from None
+            continue
         task = open_tasks.pop(future.key)
         try:
             result = future.result() if future.status == "finished" else None
@@ -142,6 +154,6 @@ def work_off_by(
             result = None
         future.release()
         for following in rest:
-            done.add(submit(following))
+            submit(following)
             break
         yield task, result

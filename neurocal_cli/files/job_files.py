@@ -17,7 +17,6 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 from neurocal_cli import __version__
@@ -46,19 +45,17 @@ def locked(folder: str) -> Iterator[None]:
     """
     path = os.path.join(folder, _LOCK)
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | (0 if fcntl else os.O_EXCL), 0o666)
-        if fcntl:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed when this process ends, however
+        descriptor = _lock(path)
     except OSError as error:
         if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EEXIST):
             raise NeurocalError(f"{one_line(path)}: cannot be locked ({reason(error)})") from error
-        with suppress(OSError):
-            owner = Path(path).read_text("utf-8", "replace")
-            raise NeurocalError(
-                f"{one_line(folder)}: another batch works here ({one_line(owner.strip())}); wait for it, or "
-                "give another folder"
-            ) from error
-        raise NeurocalError(f"{one_line(folder)}: another batch works here; give another folder") from error
+        owner = ""
+        with suppress(NeurocalError):
+            owner = one_line(read_text(path)[0].strip())
+        raise NeurocalError(
+            f"{one_line(folder)}: another batch works here{f' ({owner})' if owner else ''}; wait for it, or "
+            "give another folder"
+        ) from error
     try:
         with suppress(OSError):
             owner = f"process {os.getpid()} of {getpass.getuser()} on {platform.node()}"
@@ -69,6 +66,23 @@ def locked(folder: str) -> Iterator[None]:
     finally:
         with suppress(OSError):
             os.unlink(path)
+        os.close(descriptor)
+
+
+def _lock(path: str) -> int:
+    """Make and lock a file; an OSError if another process has it. The lock ends with this process."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | (0 if fcntl else os.O_EXCL), 0o666)
+        try:
+            if fcntl:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        except FileNotFoundError:  # its former owner removed it after it was opened here
+            pass
+        except OSError:
+            os.close(descriptor)
+            raise
         os.close(descriptor)
 
 

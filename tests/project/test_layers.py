@@ -24,6 +24,8 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("commands/show/",),
     "yaml": ("files/",),
+    "distributed": ("commands/cluster.py",),
+    "dask": ("commands/cluster.py",),
     "cv2": (
         "calibration/other_methods/opencv.py",
         "camera/remapping.py",
