@@ -82,7 +82,8 @@ def _link(row: Row) -> str:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    columns = [*_COLUMNS, *(_CHANGE if any(row.get("drift") for row in rows) else ())]
+    first, *others = _COLUMNS
+    columns = [first, *(_CHANGE if any(row.get("drift") for row in rows) else ()), *others]
     head = "".join(f"<th>{escape(title)}</th>" for title, _, _ in [("camera", "", ""), *columns])
     lines = []
     for row in rows[:_MOST_ROWS]:
@@ -129,8 +130,8 @@ def _histogram(values: Array, label: str, unit: str) -> str:
     )
     low, high = f"{edges[0]:.5g}", f"{edges[-1]:.5g}"
     texts = (
-        f'<text x="0" y="{_HEIGHT + 18}" font-size="14">{low}</text>'
-        f'<text x="{_WIDTH}" y="{_HEIGHT + 18}" font-size="14" text-anchor="end">{high}</text>'
+        f'<text x="0" y="{_HEIGHT + 15}" font-size="11">{low}</text>'
+        f'<text x="{_WIDTH}" y="{_HEIGHT + 15}" font-size="11" text-anchor="end">{high}</text>'
     )
     drawing = (
         f'<svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT + _FOOT:.0f}" role="img" '
