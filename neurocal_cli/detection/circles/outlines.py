@@ -11,6 +11,7 @@ from neurocal_cli.detection.fitting.batched_newton import FitPixels
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Single
+from neurocal_cli.detection.local_inverse import LocalInverse
 
 _REACH = 4.0  # sigma on both sides of the outline
 _ROUGHLY = 1.5  # of that, for a first selection
@@ -92,32 +93,31 @@ def _distances(
 
     The map's inverse is a polynomial through its samples around the circle.
     """
-    centre = seen[0]
-    scale = np.abs(seen - centre).max()
-    inverse = np.linalg.lstsq(_powers((seen - centre) / scale), samples, rcond=None)[0]
-    point = np.stack([u - centre[0], v - centre[1]], axis=-1).astype(float) / scale
+    inverse = LocalInverse.of(seen, samples)
+    point = np.stack([u, v], axis=-1).astype(float)
 
     def nearer(foot: Array, point: Array) -> tuple[Array, Array, Array]:
         """Distance from the outline, normal at a foot near it, and the radius there."""
-        a, b, slopes = _at(np.asarray(inverse, dtype=float), foot)
+        a, b = inverse.at(foot)
+        au, av, bu, bv = inverse.slopes(foot)
         rho = np.maximum(np.hypot(a, b), 1e-9)
-        slope = (a[:, None] * slopes[0] + b[:, None] * slopes[1]) / (scale * rho[:, None])
+        slope = np.stack([a * au + b * bu, a * av + b * bv], axis=-1) / rho[:, None]
         steep = np.maximum(np.hypot(*slope.T), 1e-9)
         n = slope / steep[:, None]
-        return ((point - foot) * scale * n).sum(axis=1) + (rho - radius) / steep, n, rho
+        return ((point - foot) * n).sum(axis=1) + (rho - radius) / steep, n, rho
 
     d, n, rho = nearer(point, point)
     near = np.abs(d) < _ROUGHLY * reach
     d, n, rho, point = d[near], n[near], rho[near], point[near]
     foot = point
     for _ in range(2):
-        foot = np.asarray(point - d[:, None] * n / scale, dtype=float)
+        foot = point - d[:, None] * n
         d, n, _ = nearer(foot, point)
     # Curvature of an ellipse with the shape of the map at the centre: M maps pixels to the board.
-    _, _, slopes = _at(np.asarray(inverse, dtype=float), np.zeros((1, 2)))
-    M = np.stack([slopes[0][0], slopes[1][0]]) / scale
+    au, av, bu, bv = (float(one[0]) for one in inverse.slopes(seen[:1]))
+    M = np.array([[au, av], [bu, bv]])
     G = M.T @ M / radius**2
-    q = foot * scale
+    q = foot - seen[0]
     gradient = q @ G
     length = np.maximum(np.hypot(*gradient.T), 1e-12)
     tangent = np.stack([-gradient[:, 1], gradient[:, 0]], axis=-1) / length[:, None]
@@ -131,35 +131,3 @@ def _distances(
         0.5 * np.clip(curvature, 0, 2),
         rho,
     )
-
-
-_DEGREE = 4
-_POWERS = tuple((i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i))
-
-
-def _up_to(x: Array) -> list[Array]:
-    powers = [np.ones_like(x), x]
-    for _ in range(_DEGREE - 1):
-        powers.append(powers[-1] * x)
-    return powers
-
-
-def _powers(place: Array) -> Array:
-    """Powers (N, M) of places (N, 2)."""
-    x, y = (_up_to(one) for one in place.T)
-    return np.stack([x[i] * y[j] for i, j in _POWERS], axis=-1)
-
-
-def _at(inverse: Array, place: Array) -> tuple[Array, Array, tuple[Array, Array]]:
-    """The polynomials at places (N, 2), and their gradients (N, 2)."""
-    x, y = (_up_to(one) for one in place.T)
-    terms, du, dv = (np.zeros((len(_POWERS), len(place))) for _ in range(3))
-    for k, (i, j) in enumerate(_POWERS):
-        terms[k] = x[i] * y[j]
-        if i:
-            du[k] = i * x[i - 1] * y[j]
-        if j:
-            dv[k] = j * x[i] * y[j - 1]
-    a, b = inverse.T @ terms
-    (au, bu), (av, bv) = inverse.T @ du, inverse.T @ dv
-    return a, b, (np.stack([au, av], axis=-1), np.stack([bu, bv], axis=-1))

@@ -26,9 +26,11 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.edge_profile import profile, response
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.local_inverse import LocalInverse
 
 _REACH = 4.5  # sigma around a cell of the board
-_DEGREE = 3  # of the inverse of the map within a cell
+_SLACK = 1.3  # for the different sizes of a cell's parts
+_FITTED, _FITTED_PX = 6.0, 2.0  # sigma and px from an edge, beyond which fits use no pixels
 _SAMPLES = 6  # along its sides
 _TERMS = ((0.02, 1), (0.1, 2), (0.3, 4), (0.5, 7), (1.0, 12))  # of the series up to a correlation
 _MOST_RHO = 0.9
@@ -59,72 +61,76 @@ class Appearance:
 
 
 def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: float) -> NDArray[np.float32]:
-    """The image (H, W) without patterns near their borders, and NaN within them.
+    """The image (H, W) without patterns near the edges of their cells, and NaN within the patterns.
 
     `most` is the change of the light, in half contrasts, beyond which a pixel is left out.
     """
     result = image.astype(np.float32)
     nonlinear = bool(look.nonlinearity.any())
-    for k in range(len(ink.cell)):
-        place = _pixels_of(ink.cell[k], look.map, float(look.blur[k, :2].max()), result.shape)
-        if place is None:
+    for cell, light, base, blur in zip(ink.cell, ink.light, ink.base, look.blur, strict=True):
+        inner = light - base
+        inverse = _inverse(look.map, cell)
+        pixels = None if inverse is None else _pixels_of(cell, look.map, blur, result.shape)
+        if inverse is None or pixels is None or not inner.any():
             continue
-        u, v = place
-        a, b, slopes = _inverse(look.map, ink.cell[k], u, v)
-        pattern = _Blurred.of(slopes, look.blur[k], look.shift, look.tails)
-        inner = ink.light[k] - ink.base[k]
+        near, within = _selected(inverse, pixels, ink.lines, inner, float(blur[:2].max()))
+        u, v = pixels[within].T.astype(np.intp)
+        result[v, u] = np.nan
+        if not near.any():
+            continue
+        some = pixels[near]
+        a, b = inverse.at(some)
+        pattern = _Blurred.of(inverse.slopes(some), blur, look.shift, look.tails)
         change = pattern.pattern(a, b, ink.lines, inner)
-        _, contrast = look.shading.at(np.stack([u, v], axis=-1))
+        _, contrast = look.shading.at(some)
         if nonlinear:
-            plain = np.clip(pattern.squares(a, b, ink.base[k]), -1, 1)
+            plain = np.clip(pattern.squares(a, b, base), -1, 1)
             seen = np.clip(plain + change, -1, 1)
             change = response(seen, look.nonlinearity)[0] - response(plain, look.nonlinearity)[0]
-        mostly = np.abs(change) > most
-        result[v, u] -= np.where(mostly, np.nan, contrast * change).astype(np.float32)
+        u, v = some.T.astype(np.intp)
+        result[v, u] -= np.where(np.abs(change) > most, np.nan, contrast * change).astype(np.float32)
     return result
 
 
-def _pixels_of(
-    cell: NDArray[np.int64], at: SmoothMap, sigma: float, shape: tuple[int, ...]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-    """Pixels u and v of the image around a cell, as far as its blur reaches."""
+def _pixels_of(cell: NDArray[np.int64], at: SmoothMap, blur: Array, shape: tuple[int, ...]) -> Array | None:
+    """Pixels (N, 2) of the image around a cell, as far as its blur reaches."""
     corners = at.at(cell + np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
-    if not np.isfinite(corners).all():
-        return None
-    room = _REACH * sigma
+    room = _REACH * blur[:2].max()
     low = np.maximum(np.floor(corners.min(axis=0) - room), 0).astype(np.intp)
     high = np.minimum(np.ceil(corners.max(axis=0) + room) + 1, shape[::-1]).astype(np.intp)
     if (high <= low).any():
         return None
     v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].reshape(2, -1)
-    return u, v
+    return np.stack([u, v], axis=-1).astype(float)
 
 
-def _inverse(
-    at: SmoothMap, cell: NDArray[np.int64], u: NDArray[np.intp], v: NDArray[np.intp]
-) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:
-    """Places a and b in a cell of pixels, and their derivatives by u and by v (au, av, bu, bv)."""
+def _selected(
+    inverse: LocalInverse, pixels: Array, lines: Array, inner: Array, sigma: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks of the pixels near the edges of a cell that its pattern reaches, and of those within the pattern.
+
+    The latter are too far from the edges for the fits.
+    """
+    a, b = inverse.at(pixels)
+    au, av, bu, bv = (float(one[0]) for one in inverse.slopes(inverse.centre[None]))
+    sides = 1 / np.hypot([au, bu], [av, bv])  # [px] of the cell, between opposite edges
+    columns, rows = (np.flatnonzero(inner.any(axis=axis)) for axis in (0, 1))
+    inward, outward = np.full(len(a), np.inf), np.full(len(a), -np.inf)
+    for place, side, used in ((a, sides[0], columns), (b, sides[1], rows)):
+        inward = np.minimum(inward, side * np.minimum(place, 1 - place))
+        low, high = lines[used[0]], lines[used[-1] + 1]
+        outward = np.maximum(outward, side * np.maximum(low - place, place - high))
+    reached = outward < _SLACK * _REACH * sigma
+    near = reached & (inward < _FITTED * sigma + _FITTED_PX)
+    return near, reached & ~near
+
+
+def _inverse(at: SmoothMap, cell: NDArray[np.int64]) -> LocalInverse | None:
+    """Places in a cell of pixels; None if the camera does not see the cell."""
     ticks = np.linspace(0, 1, _SAMPLES)  # the next cells may be of another size
     samples = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     pixels = at.at(cell + samples)
-    centre = pixels.mean(axis=0)
-    scale = np.abs(pixels - centre).max()
-    terms = _polynomial((pixels - centre) / scale)[0]
-    coefficients = np.linalg.lstsq(terms, samples, rcond=None)[0]
-    value, du, dv = _polynomial((np.stack([u, v], axis=-1) - centre) / scale)
-    a, b = (value @ coefficients).T
-    (au, bu), (av, bv) = ((x @ coefficients / scale).T for x in (du, dv))
-    return a, b, (au, av, bu, bv)
-
-
-def _polynomial(place: Array) -> tuple[Array, Array, Array]:
-    """Powers (N, M) of places (N, 2), and their derivatives."""
-    x, y = place.T
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    value = np.stack([x**i * y**j for i, j in powers], axis=-1)
-    du = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=-1)
-    dv = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=-1)
-    return value, du, dv
+    return LocalInverse.of(pixels, samples) if np.isfinite(pixels).all() else None
 
 
 @frozen_dataclass(eq=False)
