@@ -18,13 +18,16 @@ import numpy as np
 from neurocal_cli.adjustment.leave_out import folds_of, quietly
 from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.rig.adjust import RigFit, ViewEquations, adjust_rig, rig_problem, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
+from neurocal_cli.calibration.rig.causes import EACH_PART, SAME_MOMENT, TAKEN, Named
+from neurocal_cli.calibration.rig.combine import rig_problem
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED, UNSYNCHRONISED
 from neurocal_cli.calibration.rig.depth import depth_std
 from neurocal_cli.calibration.rig.edges import described, pair_name
 from neurocal_cli.calibration.rig.motion import motion_of
+from neurocal_cli.calibration.rig.problem import ViewEquations
 from neurocal_cli.calibration.rig.rig import Rig, of_two
-from neurocal_cli.calibration.rig.rivals import EACH_PART, SAME_MOMENT, TAKEN, Named, named_cause
+from neurocal_cli.calibration.rig.rivals import named_cause
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.verdict.assessment import assess
 from neurocal_cli.calibration.verdict.findings import WORDS, Finding, Limit, name_some, verdict_of

@@ -10,8 +10,9 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import on_one_target
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
+from neurocal_cli.calibration.rig.combine import stereo_problem
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.pairing import ViewPairs
 from neurocal_cli.calibration.rig.rig import Rig

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigProblem, stereo_problem
+from neurocal_cli.calibration.rig.combine import stereo_problem
+from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.relative_poses import in_order
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation

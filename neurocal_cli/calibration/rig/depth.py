@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.adjustment.problem import intrinsic_matrix
-from neurocal_cli.calibration.rig.adjust import RigFit, RigState, is_significant, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.covariance import contradicting_covariance, covariance_by_given
 from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points
+from neurocal_cli.calibration.rig.state import RigState
 from neurocal_cli.calibration.rig.triangulation import triangulate
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array

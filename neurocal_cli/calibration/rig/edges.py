@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.reprojection import squared_errors
-from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, adjust_rig
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
 from neurocal_cli.calibration.rig.consensus import (
     OPPOSITE,
     PAIR_ANEW,
@@ -27,6 +27,7 @@ from neurocal_cli.calibration.rig.consensus import (
 )
 from neurocal_cli.calibration.rig.frames import groups
 from neurocal_cli.calibration.rig.odd_pairs import MEDIAN, SUSPECT, odd_pairs
+from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.relative_poses import relative_poses
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass

@@ -15,16 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import (
-    RigFit,
-    RigProblem,
-    adjust_rig,
-    is_significant,
-    rig_problem,
-    scatter,
-)
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
 from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES, Named
+from neurocal_cli.calibration.rig.combine import rig_problem
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED
 from neurocal_cli.calibration.rig.covariance import (
     contradicting_covariance,
@@ -46,17 +41,11 @@ from neurocal_cli.calibration.rig.edges import (
 from neurocal_cli.calibration.rig.frames import FrameNames, connected_frames, refuse_apart
 from neurocal_cli.calibration.rig.motion import timed
 from neurocal_cli.calibration.rig.pairing import ViewPairs
+from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.refinement import adjusted
 from neurocal_cli.calibration.rig.result import RigAssembly
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.rivals import (
-    LATE_CAMERA,
-    TAKEN,
-    TWO_GEOMETRIES,
-    Named,
-    log_evidence,
-    named_cause,
-)
+from neurocal_cli.calibration.rig.rivals import log_evidence, named_cause
 from neurocal_cli.calibration.verdict.rival import LEVEL
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose

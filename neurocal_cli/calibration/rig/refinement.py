@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.adjust import RigFit, RigProblem, RigState, adjust_rig, free_parameters
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
+from neurocal_cli.calibration.rig.combine import free_parameters
+from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.result import non_monotonic_sides
+from neurocal_cli.calibration.rig.state import RigState
 
 # Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
 # refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.leave_out import Quadratics
 from neurocal_cli.adjustment.normal_equations import eliminate, solve_scaled
 from neurocal_cli.adjustment.reprojection import POSE, camera_columns
-from neurocal_cli.calibration.rig.adjust import RigProblem, steps_through
+from neurocal_cli.calibration.rig.problem import RigProblem, steps_through
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, rotation_vector
 from neurocal_cli.camera.pinhole import Pose

@@ -15,8 +15,9 @@ from support.scenes import random_rotation
 from support.slow_cases import slow_but
 
 from neurocal_cli import StereoRig, calibrate
-from neurocal_cli.calibration.rig.adjust import adjust_rig, stereo_problem
+from neurocal_cli.calibration.rig.adjust import adjust_rig
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
+from neurocal_cli.calibration.rig.combine import stereo_problem
 from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
