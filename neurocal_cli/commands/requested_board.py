@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from math import gcd
 from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.options import BoardOptions
-from neurocal_cli.commands.streams import complain, note, say, warn
+from neurocal_cli.commands.streams import ProgressBar, complain, note, say, warn
 from neurocal_cli.errors import NeurocalError
 
 if TYPE_CHECKING:
@@ -49,7 +49,8 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
     from neurocal_cli.detection.identity.placement import NoBoardError
     from neurocal_cli.observations.board import Board
 
-    found = found_size(_readable(_spread(paths)))
+    with ProgressBar() as progress:
+        found = found_size(_readable(_spread(paths), progress))
     if not found.sure and len(paths) < enough:
         raise NoBoardError(
             "it is not certain where the board ends; more images of the whole board are needed"
@@ -70,12 +71,13 @@ def _spread(paths: Sequence[str]) -> list[str]:
     return [paths[k * step % len(paths)] for k in range(len(paths))]
 
 
-def _readable(paths: Sequence[str]) -> Iterator[NDArray[np.generic]]:
+def _readable(paths: Sequence[str], progress: Callable[[str, float], None]) -> Iterator[NDArray[np.generic]]:
     """The grey images of files, without those that cannot be read, unless no file can be."""
     from neurocal_cli.files.images import read_image
 
     problem, read = None, False
-    for path in paths:
+    for number, path in enumerate(paths):
+        progress("finding the size of the board", number / len(paths))
         try:
             grey = read_image(path).grey
         except NeurocalError as error:
