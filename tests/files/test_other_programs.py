@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.command_line import run
+from support.places import SAMPLES
 from support.real_data import FOLDER, RealFiles
 
 from neurocal_cli import Camera, read_points
@@ -157,7 +158,7 @@ RIGS: dict[str, tuple[list[tuple[list[float], list[Any]]], list[Array]]] = {
 }  # fmt: skip
 REFUSED = {
     "fisheye_KD.npz": "whether they are k1, k2, p1, p2 of an ordinary lens or k1 to k4 of a fisheye",
-    "fisheye_calib_py_front.json": "give --distortion k1k2p1p2 or --distortion fisheye",
+    "fisheye_calib_py_front.json": "convert it with --distortion k1k2p1p2 or fisheye",
     "ros_uncal.yaml": "K is 0: the camera is not calibrated",
     "wide_dist_pickle.p": "is a pickle of Python, which can run code and is not read",
     "bouguet_calib_data.mat": "holds points of Bouguet's toolbox, and no camera",
@@ -348,7 +349,7 @@ def test_the_nearest_camera_of_one_that_ends_in_a_pole_is_told(real_files: RealF
 def test_exchanged_sides_of_an_image_are_told_and_can_be_given(real_files: RealFiles, tmp_path: Path) -> None:
     (path,) = real_files("other_programs/image_size_hw.json")
     result = run("convert", path, "--to", "json")
-    assert "if the file has height and width, give --image-size 1280 720" in result.stderr
+    assert "if the file has height and width, convert it with --image-size 1280 720" in result.stderr
     result = run("convert", path, "--to", "json", "--image-size", 1280, 720)
     assert (result.stderr, json.loads(result.stdout)["image_width"]) == ("", 1280)
 
@@ -464,7 +465,7 @@ FAULTS = {
     '{"CalibrationInformation": {"Cameras": []}}': "is the raw calibration of an Azure Kinect",
     "model_type: SCARAMUZZA\nprojection_parameters: {a: 1}\n": "the model 'SCARAMUZZA' of VINS is not known",
     "<calibration><projection>fisheye</projection></calibration>": "the projection 'fisheye' of Metashape",
-    "[LEFT_CAM_HD]\nfx=1\n[LEFT_CAM_VGA]\nfx=1\n": "choose one by --image-size: 1280 720, 672 376",
+    "[LEFT_CAM_HD]\nfx=1\n[LEFT_CAM_VGA]\nfx=1\n": "convert one with --image-size: 1280 720, 672 376",
 }
 
 
@@ -500,8 +501,38 @@ def test_cameras_with_rotation_vectors_are_a_rig(listed: bool, tmp_path: Path) -
     (tmp_path / "rig.json").write_text(json.dumps(tree))
     found = read_cameras([tmp_path / "rig.json"])
     assert [camera.name for camera in found.cameras] == ["c0", "c1"]
-    first, second = (rotated(r, POINT) + np.ravel(t) for r, t in poses)
+    first, second = (np.add(rotated(r, POINT), np.ravel(t)) for r, t in poses)
     assert np.abs(found.relative[0].to_camera(first) - second).max() < 1e-9
+
+
+def test_a_stereo_script_of_bouguet_is_a_rig(tmp_path: Path) -> None:
+    lines = ["% Stereo", "nx = 640; ny = 480;"]
+    for side in ("left", "right"):
+        lines += [
+            f"fc_{side} = [ 800 ; 801 ];",
+            f"cc_{side} = [ 320 ; 240 ];",
+            f"kc_{side} = [ -0.3 ; 0.1 ; 0.001",
+        ]
+        lines[-1] += " ; 0.002 ; 0.05 ];"
+    lines += ["om = [ 0.1 ; 0.2 ; 0.3 ];", "T = [ -99.8 ; 1.1 ; 0.05 ];"]
+    (tmp_path / "Calib_Results_stereo.m").write_text("\n".join(lines))
+    found = read_cameras([tmp_path / "Calib_Results_stereo.m"])
+    for camera in found.cameras:
+        check(camera, CAMERA, FIVE)
+        assert camera.image_size == (640, 480)
+    expected = np.add(rotated([0.1, 0.2, 0.3], POINT), [-99.8, 1.1, 0.05])
+    assert np.abs(found.relative[0].to_camera(POINT) - expected).max() < 1e-9
+
+
+def test_a_known_camera_without_its_model_takes_the_option(tmp_path: Path) -> None:
+    (tmp_path / "camera.json").write_text(f'{{"K": {K}, "D": {FISH}, "image_size": [640, 480]}}')
+    words = "calibrate", SAMPLES / "flat.csv", "--type", 3, "--intrinsics", tmp_path / "camera.json"
+    result = run(*words)
+    assert result.exit_code == 1
+    assert "has four distortion coefficients" in result.stderr
+    result = run(*words, "--distortion", "fisheye", "-o", tmp_path / "poses.yaml")
+    assert result.exit_code in (0, 3), result.stderr
+    assert "distortion_model: equidistant" in (tmp_path / "poses.yaml").read_text()
 
 
 def test_arrays_without_names_are_told_by_their_shape(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def _read_zed(document: Document) -> CameraSet:
     fitting = [mode for mode in modes if document.size in (None, _ZED_SIZES.get(mode))]
     if len(fitting) != 1:
         sizes = ", ".join("{} {}".format(*_ZED_SIZES[mode]) for mode in modes if mode in _ZED_SIZES)
-        raise InputError(f"holds the cameras of several image sizes; choose one by --image-size: {sizes}")
+        raise InputError(f"holds cameras of several image sizes; convert one with --image-size: {sizes}")
     (mode,) = fitting
     cameras = [
         replace(_ZED.camera(root[f"{side}_CAM_{mode}"], side.lower()), image_size=_ZED_SIZES.get(mode))

@@ -105,7 +105,7 @@ def note_size(camera: Camera, document: Document) -> None:
     if off(width, height) > _OFF and off(height, width) < 0.5 * off(width, height):
         document.warnings.append(
             f"{place} is far from the middle of an image of {width} x {height}, and near that of {height} x "
-            f"{width}; if the file has height and width, give --image-size {height} {width}"
+            f"{width}; if the file has height and width, convert it with --image-size {height} {width}"
         )
     elif off(width, height) > _OUTSIDE:
         document.warnings.append(

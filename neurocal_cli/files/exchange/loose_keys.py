@@ -1,9 +1,9 @@
 """Read a camera from a dictionary by the many names that programs and people give to its parts.
 
-Names are compared without case and punctuation, with or without the name of one camera of two before or after
-them (``cameraMatrix1``, ``left_K``). Nothing is guessed: four coefficients that may be those of an ordinary
-lens or of a fisheye are refused, and so are numbers that may be the distortion and were not read, because a
-camera without its distortion looks right but is wrong.
+The names may have that of one camera of two before or after them (``cameraMatrix1``, ``left_K``). Nothing is
+guessed: four coefficients that may be those of an ordinary lens or of a fisheye are refused, and so are
+numbers that may be the distortion and were not read, because a camera without its distortion looks right but
+is wrong.
 """
 
 from __future__ import annotations
@@ -22,90 +22,32 @@ from neurocal_cli.camera.given_values import checked_size
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
+from neurocal_cli.files.exchange.camera_names import (
+    ALIKE,
+    COEFFICIENTS,
+    ENTRIES,
+    FISHEYE,
+    HARMLESS,
+    HEIGHT,
+    KIND,
+    LENGTHS,
+    MATRIX,
+    MODEL,
+    NAME,
+    NO_LIST,
+    RADIAL,
+    SHAPE,
+    SIZE,
+    SUSPECT,
+    SUSPECT_NUMBER,
+    TANGENTIAL,
+    UNKNOWN,
+    WIDTH,
+    means,
+    plain,
+)
 from neurocal_cli.files.failures import one_line, value_failures
 from neurocal_cli.files.tree_fields import Field, is_number
-
-# The first are written here and by ROS and OpenCV; in OpenCV's stereo sample the left camera has M1 and D1.
-_MATRIX = (
-    "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
-    "cameraintrinsic", "intrinsic", "camintrinsics", "cammatrix", "cammtx", "cameramtx", "kmatrix", "kmat",
-    "matrix", "intrinsicmat", "intrinsicparameters", "calibrationmatrix", "intrinsicparams", "camerak",
-    "cameramat", "kk", "m1", "cm", "intrinsicmtx", "camk",
-)  # fmt: skip
-_COEFFICIENTS = (
-    "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "distortioncoeffs",
-    "distortioncoeff", "distortioncoefs", "distortioncoef", "distortioncoefficient", "distcoefficients",
-    "distortion", "distortions", "dist", "d", "kc", "coefs", "coeffs", "coef", "coefficients",
-    "distortionparameters", "distortionparams", "distparams", "distortionvector", "distortionmatrix",
-    "distvec", "lensdistortion", "cameradistortion", "distmtx", "distmatrix", "camdist", "disto", "distcof",
-    "distcoffs", "distortioncoefficents", "distortionvalues", "opencvdistortion", "d1",
-)  # fmt: skip
-_ENTRIES = (
-    ("fx", "flx", "focalx", "fu"),
-    ("fy", "fly", "focaly", "fv"),
-    ("cx", "ppx", "u0", "pu"),
-    ("cy", "ppy", "v0", "pv"),
-)
-_RADIAL = ("radialdistortion", "radial", "radialcoefficients", "radialdistortioncoefficients", "radialcoeffs")
-_TANGENTIAL = (
-    "tangentialdistortion", "tangential", "tangentialcoefficients", "tangentialdistortioncoefficients",
-    "tangentialcoeffs",
-)  # fmt: skip
-_WIDTH = ("imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex")
-_HEIGHT = ("imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey")
-_SIZE = (
-    "imagesize", "imgsize", "resolution", "size", "dim", "dims", "imageresolution", "imagedimensions",
-    "dimensions", "framesize", "calibdimension", "cameraresolution", "imsize", "calibrationresolution",
-)  # fmt: skip
-_SHAPE = ("imageshape", "imgshape", "shape")  # NumPy's: height and width
-_NAME = ("cameraname",)
-
-# Keys whose text names the distortion model; an unknown word is refused in the first, ignored in the others.
-_MODEL = ("distortionmodel", "distmodel", "distortiontype", "disttype", "distortion")
-_KIND = (
-    "cameramodel", "calibrationmodel", "opencvmodel", "model", "cameratype", "projection", "projectionmodel",
-    "lensmodel", "lenstype", "modeltype", "type", "calibrationtype", "projectiontype", "lens",
-)  # fmt: skip
-_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye", "usefisheye", "useopencvfisheye")  # true or false
-_UNKNOWN = "unknown"
-# What the words mean, the first that is found; "" says nothing that a coefficient could contradict.
-_WORDS = (
-    (r"inverse|fov|atan|division|ocam|scaramuzza|thinprismfisheye|cahv|splined|ftheta|orthogr|stereogr|equisolid"
-     r"|equirect|spheric|cylind|panoram", _UNKNOWN),
-    (r"doublesphere|^ds$", "double_sphere"),
-    (r"eucm|extendedunified", "eucm"),
-    (r"omni|mei$|unified", "omnidir"),
-    (r"fisheye|kannala|^kb\d?$|equidist|^equi$", "equidistant"),
-    (r"rational", "rational_polynomial"),
-    (r"thinprism", "thin_prism"),
-    (r"^tilted", "tilted"),
-    (r"^rich$", "rich"),
-    (r"plumb|radtan|radialtang|brown|conrady|radial|polynom|standard", "plumb_bob"),
-    (r"^pinhole|perspective|^normal$|^opencv$|^cv2$|^regular$|^cv2calibratecamera$", "pinhole"),
-)  # fmt: skip
-_ALIKE = ("plumb_bob", "rational_polynomial", "thin_prism", "tilted", "pinhole")
-
-# Names of numbers that may be a distortion, and of some that are none.
-_SUSPECT = re.compile(r"dist(?!an|rib)|^kc|coef|radial|tangent")
-_SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")
-_HARMLESS = re.compile(
-    r"std|err|undist|newcam|uncert|sigma|limit|rms|perview|roi|optimal|thresh|flag|aspect|fix|rect|^est|valid"
-)
-_NO_LIST = re.compile(
-    r"roi|quat|rot|^q\d?$|rect|crop|box|board|pattern|size|color|time|pose|trans|orient|^[rtp]\d?$"
-)
-_LENGTHS = (4, 5, 8, 12, 14)
-
-
-def plain(name: str) -> str:
-    """A name in lower-case letters and digits, spelt rightly."""
-    letters = re.sub(r"[^a-z0-9]", "", name.lower())
-    return letters.replace("distors", "distort").replace("coefficent", "coefficient")
-
-
-def means(word: str) -> str | None:
-    """ROS's name of the distortion model that a word names, ``unknown``, or None if it names none."""
-    return next((model for pattern, model in _WORDS if re.search(pattern, plain(word))), None)
 
 
 def _is_numbers(value: Any) -> bool:
@@ -133,7 +75,7 @@ def _has_entries(value: Any) -> bool:
     if not isinstance(value, dict):
         return False
     names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
-    return all(not names.isdisjoint(entry) for entry in _ENTRIES)
+    return all(not names.isdisjoint(entry) for entry in ENTRIES)
 
 
 class LooseKeys:
@@ -176,7 +118,7 @@ class LooseKeys:
         """Whether there is a camera matrix, or its entries, under their usual names."""
         matrix = any(
             _is_matrix(self.root.value[key]) or (key != "k" and _has_entries(self.root.value[key]))
-            for name in _MATRIX
+            for name in MATRIX
             for form in ((name + side, side + name) if side else (name,))
             for key in self.names.get(form, [])
         )
@@ -186,7 +128,7 @@ class LooseKeys:
         """Read the camera, or that of one side."""
         intrinsics = self._intrinsics(side)
         distortion = self._distortion(side)
-        stated = self.find(_NAME, side, lambda value: isinstance(value, (str, int)))
+        stated = self.find(NAME, side, lambda value: isinstance(value, (str, int)))
         return Camera(
             intrinsics, distortion, self.image_size(side), name if stated is None else stated.text()
         )
@@ -196,15 +138,15 @@ class LooseKeys:
         sides = (side, "") if side else ("",)
         width, height = (
             next((field for s in sides if (field := self.find(names, s)) is not None), None)
-            for names in (_WIDTH, _HEIGHT)
+            for names in (WIDTH, HEIGHT)
         )
         if width is not None and height is not None:
             size = width.integer(), height.integer()
         else:
             turned = False
-            field = next((f for s in sides if (f := self.find(_SIZE, s)) is not None), None)
+            field = next((f for s in sides if (f := self.find(SIZE, s)) is not None), None)
             if field is None:
-                turned, field = True, self.find(_SHAPE)
+                turned, field = True, self.find(SHAPE)
             if field is None:
                 return None
             if isinstance(field.value, dict) and "data" not in field.value:
@@ -226,15 +168,15 @@ class LooseKeys:
         """Refuse numbers that may be the distortion and were not read."""
         for key, value in self.root.value.items():
             name = plain(str(key))
-            if key in self.read or _HARMLESS.search(name) or not _is_numbers(value):
+            if key in self.read or HARMLESS.search(name) or not _is_numbers(value):
                 continue
             numbers = _flat(value)
             if isinstance(value, (list, dict)):
-                listed = len(numbers) in _LENGTHS and not _NO_LIST.search(name)
+                listed = len(numbers) in LENGTHS and not NO_LIST.search(name)
                 guess = not self.coefficients_read and listed and any(n != int(n) for n in numbers)
-                suspect = guess or _SUSPECT.search(name) is not None
+                suspect = guess or SUSPECT.search(name) is not None
             else:
-                suspect = _SUSPECT_NUMBER.fullmatch(name) is not None
+                suspect = SUSPECT_NUMBER.fullmatch(name) is not None
             if suspect and any(numbers):
                 raise InputError(
                     f"the key {str(key)[:60]!r} may be the distortion, and is not a known name of it; rename "
@@ -244,12 +186,12 @@ class LooseKeys:
     coefficients_read = False
 
     def _intrinsics(self, side: str) -> Intrinsics:
-        field = self.find(_MATRIX, side, lambda value: _is_matrix(value) or _has_entries(value))
+        field = self.find(MATRIX, side, lambda value: _is_matrix(value) or _has_entries(value))
         if field is None and not side and _has_entries(self.root.value):
             field = self.root
         if field is None:
             field = self.find(
-                [n for n in _MATRIX if len(n) > 1 or not side], side, lambda value: value is not None
+                [n for n in MATRIX if len(n) > 1 or not side], side, lambda value: value is not None
             )
         if field is None:
             keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
@@ -260,7 +202,7 @@ class LooseKeys:
         if isinstance(field.value, dict) and _has_entries(field.value):
             entries = self if field is self.root else LooseKeys(field)
             values = []
-            for names in _ENTRIES:
+            for names in ENTRIES:
                 entry = entries.find(names, "", lambda value: not isinstance(value, (dict, list)))
                 assert entry is not None  # `_has_entries`
                 values.append(entry.number())
@@ -290,28 +232,28 @@ class LooseKeys:
     def _stated_model(self, side: str) -> str | None:
         """ROS's name of the distortion model that the file states; None if it states none."""
         stated: dict[str, str] = {}
-        inner = self.find(_COEFFICIENTS, side, lambda value: isinstance(value, dict) and "data" not in value)
+        inner = self.find(COEFFICIENTS, side, lambda value: isinstance(value, dict) and "data" not in value)
         if inner is not None and (model := LooseKeys(inner)._stated_model("")) is not None:
             stated[model] = inner.path
-        for names in (_MODEL, _KIND):
+        for names in (MODEL, KIND):
             for s in dict.fromkeys((side, "")):
                 field = self.find(names, s, lambda value: isinstance(value, str))
                 if field is None:
                     continue
                 word = field.text()
-                model = means(word) if word.strip() else "plumb_bob" if names is _MODEL else None
-                if names is _MODEL and model is None:
+                model = means(word) if word.strip() else "plumb_bob" if names is MODEL else None
+                if names is MODEL and model is None:
                     model = "none" if plain(word) in ("none", "nodistortion") else word
                 if model is not None:
                     stated.setdefault(model, field.text())
                     break
-        for name in () if side and stated else _FISHEYE:
+        for name in () if side and stated else FISHEYE:
             field = self.find((name,), "", lambda v: v in (0, 1, True, False, "true", "false", "0", "1"))
             if field is not None:
                 yes = field.value in (1, True, "true", "1")
                 stated.setdefault("equidistant" if yes else "plumb_bob", f"{field.path} {field.value}")
         strong = [model for model in stated if model != "pinhole"]
-        kinds = {"plumb_bob" if model in _ALIKE else model for model in strong}
+        kinds = {"plumb_bob" if model in ALIKE else model for model in strong}
         if len(kinds) > 1:
             words = " and ".join(repr(stated[model][:40]) for model in strong)
             raise InputError(f"names two distortion models, {words}; remove the one that is not meant")
@@ -330,7 +272,7 @@ class LooseKeys:
                 )
             return Distortion()
         self.coefficients_read = True
-        if model == _UNKNOWN:
+        if model == UNKNOWN:
             if coefficients.any():
                 raise InputError(
                     "its distortion model is not known here; calibrate with OpenCV's model or its fisheye, "
@@ -348,13 +290,13 @@ class LooseKeys:
         if model is None and len(coefficients) == 4 and coefficients.any() and not named:
             raise InputError(
                 "has four distortion coefficients, and does not say whether they are k1, k2, p1, p2 of an "
-                "ordinary lens or k1 to k4 of a fisheye; give --distortion k1k2p1p2 or --distortion fisheye"
+                "ordinary lens or k1 to k4 of a fisheye; convert it with --distortion k1k2p1p2 or fisheye"
             )
         return Distortion(*from_ros(model or "plumb_bob", coefficients))
 
     def _coefficients(self, side: str) -> tuple[Array | None, bool]:
         """Coefficients in OpenCV's order, and whether their names tell that p1 and p2 are among them."""
-        field = self.find(_COEFFICIENTS, side, lambda v: not isinstance(v, (str, int, float)))
+        field = self.find(COEFFICIENTS, side, lambda v: not isinstance(v, (str, int, float)))
         if field is not None:
             if isinstance(field.value, dict) and "data" not in field.value:
                 inner = LooseKeys(field)
@@ -362,9 +304,9 @@ class LooseKeys:
                 inner.refuse_unread()
                 return found
             return matrix_data(field, -1), False
-        radial = self.find(_RADIAL, side, _is_numbers)
+        radial = self.find(RADIAL, side, _is_numbers)
         if radial is not None:
-            tangential = self.find(_TANGENTIAL, side, _is_numbers)
+            tangential = self.find(TANGENTIAL, side, _is_numbers)
             k = (
                 matrix_data(radial, -1)
                 if not isinstance(radial.value, (int, float))
