@@ -19,7 +19,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
-from neurocal_cli.adjustment.board.find import Found, evidence_as_given, views_for_target
+from neurocal_cli.adjustment.board.find import Found, counted_again, gain_over_given, views_for_target
 from neurocal_cli.adjustment.normal_equations import ROUNDING, eliminate
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
 from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, displaced_blocks, predicted_pixels
@@ -71,13 +71,15 @@ def has_other_cause(solution: Solution, found: Found) -> bool:
     if named and problem.views.n_views < _TELL_BENDS and richer_lens_is_better(found):
         return True
     fits = views_for_target([(problem, solution.adjusted)])
-    held, gain = contest_of(solution, fits[0]), found.evidence - evidence_as_given(fits)
+    held, gain = contest_of(solution, fits[0]), gain_over_given(found, fits)
     if held is None or not held.causes:
         return False
+    # An equation of the contest, which is on the given target, may count less on the found one.
+    worth = min(counted_again(found, fits), 1.0)
     if held.beside_board:
-        return held.evidence > gain + LEVEL
+        return held.evidence * worth > gain + LEVEL
     # A shape that is far more probable than the found one is not open: no print is stretched by percents.
-    return held.causes[0].pattern == "all" and sum(one.evidence for one in held.causes) > _FAR * gain
+    return held.causes[0].pattern == "all" and worth * sum(one.evidence for one in held.causes) > _FAR * gain
 
 
 def contradicts_sigma(solution: Solution) -> bool:

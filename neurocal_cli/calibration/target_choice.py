@@ -25,8 +25,8 @@ from neurocal_cli.adjustment.board.find import (
     Found,
     Search,
     enough_views,
-    evidence_as_given,
     find_target,
+    gain_over_given,
 )
 from neurocal_cli.adjustment.board.information import of_views, without_points
 from neurocal_cli.adjustment.board.posterior import evidence_of_given
@@ -232,8 +232,8 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
     if bent > _NOISE * least and flat - bent < _SHARE * (flat - least):
         return common
-    rigid = evidence_as_given([given]) if common is None else common.evidence
-    return common if other_causes(solution, before) > found.evidence - rigid else found
+    gain = gain_over_given(found, [given]) if common is None else found.evidence - common.evidence
+    return common if other_causes(solution, before) > gain else found
 
 
 def _find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:

@@ -16,7 +16,7 @@ from neurocal_cli.files.failures import one_line
 from neurocal_cli.files.reading import read_bytes
 from neurocal_cli.files.writing import make_folder, write_whole
 
-_KINDS = (".csv", ".png", ".md")  # the scripts that made the data stay in the project
+_KINDS = (".csv", ".jpg", ".png", ".md")  # the scripts that made the data stay in the project
 _INSTALLED = "share/neurocal/sample_data/README.md"  # in pyproject.toml
 
 

@@ -149,6 +149,26 @@ def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
     return evidence_of_views(views_for_target(fits))
 
 
+def gain_over_given(found: Found, fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Gain in log evidence of a found target over the given one, at the minima for which are the fits.
+
+    Residuals that a target of another shape explains look like noise in both directions. So more equations
+    count of points that are measured in one direction, and evidences of different numbers of equations cannot
+    be compared; that of the given target is then taken with the weights of the found one.
+    """
+    if counted_again(found, fits) == 1:
+        return found.evidence - evidence_as_given(fits)
+    return found.target.evidence
+
+
+def counted_again(found: Found, fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Number of equations that count on the found target, over that on the given one."""
+    of_found, of_given = (
+        sum(problem.views.n_equations for problem, _ in some) for some in (found.fits, views_for_target(fits))
+    )
+    return of_found / of_given
+
+
 def views_for_target(fits: Sequence[tuple[Problem, Adjusted]]) -> Sequence[tuple[Problem, Adjusted]]:
     """The fits, with the views from which a target would be estimated."""
     return _few_enough(fits, None) or fits

@@ -132,7 +132,7 @@ def reestimate_centre_and_target(
     which the evidence falls as that of a normal distribution. Empty if the given centre is as probable, or if
     the points do not determine the target.
     """
-    from neurocal_cli.adjustment.board.find import evidence_as_given, find_target
+    from neurocal_cli.adjustment.board.find import find_target, gain_over_given
 
     rich = state.model == "rich"
     if rich:
@@ -155,7 +155,7 @@ def reestimate_centre_and_target(
     kept, found = find_target([fit]), find_target([fitted(free_centre=True)])
     if found is None:
         return ()
-    gain = found.evidence - (evidence_as_given([fit]) if kept is None else kept.evidence)
+    gain = gain_over_given(found, [fit]) if kept is None else found.evidence - kept.evidence
     problem, adjusted = found.fits[0]
     spare = max(views.n_equations - problem.n_parameters, 1)
     as_well = float(adjusted.cost.sum()) <= AS_WELL * variance * spare
