@@ -128,6 +128,23 @@ def test_a_marker_that_was_read_wrongly_is_left_out() -> None:
     assert place(plane, Marks(number[:1], corners[:1], "DICT_4X4_50")) is None
 
 
+def test_markers_that_fit_both_patterns_tell_nothing() -> None:
+    plane = plane_of("charuco:7x6:40:28:DICT_5X5_100")
+    cells = marked_cells(plane, Print(legacy=True))
+    # Without those at the ends of the rows, the board of today's pattern is the same one square aside.
+    inner = (cells.cell[:, 0] > 0) & (cells.cell[:, 0] < 4)
+    H = np.array([[40.0, 6, 30], [-5, 35, 60], [1e-2, 2e-2, 1]])
+    mapped = cells.corners @ H[:, :2].T + H[:, 2]
+    corners = mapped[..., :2] / mapped[..., 2:]
+    part = place(plane, Marks(cells.number[inner], corners[inner], "DICT_5X5_100"))
+    whole = place(plane, Marks(cells.number, corners, "DICT_5X5_100"))
+    assert part is not None
+    assert part.unsure
+    assert whole is not None
+    assert whole.how.legacy
+    assert not whole.unsure
+
+
 def test_the_light_of_a_pattern_is_that_of_the_blurred_pattern() -> None:
     rng = np.random.default_rng(0)
     n, fine, sigma = 4, 25, 1.3

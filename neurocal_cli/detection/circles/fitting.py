@@ -39,6 +39,7 @@ from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.fitting.strips import Single
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -126,11 +127,8 @@ def _pixel_radius(at: SmoothMap, places: Array, radius: float) -> float:
 def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
     """Fit all circles: shift (2,), growth, levels and blur."""
     used = pixels.root > 0
-    values = np.where(used, pixels.value, np.nan)
-    with np.errstate(invalid="ignore"):
-        dark = np.nanmedian(np.where(pixels.d < -0.5 * blur, values, np.nan), axis=1)
-        light = np.nanmedian(np.where(pixels.d > 0.5 * blur, values, np.nan), axis=1)
-    usual = [float(np.nanmedian(one)) for one in (dark, light)]
+    dark, light = (_mean(pixels.value, used & (sign * pixels.d > 0.5 * blur)) for sign in (-1, 1))
+    usual = [upper_median(one[np.isfinite(one)]) if np.isfinite(one).any() else 0.0 for one in (dark, light)]
     dark, light = (
         np.where(np.isfinite(one), one, other) for one, other in zip((dark, light), usual, strict=True)
     )
@@ -144,6 +142,13 @@ def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
     unit = replace(pixels, root=pixels.root / np.float32(np.sqrt(noise)))
     fit = fit_batch(circle_model, unit, start, prior, shape, _STEPS)
     return fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise))
+
+
+def _mean(values: Single, which: NDArray[np.bool_]) -> Array:
+    """Mean (N,) of some of the pixels; NaN for none."""
+    count = which.sum(axis=1)
+    total = np.where(which, values, 0).sum(axis=1, dtype=float)
+    return np.divide(total, count, out=np.full(len(count), np.nan), where=count > 0)
 
 
 def circle_model(data: CirclePixels, values: Array, shape: ProfileShape) -> Linearised:

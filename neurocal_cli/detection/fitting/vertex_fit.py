@@ -51,6 +51,7 @@ from neurocal_cli.detection.medians import upper_median
 FIRST, SECOND = 0, 2
 # Insensitive.
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
+_NO_VARIANCE = 1e-12  # px^2, of fits that are not determined
 _RIDGE = 1e-6  # keeps the gradients of vertices without pixels finite
 _NOTABLE = 1.0  # variance of the gradients, relative to that of their errors, from which they are fitted
 # Number of terms of the series for crossings with a cosine below each limit, and for all others;
@@ -92,7 +93,9 @@ def fit_grid_vertices(
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + at.variance(grid, line.normal)
         variance *= fitted.map.excess
-        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
+        departure = np.maximum(
+            departure, np.abs(fit.values[:, which]) / np.sqrt(np.maximum(variance, _NO_VARIANCE))
+        )
     # Map, blur and levels come from the edges: if no edge is reliable, no vertex is.
     return fit, lines, is_reliable(fit, departure) & fitted.good.any()
 

@@ -10,6 +10,8 @@ brightness. From there, further vertices are predicted by those already found.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,7 @@ class Placed:
     cells: Cells
     at: NDArray[np.intp]  # (N,) their positions among the cells
     ground: Array  # (N, 4, 2) [squares] their corners on the board
+    unsure: bool = False  # whether as many markers agree in another print
 
 
 def place(plane: Plane, marks: Marks) -> Placed | None:
@@ -56,8 +59,12 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
         at = cells.of(some.number)
         ground = plane.spread(cells.corners[at])
         kept = _agreeing(ground, some.corners)
-        if len(kept) >= 2 and (best is None or len(kept) > len(best.at)):
+        if len(kept) < 2:
+            continue
+        if best is None or len(kept) > len(best.at):
             best = Placed(some.only(kept), how, cells, at[kept], ground[kept])
+        elif len(kept) == len(best.at):
+            best = replace(best, unsure=True)
     return best
 
 

@@ -38,6 +38,11 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
         found = None if placed is None else find_vertices(plane, placed, light)
         if placed is None or found is None:
             continue
+        if placed.unsure:
+            raise NoBoardError(
+                "the markers fit today's and the legacy pattern of OpenCV; show more of the board, or give "
+                "legacy: true or false in a board file"
+            )
         located.append(_located(plane, index, placed, *found))
         notes.append(_told(plane, placed))
     if not located:
@@ -62,9 +67,9 @@ def _placed(plane: Plane, grey: NDArray[np.uint8]) -> Placed | None:
     for dictionary in (named,) if named else USUAL:
         for marks in read_markers(grey, dictionary, first, count, border):
             placed = place(plane, marks)
-            if placed is not None and (best is None or len(placed.at) > len(best.at)):
+            if placed is not None and (best is None or len(placed.at) > len(best.at) or best.unsure):
                 best = placed
-            if best is not None and len(best.at) >= _MOST * count:
+            if best is not None and len(best.at) >= _MOST * count and not best.unsure:
                 break
         if best is not None and len(best.at) >= _ENOUGH:
             break
