@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -533,6 +534,17 @@ def test_a_known_camera_without_its_model_takes_the_option(tmp_path: Path) -> No
     result = run(*words, "--distortion", "fisheye", "-o", tmp_path / "poses.yaml")
     assert result.exit_code in (0, 3), result.stderr
     assert "distortion_model: equidistant" in (tmp_path / "poses.yaml").read_text()
+
+
+def test_toml_is_read_without_python_s_reader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Python 3.10 has none."""
+    name = "neurocal_cli.files.exchange.document.sys"
+    text = f'[cam_0]\nname = "A"\nsize = [ 640, 480,]\nmatrix = {K}\ndistortions = {D}\n[metadata]\n'
+    (tmp_path / "rig.toml").write_text(text)
+    monkeypatch.setattr(name, SimpleNamespace(version_info=(3, 10)))
+    (camera,) = read_cameras([tmp_path / "rig.toml"]).cameras
+    check(camera, CAMERA, FIVE)
+    assert (camera.name, camera.image_size) == ("A", (640, 480))
 
 
 def test_arrays_without_names_are_told_by_their_shape(tmp_path: Path) -> None:

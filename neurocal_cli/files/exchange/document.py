@@ -7,6 +7,7 @@ The tree is that of YAML, JSON (also with comments), OpenCV's and Agisoft's XML,
 from __future__ import annotations
 
 import io
+import json
 import re
 import sys
 import zipfile
@@ -116,6 +117,16 @@ class Document:
         return value if isinstance(value, dict) else {}
 
 
+def _value(text: str) -> Any:
+    """A number, or what TOML writes like JSON, for Python 3.10, which cannot read TOML; or text."""
+    if is_number(text):
+        return float(text)
+    try:
+        return json.loads(re.sub(r",(?=\s*\])", "", text))
+    except (ValueError, RecursionError):
+        return text
+
+
 def few_numbers(text: str) -> list[list[float]] | None:
     """Rows of a text of at most 16 numbers and nothing else; None for other texts."""
     if len(text) > 1000 or not text.strip():
@@ -204,10 +215,7 @@ def _sections(text: str, source: str) -> dict[str, Any]:
     except configparser.Error as error:
         line = getattr(error, "lineno", None)
         raise FormatError("is neither TOML nor sections of key = value; correct it", source, line) from error
-    return {
-        name: {key: float(value) if is_number(value) else value for key, value in parser[name].items()}
-        for name in parser.sections()
-    }
+    return {name: {key: _value(value) for key, value in parser[name].items()} for name in parser.sections()}
 
 
 def assignments(text: str) -> dict[str, Any]:
