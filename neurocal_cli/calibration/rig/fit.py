@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
-from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES, Named
+from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES
+from neurocal_cli.calibration.rig.changes import evidence_by_parts, evidence_of_odd, of_rig, seen_again
 from neurocal_cli.calibration.rig.combine import rig_problem
 from neurocal_cli.calibration.rig.consensus import PAIR_ANEW, SHIFTED
 from neurocal_cli.calibration.rig.covariance import (
@@ -151,8 +152,10 @@ def _without_contradictions(
     if suspects:
         # The others tell whether the suspects have a cause in common, or which of them fit after all.
         still = at_fit(_detached(problem, _named(left_out), names), fit)
-        found = named_cause(still, names, free=_of_rig(still))[0]
-        if found is not None and _evidence(still, fit, found) > _evidence_of_odd(still, fit, len(suspects)):
+        found = named_cause(still, names, free=of_rig(still))[0]
+        if found is not None and evidence_by_parts(still, fit, found) > evidence_of_odd(
+            still, fit, len(suspects)
+        ):
             held = set(suspects)
         else:
             held = set(_views(problem, fitting(still))) & set(suspects)
@@ -168,50 +171,11 @@ def _without_contradictions(
             why = f"{TAKEN} {'after' if found.is_late else 'before'} {found.text}"
             left_out = before | dict.fromkeys(_views(problem, found.apart), why)
             fit, warnings = fitted()
-            again = _seen_again(_detached(problem, before, names), fit, names)
-            if again is None or again.text == found.text:
+            again = seen_again(_detached(problem, before, names), fit, found)
+            if again.text == found.text:
                 break
             found = again
     return fit, left_out, warnings
-
-
-def _evidence(still: RigFit, fit: RigFit, found: Named) -> float:
-    """Log odds of a cause; of a second geometry by its own fit, since it may be beyond the linear range."""
-    if found.cause not in TWO_GEOMETRIES:
-        return found.evidence
-    problem, inside = still.problem, np.zeros(len(still.problem.scale), dtype=bool)
-    for views, observed in zip(found.apart, problem.observations, strict=True):
-        inside[observed.view[views]] = True
-    part = problem.detached([~inside[observed.view] for observed in problem.observations])
-    free = _of_rig(still)
-    alone = at_fit(part, fit)
-    own = scatter(adjust_rig(part, alone.state, free))[0]
-    squares, degrees = scatter(still)
-    choices = np.log(problem.together.sum() * len(problem.cameras))
-    m = int(free.sum())
-    return log_evidence(squares, scatter(fit)[0] + own, degrees, m) - float(choices)
-
-
-def _evidence_of_odd(still: RigFit, fit: RigFit, n: int) -> float:
-    """Log odds of n views that contradict the others, each for reasons of its own."""
-    squares, degrees = scatter(still)
-    return log_evidence(squares, scatter(fit)[0], degrees, 6 * n) if degrees else 0.0
-
-
-def _seen_again(problem: RigProblem, fit: RigFit, names: Sequence[str]) -> Named | None:
-    """What the fit of one part says that changed before the other one, which `problem` has as well.
-
-    Large changes look different where the fit is a compromise between both parts.
-    """
-    still = at_fit(problem, fit)
-    return named_cause(still, names, TWO_GEOMETRIES, np.zeros(len(still.free), dtype=bool))[0]
-
-
-def _of_rig(fit: RigFit) -> NDArray[np.bool_]:
-    """(n_shared,) which shared unknowns are the poses of the cameras."""
-    free = np.zeros(len(fit.free), dtype=bool)
-    free[np.concatenate(fit.state.columns.rigs)] = True
-    return free
 
 
 def _with_agreeing_poses(cameras: list[Calibration], views: FrameNames) -> list[Calibration]:
