@@ -20,7 +20,7 @@ from neurocal_cli.observations.markers import DICTIONARIES, code_count
 
 _ENOUGH = 4  # markers that agree, after which no other dictionary is tried
 _MOST = 0.5  # share of the markers after which no other scale is tried
-_STRANGE = 4  # markers of another dictionary that are worth a word
+_STRANGE = 8  # markers of another dictionary that are worth a word
 _MIRRORED = ((1, 0), (0, -1))
 
 
