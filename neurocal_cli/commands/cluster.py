@@ -22,6 +22,7 @@ Result = TypeVar("Result")
 _AHEAD = 8  # tasks per thread that wait at the workers' side, so that no worker waits
 _WAIT = 30  # seconds for the first worker
 _GONE = 10  # seconds without the scheduler, after which it will not come back
+_LOST = "the scheduler is gone; start it, then the same command goes on"
 _TRIES = 1  # after a worker died
 
 
@@ -41,6 +42,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
         "distributed.admin.log-format": "%(message)s",
         "distributed.worker.memory.terminate": 0.95,  # of its share; the task is then tried elsewhere
     }
+    _silence()
     with dask.config.set(settings), interrupts_held():
         cluster = LocalCluster(
             n_workers=workers,
@@ -65,7 +67,7 @@ def running_cluster(address: str) -> Iterator[Client]:
     """
     from distributed import Client
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _silence()
     try:
         client = Client(address, set_as_default=False, timeout=_WAIT)
     except (OSError, ValueError, TimeoutError) as error:
@@ -81,6 +83,12 @@ def running_cluster(address: str) -> Iterator[Client]:
             ) from error
         _check_versions(client)
         yield client
+
+
+def _silence() -> None:
+    """Keep tracebacks of lost connections off the terminal: what follows from them is told in one line."""
+    for name in ("distributed", "distributed.client", "distributed.core", "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def _check_versions(client: Client) -> None:
@@ -142,16 +150,13 @@ def work_off_by(
             future = finished.get(timeout=1.0)
         except Empty:
             lost = 0 if client.status == "running" else lost + 1
-            if lost >= _GONE:
-                raise NeurocalError(
-                    "the scheduler is gone; start it, then the same command goes on"
-                ) from None
-            continue
+            if lost < _GONE:
+                continue
+            raise NeurocalError(_LOST) from None
+        if future.status not in ("finished", "error"):  # cancelled, for the scheduler is gone
+            raise NeurocalError(_LOST)
         task = open_tasks.pop(future.key)
-        try:
-            result = future.result() if future.status == "finished" else None
-        except Exception:  # of the cluster, for `work` raises nothing
-            result = None
+        result = future.result() if future.status == "finished" else None  # else its worker died, again
         future.release()
         for following in rest:
             submit(following)
