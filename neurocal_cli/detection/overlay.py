@@ -54,7 +54,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     kinds = [label(located, measured).kind for located, measured in pairs]
     every = np.concatenate(kinds)
     counts = [f"{name} ({n})" for kind, name in _KINDS.items() if (n := np.count_nonzero(every == kind))]
-    offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
+    offsets = ", ".join(f"{round(measured.polarity, 3) + 0.0:+.3f}" for measured in detection.measured)
     lines = [
         f"{len(detection.ids)} points, {detection.rejected} rejected; residuals x {scale}: rms "
         f"{np.sqrt((lengths**2).mean()):.3g} px, largest {lengths.max():.3g} px",

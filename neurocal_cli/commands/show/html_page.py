@@ -225,7 +225,7 @@ def enlargement(residuals: Array, size: tuple[int, int]) -> float:
 
 
 def scatter(residuals: Array) -> str:
-    """Draw residuals (N, 2) [px] as points, with a circle of three times the rms per coordinate."""
+    """Draw residuals (N, 2) [px] as points, with a circle of their rms, as in the pictures of ``--plot``."""
     sigma = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0
     if not sigma > 0:
         return ""
@@ -235,9 +235,9 @@ def scatter(residuals: Array) -> str:
     return (
         '<svg viewBox="-6 -6 12 12" role="img" aria-label="du and dv of all points">'
         '<rect x="-6" y="-6" width="12" height="12" class="frame"/>'
-        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/><circle r="3" class="axis"/>'
+        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/><circle r="{np.sqrt(2):.3f}" class="axis"/>'
         f'<path d="{dots}" class="dots" stroke-width="0.11"/>'
-        f'<text x="2.3" y="2.75" font-size="0.5">{3 * sigma:.2g} px</text></svg>'
+        f'<text x="1.2" y="1.6" font-size="0.5">rms {np.sqrt(2) * sigma:.2g} px</text></svg>'
     )
 
 

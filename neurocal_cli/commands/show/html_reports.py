@@ -187,7 +187,7 @@ def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) ->
             _uncertainty(calibration),
             figure(
                 scatter(residuals),
-                "du and dv. Noise makes a round cloud about the middle; the circle is three times its rms.",
+                "du and dv. Noise makes a round cloud about the middle; the circle is their rms.",
             ),
             figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
         ]
