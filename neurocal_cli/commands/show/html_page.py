@@ -235,7 +235,8 @@ def scatter(residuals: Array) -> str:
     return (
         '<svg viewBox="-6 -6 12 12" role="img" aria-label="du and dv of all points">'
         '<rect x="-6" y="-6" width="12" height="12" class="frame"/>'
-        f'<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/><circle r="{np.sqrt(2):.3f}" class="axis"/>'
+        '<path d="M-6 0H6M0 -6V6" class="axis" stroke-width="0.02"/>'
+        f'<circle r="{np.sqrt(2):.3f}" class="axis"/>'
         f'<path d="{dots}" class="dots" stroke-width="0.11"/>'
         f'<text x="1.2" y="1.6" font-size="0.5">rms {np.sqrt(2) * sigma:.2g} px</text></svg>'
     )
