@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections.abc import Mapping
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -102,13 +103,24 @@ def _in_tree(root: str) -> list[DataSet]:
         name = os.path.basename(top) if inner == os.curdir else inner.replace(os.sep, "-")
         if not _is_name(name):
             raise InputError(f"{one_line(folder)}: cannot be the name of a folder of results; rename it")
-        cells = {"images": os.curdir} if images else {"points": ";".join(points)}
+        cells = {"images": os.curdir} if images else _of_points(points)
         if images and (board := _board_above(folder, top)):
             cells["board"] = board
         found.append(DataSet(name, cells, one_line(folder), folder))
     if not found:
         raise InputError(f"{one_line(root)}: no folder in it holds images or points; give another folder")
     return found
+
+
+def _of_points(files: list[str]) -> dict[str, str]:
+    """The columns of files of points: left.csv and right.csv are a pair, cam0.csv, cam1.csv, ... a rig."""
+    named = {os.path.splitext(name)[0].lower(): name for name in files}
+    if len(named) == len(files):
+        if set(named) == {"left", "right"}:
+            return {"points": named["left"], "right": named["right"]}
+        if len(named) > 1 and all(re.fullmatch(r"cam\d+", name) for name in named):
+            return named
+    return {"points": ";".join(files)}
 
 
 def _board_above(folder: str, top: str) -> str:

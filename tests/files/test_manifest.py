@@ -56,6 +56,23 @@ def test_the_leaves_of_a_tree_are_data_sets_with_the_nearest_board(tmp_path: Pat
         read_data_sets(str(tmp_path / "empty"))
 
 
+@pytest.mark.parametrize(
+    ("files", "columns"),
+    [
+        (("left.csv", "right.csv"), {"points": "left.csv", "right": "right.csv"}),
+        (("cam0.csv", "cam1.csv", "cam10.csv"), {f"cam{k}": f"cam{k}.csv" for k in (0, 1, 10)}),
+        (("a.csv", "b.csv"), {"points": "a.csv;b.csv"}),
+    ],
+)
+def test_names_of_points_tell_a_pair_and_a_rig(
+    files: tuple[str, ...], columns: dict[str, str], tmp_path: Path
+) -> None:
+    for name in files:
+        (tmp_path / name).touch()
+    (found,) = read_data_sets(str(tmp_path))
+    assert found.cells == columns
+
+
 def test_two_batches_do_not_work_in_one_folder_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
     left = work_folder(str(tmp_path / "a"))
     with locked(str(tmp_path)):
