@@ -94,9 +94,9 @@ def batch(
     video) or `points` (CSV); `right` as well for a stereo pair; `cam0`, `cam1`, ... for a rig; or `lens`, the
     points of a zoom lens. Paths are relative to the manifest. All other columns are options of neurocal
     detect, calibrate, stereo, rig and lens fit by their names: `board`, `cols`, `distortion`, `no-skew` (yes
-    or no), and `measure` for detect's --points. In a tree of folders, left.csv and right.csv beside each other
-    are a stereo pair, cam0.csv, cam1.csv, ... a rig, and board.yaml describes the images in its folder and
-    below.
+    or no), and `measure` for detect's --points. In a tree of folders, left.csv and right.csv beside each
+    other are a stereo pair, cam0.csv, cam1.csv, ... a rig, and board.yaml describes the images in its folder
+    and below.
 
     The batch can be stopped at any time. The same command goes on where it was: a job is not done again if
     its commands, the contents of its inputs and the version of neurocal are the same. If a worker dies, its
