@@ -78,7 +78,6 @@ def _lines(lens: ZoomLens) -> Iterator[str]:
     yield "members:"
     for member in lens.members:
         yield f"  - scale: {member.nets.scale}"
-        yield f"    share: {number(member.share)}"
         yield f"    constants: {_constants(member.constants)}"
         yield "    networks:"
         for name, net in zip(lens.names, member.nets.nets, strict=True):
@@ -237,8 +236,7 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
             net["scatter"].number(),
         )
         nets.append(parameters)
-    share = _positive(field.get("share", 1.0))  # files of earlier versions have none
-    return Member(LensNets(scale, tuple(nets)), _read_constants(field["constants"]), share)
+    return Member(LensNets(scale, tuple(nets)), _read_constants(field["constants"]))
 
 
 def _read_constants(field: Field) -> Constants:

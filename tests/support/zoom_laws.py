@@ -1,4 +1,4 @@
-"""Six laws by which a camera follows zoom and focus, and what it sees; lengths in mm."""
+"""Four laws by which a camera follows zoom and focus, and what it sees; lengths in mm."""
 
 from __future__ import annotations
 
@@ -72,32 +72,7 @@ def law_d(z: Array, f: Array) -> dict[str, Array]:
     }
 
 
-def law_e(z: Array, f: Array) -> dict[str, Array]:
-    """Five and a half times; breathing with the square of the focus control, which grows with the zoom."""
-    alpha = 700 * np.exp(1.7 * z) * (1 + (0.04 + 0.10 * z) * f**2)
-    return {
-        "alpha_u": alpha,
-        "alpha_v": 0.99 * alpha,
-        "u0": 320 + 6 * np.sin(3 * z) - 3 * f**2,
-        "v0": 240 - 5 * z**2 + 4 * z * f**2,
-        "t_z": 1500 + 70 * z - 40 * f**2 * (0.5 + z),
-    }
-
-
-def law_f(z: Array, f: Array) -> dict[str, Array]:
-    """Seven times, of exponentials, roots and tanh: no hyperbolas."""
-    alpha = 650 * np.exp(1.5 * z + 0.2 * np.tanh(4 * (z - 0.5)))
-    alpha = alpha * (1 + 0.09 * np.sqrt(f + 0.05) * (1 + 0.5 * z))
-    return {
-        "alpha_u": alpha,
-        "alpha_v": 1.003 * alpha,
-        "u0": 320 + 6 * np.exp(-3 * z) + 4 * f,
-        "v0": 240 + 5 * np.sqrt(z + 0.1) - 3 * f * z,
-        "t_z": 1500 + 50 * np.tanh(3 * z) - 30 * np.sqrt(f + 0.05) * (0.5 + z),
-    }
-
-
-LAWS: dict[str, Law] = {"a": law_a, "b": law_b, "c": law_c, "d": law_d, "e": law_e, "f": law_f}
+LAWS: dict[str, Law] = {"a": law_a, "b": law_b, "c": law_c, "d": law_d}
 
 
 def grid(zooms: int, focuses: int) -> Array:

@@ -11,7 +11,6 @@ error no richer one lowers.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from itertools import count
 from typing import cast
 
@@ -43,7 +42,7 @@ from neurocal_cli.observations.points import Correspondences
 
 # The static calibrations are near the minimum, but not at it.
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
-_QUICK_BUDGET = Budget(starts=3, finalists=12, members=2, schedule=Schedule(120, 30, 50, 80))
+_QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 # A richer model must lower the cross-validation error to this share and the residual variance by so many
 # standard deviations. The tests of the choice in test_zoom_lens.py have both outcomes.
 _LARGEST_SHARE = 0.98
@@ -105,14 +104,9 @@ class CalibratedSettings:
     @property
     def variance(self) -> float:
         """Variance of the noise of one coordinate [px^2], from the residuals of the tables."""
-        return float(max(self.tables.normal.cost.sum() / self.freedom, 1e-18))
-
-    @property
-    def freedom(self) -> int:
-        """Number of equations minus that of the tables' unknowns; at least 1."""
         n, S = self.data.views.n_equations, self.lens.n_settings
         unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
-        return max(int(n) - unknowns, 1)
+        return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
     @property
     def may_reject(self) -> bool:
@@ -143,32 +137,20 @@ class CalibratedSettings:
 
 def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
-    failures: list[DegenerateGeometryError] = []
-
-    @cache
-    def calibrated(model: str) -> CalibratedSettings | None:
-        try:
-            return calibrate_settings(lens, model, options)
-        except DegenerateGeometryError as error:
-            failures.append(error)
-            return None
-
-    simple, *_, richest = POLYNOMIAL_MODELS
-    best, rich = calibrated(simple), calibrated(richest)
-    if best is not None and rich is not None:
-        # The richest model contains all others, so none of them has a smaller error.
-        least = rich.tables.normal.cost.sum() / (_least_gain(best) * best.freedom)
-        if len(best.rejected) == len(rich.rejected) and least >= best.variance:
-            return best
+    best: CalibratedSettings | None = None
+    failure: DegenerateGeometryError | None = None
     best_px: float | None = None  # computed when a richer model is compared
     for model in POLYNOMIAL_MODELS:
-        start = calibrated(model)
-        if start is None:
+        try:
+            start = calibrate_settings(lens, model, options)
+        except DegenerateGeometryError as error:
+            failure = error
             continue
         if best is None:
             best = start
             continue
-        if not start.variance < best.variance * _least_gain(start):
+        noise = np.sqrt(2 / start.data.views.n_equations)  # of a variance, as a share of it
+        if not start.variance < best.variance * (1 - _SIGMAS * noise):
             continue
         options.report(f"trying distortion model {model}", 0.5)
         best_px = _held_out(best, options) if best_px is None else best_px
@@ -176,13 +158,9 @@ def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
         if error_px < _LARGEST_SHARE * best_px:
             best, best_px = start, error_px
     if best is None:
-        raise failures[-1]
+        assert failure is not None
+        raise failure
     return best
-
-
-def _least_gain(start: CalibratedSettings) -> float:
-    """Share of another model's variance below which that of a model is no accident."""
-    return 1 - _SIGMAS * float(np.sqrt(2 / start.data.views.n_equations))
 
 
 def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
@@ -255,9 +233,8 @@ def calibrate_each(lens: LensPoints, data: PixelData, seed: int, skew: bool, pro
     good, reasons = np.zeros(S, dtype=bool), {}
     number = {name: k for k, name in enumerate(lens.points.view_names)}
     rows = lens.point_setting
-    with_model = "" if data.model == "none" else f" with distortion {data.model}"
     for s in range(S):
-        progress(f"calibrating each setting{with_model}", s / S)
+        progress("calibrating each setting", s / S)
         try:
             cal = _calibrate(lens.points.select(rows == s), data.model, seed, skew)
         except NeurocalError as error:

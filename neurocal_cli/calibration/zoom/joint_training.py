@@ -45,7 +45,7 @@ _OPTIONS = DescentOptions(
     damping=1e-4, shrink=0.1, least_damping=1e-12, largest_damping=1e8,
     tolerance=0.0, negligible=0.02, by_promise=False, flat=0.0, max_iterations=25,
 )  # fmt: skip
-_PRIOR_ROUNDS = 2  # the first rounds, which update the priors
+_PRIOR_ROUNDS = 4  # the first rounds, which update the priors
 # test_alternating_ends_where_joint_training_ends in test_zoom_lens_networks.py checks both.
 _RATE = 0.35  # eta: below 2 / (number of parameters that compensate for each other)
 _EPOCHS = 150  # most turns on one set of normal matrices

@@ -143,24 +143,18 @@ def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple
     by_sum = (1 - g * g) * weights[:, None, part["v"]]  # by the argument of each second-layer unit
     by_r = by_sum @ U + weights[:, None, part["q"]]
     by_r[:, :, : 2 * D] += z @ _products(topology, weights)
+    by_argument = by_r[:, :, 2 * D :] * (1 - own_units * own_units)
     squashed, inside = np.tanh(weights[:, None, part["a"]]), np.clip(x, -1, 1)
     by_tilt = by_r[:, :, D : 2 * D] * rational * -inside / (1 + _LARGEST_TILT * squashed * inside)
-    by_tilt *= _LARGEST_TILT * (1 - squashed * squashed)
-    J = np.empty((B, topology.n_weights, n))  # so that a part is one piece of memory
-    by_sum, rows = np.swapaxes(by_sum, 1, 2), np.swapaxes(r, 1, 2)
-    J[:, part["a"]] = np.swapaxes(by_tilt, 1, 2)
-    if topology.own:
-        by_argument = np.swapaxes(by_r[:, :, 2 * D :] * (1 - own_units * own_units), 1, 2)
-        np.multiply(by_argument, np.repeat(x.T, topology.own, axis=0), out=J[:, part["s"]])
-        J[:, part["c"]] = by_argument
-    if H:
-        hidden = J[:, part["U"]].reshape(B, H, topology.width, n)
-        np.multiply(by_sum[:, :, None], rows[:, None], out=hidden)
-        J[:, part["b"]], J[:, part["v"]] = by_sum, np.swapaxes(g, 1, 2)
-    J[:, part["q"]], J[:, part["o"]] = rows, 1.0
     first, second = topology.pairs
-    np.multiply(rows[:, first], rows[:, second], out=J[:, part["m"]])
-    return y, np.swapaxes(J, 1, 2)
+    J = np.empty((B, n, topology.n_weights))
+    J[:, :, part["a"]] = by_tilt * _LARGEST_TILT * (1 - squashed * squashed)
+    J[:, :, part["s"]] = by_argument * np.repeat(x, topology.own, axis=1)
+    J[:, :, part["c"]] = by_argument
+    J[:, :, part["U"]] = (by_sum[..., None] * r[:, :, None]).reshape(B, n, -1)
+    J[:, :, part["b"]], J[:, :, part["v"]], J[:, :, part["q"]], J[:, :, part["o"]] = by_sum, g, r, 1.0
+    J[:, :, part["m"]] = r[:, :, first] * r[:, :, second]
+    return y, J
 
 
 def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array]:
@@ -196,8 +190,7 @@ class Schedule:
 
     iterations: int = 300
     warm: int = 40  # before the first update of the priors
-    settle: int = 90  # before the first update of the scatter
-    heat: int = 90  # after which only the best networks are trained further
+    settle: int = 160  # before the first update of the scatter
     period: int = 4  # from one update of the priors to the next
 
 
@@ -224,46 +217,16 @@ def train(
     The controls x (n, D) are scaled to about [-1, 1], the targets (n,) centred and scaled to a spread of
     about 1. Their variances (n,) are 0 where unknown, so that the scatter is the noise.
     """
-    training = Training(topology, x, targets, variance, weights, schedule or Schedule())
-    training.advance(training.schedule.iterations)
-    return training.result()
-
-
-class Training:
-    """A stack of networks in training, which may be interrupted; the arguments are those of `train`."""
-
-    def __init__(
-        self,
-        topology: Topology,
-        x: Array,
-        targets: Array,
-        variance: Array,
-        weights: Array,
-        schedule: Schedule,
-    ) -> None:
-        self.schedule, self.iteration = schedule, 0
-        self._learner = _NetworkStack(topology, x, targets, variance, weights)
-        self._descent = LevenbergMarquardt(self._learner, _OPTIONS, floor=-1.0)
-
-    def advance(self, until: int) -> None:
-        """Train up to an iteration."""
-        schedule, learner, descent = self.schedule, self._learner, self._descent
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            for iteration in range(self.iteration, until):
-                if iteration >= schedule.warm and (iteration - schedule.warm) % schedule.period == 0:
-                    learner.update_priors(allow_scatter=iteration >= schedule.settle)
-                    descent.renew()
-                descent.step()
-        self.iteration = until
-
-    def keep(self, some: NDArray[np.intp]) -> None:
-        """Train only some of the networks further."""
-        self._learner.keep(some)
-        self._descent = LevenbergMarquardt(self._learner, _OPTIONS, floor=-1.0)
-
-    def result(self) -> TrainedNets:
-        """The networks as they are."""
-        return self._learner.result()
+    learner = _NetworkStack(topology, x, targets, variance, weights)
+    schedule = schedule or Schedule()
+    descent = LevenbergMarquardt(learner, _OPTIONS, floor=-1.0)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for iteration in range(schedule.iterations):
+            if iteration >= schedule.warm and iteration % schedule.period == 0:
+                learner.update_priors(allow_scatter=iteration >= schedule.settle)
+                descent.renew()
+            descent.step()
+    return learner.result()
 
 
 class _NetworkStack:
@@ -312,18 +275,10 @@ class _NetworkStack:
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
         """Accept the trial for networks that improved."""
-        if better.all():
-            self.w, self.y, self.J, self.cost = trial
-            return
         w, y, J, cost = trial
         self.w, self.y = np.where(better[:, None], w, self.w), np.where(better[:, None], y, self.y)
         self.J = np.where(better[:, None, None], J, self.J)
         self.cost = np.where(better, cost, self.cost)
-
-    def keep(self, some: NDArray[np.intp]) -> None:
-        """Keep some of the networks."""
-        for name in ("w", "a", "tau2", "y", "J", "prior", "weight", "cost"):
-            setattr(self, name, getattr(self, name)[some])
 
     def update_priors(self, allow_scatter: bool) -> None:
         """Update the priors, half the way on a logarithmic scale, and the scatter."""

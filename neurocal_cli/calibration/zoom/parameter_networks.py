@@ -9,15 +9,9 @@ parameters are fitted in an order, like the polynomials of Willson (1994). t_z c
 certain. The others are then estimated with t_z held at the output of its networks. alpha_u, which is
 correlated with t_z, compensates for the remaining error of these networks, and its targets are precise.
 
-The networks of all topologies and starts race: after a part of the training, only those with the highest
-evidence are trained further (`_Race`). The noise is far smaller than the variation of the parameters, so
-networks may pass through all settings and oscillate between them, with an evidence that is hardly lower. Few
-settings cannot tell them from smooth ones. The committee is therefore chosen by the score
-
-    log evidence - 2 log mean |second derivatives|^2,
-
-a prior that prefers a lens that bends little, as splines do. Of the networks of the highest score, the half
-that agree most between the settings are taken.
+Evidence ranks networks of all topologies. The noise is far smaller than the variation of the parameters, so
+some of the best networks overfit: they pass through all settings and oscillate between them. The committee
+therefore consists of those of the best networks that agree most between the settings (`_agreeing`).
 """
 
 from __future__ import annotations
@@ -33,11 +27,11 @@ from neurocal_cli.adjustment.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.calibration.zoom.mlfn import (
     Schedule,
     Topology,
-    Training,
     prior_precision,
     respond,
     respond_with_jacobian,
     sparse_controls,
+    train,
 )
 from neurocal_cli.calibration.zoom.quadratic_error import inverse
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -53,10 +47,8 @@ TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING = 2.0
 _LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
-_GRID = 13  # values of each control between which bending is measured
-_STRAIGHT = 1e-6  # bending that counts as none, in units of the targets' spread
-_STIFFNESS = 2.0  # power of the bending by which a network is less probable; 1 to 3 differ little
-_OF = 2  # networks of the highest score for each one in the committee
+_AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
+_GRID = 13  # values of each control at which networks are compared
 
 
 @frozen_dataclass(eq=False)
@@ -191,9 +183,9 @@ class Budget:
     """
 
     topologies: tuple[tuple[int, int], ...] | None = None  # None: those that suit the number of settings
-    starts: int = 10  # random starts of each topology
-    finalists: int = 24  # networks of all topologies that are trained to the end
-    members: int = 8  # size of the committee
+    starts: int = 12  # random starts of each topology
+    best: int = 20  # networks of the highest evidence that may be in the committee
+    members: int = 12  # size of the committee
     schedule: Schedule = field(default_factory=Schedule)
 
     def __post_init__(self) -> None:
@@ -225,6 +217,8 @@ def fit_committee(
     `report` is called with the share that is done. The first of the members consists of the networks that
     agree best with the others.
     """
+    # A grid over the whole range of the controls.
+    probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=x.shape[1])))
     L = len(names)
     first = [j for j, name in enumerate(names) if name == "t_z"]
     order = [*first, 2, 3, *range(4 + len(first), L), 0, 1]
@@ -232,20 +226,16 @@ def fit_committee(
     chosen: dict[int, list[ParameterNet]] = {}
     scale = "log"
     for count, j in enumerate(order):
-
-        def inner(share: float, count: int = count) -> None:
-            report((count + share) / L)
-
+        report(count / L)
         values, spread = _given(local, values, H, variance, held)
         targets, derivative = values[:, j], np.ones(len(x))
         if j == 0:
-            scale, chosen[j] = _best_scale(x, values[:, 0], spread[:, 0], rng, budget, inner)
+            scale, nets = _best_scale(x, values[:, 0], spread[:, 0], rng, budget)
         else:
             if j == 1:
                 targets, derivative = np.log(values[:, 1] / values[:, 0]), 1 / values[:, 1]
-            race = _Race(x, targets, spread[:, j] * derivative**2, rng, budget)
-            race.heat(inner)
-            chosen[j] = race.final()
+            nets, _ = _fit(x, targets, spread[:, j] * derivative**2, rng, budget)
+        chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
         if names[j] == "t_z":
             values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
             held[j] = True
@@ -269,101 +259,40 @@ def _given(
 
 
 def _best_scale(
-    x: Array,
-    alpha: Array,
-    variance: Array,
-    rng: np.random.Generator,
-    budget: Budget,
-    report: Callable[[float], None],
+    x: Array, alpha: Array, variance: Array, rng: np.random.Generator, budget: Budget
 ) -> tuple[str, list[ParameterNet]]:
     """The scale of alpha_u with the highest evidence, and its networks."""
-    races = {}
-    for k, scale in enumerate(SCALES):
+    fits = {}
+    for scale in SCALES:
         targets, derivative = to_scale(scale, alpha)
-        race = _Race(x, targets, variance * derivative**2, rng, budget)
-
-        def inner(share: float, k: int = k) -> None:
-            report((k + share) / len(SCALES))
-
-        race.heat(inner)
+        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget)
         # The density of the targets as one of alpha.
-        races[scale] = (race.evidence + float(np.log(np.abs(derivative)).sum()), race)
-    best = max(races, key=lambda name: races[name][0])
-    scale = best if races[best][0] > races["log"][0] + _LOG_ODDS else "log"
-    return scale, races[scale][1].final()
+        fits[scale] = (evidence + float(np.log(np.abs(derivative)).sum()), nets)
+    best = max(fits, key=lambda name: fits[name][0])
+    scale = best if fits[best][0] > fits["log"][0] + _LOG_ODDS else "log"
+    return scale, fits[scale][1]
 
 
-class _Race:
-    """Networks of all topologies and starts in training; only the most probable are trained to the end."""
-
-    def __init__(
-        self, x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget
-    ) -> None:
-        self.budget, self.centre, spread = budget, float(targets.mean()), float(targets.std())
-        # Equal targets have no spread; their noise, or 1, replaces it.
-        self.spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(self.centre)) or 1.0
-        scaled, relative = (targets - self.centre) / self.spread, variance / self.spread**2
-        self.trainings = []
-        for own, hidden in budget.topologies or _suitable_topologies(x):
-            topology = Topology(x.shape[1], own, hidden)
-            start = topology.random_weights(budget.starts if own + hidden else 1, rng)
-            training = Training(topology, x, scaled, relative, start, budget.schedule)
-            self.trainings.append((topology, training))
-        self.x = x
-
-    def heat(self, report: Callable[[float], None]) -> None:
-        """Train all networks for a part of the schedule and keep the best."""
-        found = []
-        for k, (_, training) in enumerate(self.trainings):
-            report(k / len(self.trainings))
-            training.advance(self.budget.schedule.heat)
-            found.append(training.result().evidence)
-        every = np.sort(np.concatenate(found))[::-1]
-        least = every[min(self.budget.finalists, len(every)) - 1]
-        kept = []
-        for (topology, training), evidence in zip(self.trainings, found, strict=True):
-            some = np.flatnonzero(evidence >= least)
-            if len(some):
-                training.keep(some)
-                kept.append((topology, training))
-        self.trainings = kept
-        self.evidence = float(every[0]) - len(self.x) * float(np.log(self.spread))
-
-    def final(self) -> list[ParameterNet]:
-        """Train what is left to the end; of the networks of the highest score, those that agree most."""
-        nets, evidence = [], []
-        for topology, training in self.trainings:
-            training.advance(self.budget.schedule.iterations)
-            trained = training.result()
-            for w, a, tau2, e in zip(
-                trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
-            ):
-                scatter = float(tau2) * self.spread**2
-                nets.append(ParameterNet(topology, w, a, self.centre, self.spread, scatter))
-                evidence.append(float(e))
-        outputs = self._on_grid(nets)
-        score = np.array(evidence) - _STIFFNESS * np.log(_bending(outputs))
-        best = np.argsort(-score, kind="stable")[: _OF * self.budget.members]
-        distance = (outputs[best] - np.median(outputs[best], axis=0)).reshape(len(best), -1)
-        order = best[np.argsort((distance**2).mean(axis=1), kind="stable")]
-        order = order[: max(1, len(best) // _OF)]
-        return [nets[order[k % len(order)]] for k in range(self.budget.members)]
-
-    def _on_grid(self, nets: Sequence[ParameterNet]) -> Array:
-        """Scaled outputs on a grid over the whole range of the controls (n, _GRID, ...)."""
-        D = self.x.shape[1]
-        probe = np.array(list(product(np.linspace(-1, 1, _GRID), repeat=D)))
-        outputs = np.array([(net.output(probe) - self.centre) / self.spread for net in nets])
-        return outputs.reshape(len(nets), *[_GRID] * D)
-
-
-def _bending(outputs: Array) -> Array:
-    """(n,) mean square of the second derivatives of functions on a grid (n, ...), up to a common factor."""
-    total = np.full(len(outputs), _STRAIGHT)
-    for i, j in product(range(1, outputs.ndim), repeat=2):
-        second = np.diff(np.diff(outputs, axis=i), axis=j).reshape(len(outputs), -1)
-        total += (second**2).mean(axis=1)
-    return total
+def _fit(
+    x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget
+) -> tuple[list[ParameterNet], float]:
+    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets."""
+    centre, spread = float(targets.mean()), float(targets.std())
+    # Equal targets have no spread; their noise, or 1, replaces it.
+    spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
+    scaled = (targets - centre) / spread
+    nets, evidence = [], []
+    for own, hidden in budget.topologies or _suitable_topologies(x):
+        topology = Topology(x.shape[1], own, hidden)
+        start = topology.random_weights(budget.starts if own + hidden else 1, rng)
+        trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
+        for w, a, tau2, e in zip(
+            trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
+        ):
+            nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
+            evidence.append(float(e))
+    order = np.argsort(-np.array(evidence), kind="stable")
+    return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
 
 
 def _suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
@@ -371,3 +300,14 @@ def _suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
     choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
     return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
+
+
+def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:
+    """The `count` networks nearest to the median of all, the nearest first.
+
+    Networks far from it are never taken. Where there are too few networks, the nearer ones are repeated.
+    """
+    outputs = np.array([net.output(probe) for net in nets])
+    distance = ((outputs - np.median(outputs, axis=0)) ** 2).mean(axis=1)
+    order = np.argsort(distance, kind="stable")[: max(1, round(_AGREEING_SHARE * len(nets)))]
+    return [nets[order[k % len(order)]] for k in range(count)]

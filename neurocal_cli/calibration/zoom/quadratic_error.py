@@ -9,13 +9,14 @@ points.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.adjustment.levenberg_marquardt import DescentOptions, minimise
-from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, eliminate, solve_scaled
+from neurocal_cli.adjustment.normal_equations import ROUNDING, damped_step, solve_scaled
 from neurocal_cli.calibration.zoom.settings import Normal
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -143,10 +144,14 @@ def with_scatter(normal: Normal, scatter: Array, variance: float) -> Normal:
     if not scatter.any():
         return normal
     some = np.flatnonzero(scatter)
-    # An offset has the same derivatives as its local parameter.
-    n = normal.H.shape[1] + 1
-    columns, own = np.append(np.arange(n), some), np.arange(n, n + len(some))
-    N = normal.blocks[:, columns[:, None], columns]
-    N[:, own, own] += variance / scatter[some]
-    reduced, _ = eliminate(N, np.arange(n), own, ROUNDING)
-    return Normal.of(reduced, normal.sensible)
+    B = normal.H[:, some[:, None], some] + variance * np.diag(1 / scatter[some])
+    cross = normal.H[:, some]
+    gain = np.swapaxes(solve_scaled(B, cross, ROUNDING), 1, 2)
+    pull = normal.g[:, some]
+    solved = solve_scaled(B, pull[..., None], ROUNDING)[..., 0]
+    return replace(
+        normal,
+        H=normal.H - gain @ cross,
+        g=normal.g - (gain @ pull[..., None])[..., 0],
+        cost=normal.cost - (solved * pull).sum(axis=1),
+    )

@@ -31,9 +31,6 @@ from neurocal_cli.errors import DegenerateGeometryError, InputError
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
 # stay within 1.04 of the noise floor even between settings (slow tests in test_zoom_lens.py).
 _POOR_FIT = 1.5
-# Of the members' shares: as the evidence of networks is approximate, its logarithm counts by a third.
-_TEMPERATURE = 3.0
-_LEAST_SHARE = 1e-9
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
 # out in test_zoom_lens.py check both sides: wrong names are found, and no setting of a lens that
 # changes sharply is rejected.
@@ -48,9 +45,6 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
     constants = first_constants(start.static, start.lens, still)
     averaged = common_tables(start.data, start.tables.local, constants, fixed=True)
 
-    evidence = np.array([joint.evidence for joint in joints])
-    shares = np.maximum(np.exp((evidence - evidence.max()) / _TEMPERATURE), _LEAST_SHARE)
-
     def of_lens(constants: Constants) -> Constants:
         # The poses of the views of a moving camera are not part of the lens.
         return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
@@ -62,10 +56,7 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         model=start.data.model,
         still=still,
         known=False,
-        members=tuple(
-            Member(joint.nets, of_lens(joint.constants), share)
-            for joint, share in zip(joints, shares.tolist(), strict=True)
-        ),
+        members=tuple(Member(joint.nets, of_lens(joint.constants)) for joint in joints),
         tables=replace(start.tables, constants=of_lens(start.tables.constants)),
         static=replace(averaged, constants=of_lens(averaged.constants)),
         variance=start.variance,
@@ -100,9 +91,9 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
             "every setting"
         )
     refuse_gaps(lens, start.lens.points.source)
-    local = np.tensordot(lens.shares, each, 1)
+    local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
-    constants = replace(constants, theta=float(lens.shares @ [joint.constants.theta for joint in joints]))
+    constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there, _ = start.data.linearise(local, constants)
     rmse = np.sqrt(there.cost / start.data.counts)
     # The linearisation fails for a member now and then, so the median counts.

@@ -173,11 +173,6 @@ class Normal:
     cost: Array  # (S,) sum of squared residuals [px^2]
     sensible: bool  # whether all points are in front of the camera, where the distortion is monotonic
 
-    @classmethod
-    def of(cls, blocks: Array, sensible: bool) -> Normal:
-        """From `blocks`."""
-        return cls(blocks[:, :-1, :-1], blocks[:, :-1, -1], blocks[:, -1, -1], sensible)
-
     @property
     def blocks(self) -> Array:
         """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
@@ -258,13 +253,14 @@ class PixelData:
             reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
         summed = np.zeros((self.n_settings, *reduced.shape[1:]))
         np.add.at(summed, self.setting, reduced)
+        L = summed.shape[1] - 1
         if not self.free_theta:  # a unit diagonal holds it at 0
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
         summed = symmetric(summed)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
-        return Normal.of(summed, good), constants
+        return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
 
     def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""

@@ -28,7 +28,6 @@ from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
 
 _VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
-_LEAST_DOUBT = 1e-6  # avoids a division by 0 where one member has nearly all
 _LEAST_INFORMATION = 0.02  # least share of a direction of the target's offsets that remains
 
 
@@ -51,7 +50,7 @@ class ZoomLens(Summarised):
     known : bool
         Whether it was fitted to known cameras, not to points.
     members : tuple of Member
-        The committee; predictions are its mean, weighted by the members' shares.
+        The committee; predictions are its mean.
     tables, static : Tables
         Fitted with common constants, and the static calibrations with averaged constants.
     variance : float [px^2]
@@ -142,12 +141,6 @@ class ZoomLens(Summarised):
         """Settings on the scale of the networks' inputs, -1 to 1."""
         return scaled_controls(settings, self.low, self.high)
 
-    @property
-    def shares(self) -> Array:
-        """(M,) share of each member in predictions; they add up to 1."""
-        shares = np.array([member.share for member in self.members])
-        return shares / shares.sum()
-
     @cached_property
     def posteriors(self) -> tuple[Array, ...]:
         """Covariance of each member's weights and constants."""
@@ -234,30 +227,26 @@ class ZoomLens(Summarised):
                 f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
                 "choose a setting in the calibrated range"
             )
-        shares = self.shares
-        constants, offsets = _mean_constants([m.constants for m in self.members], shares, self.still)
+        constants, offsets = _mean_constants([member.constants for member in self.members], self.still)
         Q = self.tables.normal.H.shape[1] - len(self.names)
-        spreads = np.array([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)])
+        within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
         offsets = offsets[:, :Q]
         both = np.concatenate([locals_, np.broadcast_to(offsets[:, None], (*locals_.shape[:2], Q))], axis=2)
-        deviation = both - np.tensordot(shares, both, 1)
-        between = np.einsum("m,mni,mnj->nij", shares, deviation, deviation)
-        # As for a sample of equal shares, where it is the mean square times n / (n - 1).
-        between /= max(1 - float(shares @ shares), _LEAST_DOUBT)
-        covariance = np.tensordot(shares, spreads, 1) + between
+        deviation = both - both.mean(axis=0)
+        between = np.einsum("mni,mnj->nij", deviation, deviation) / max(len(both) - 1, 1)
+        covariance = within + between
         L = len(self.names)
         if not self.known:
             covariance[:, range(L), range(L)] += self.scatter
-        return Prediction(np.tensordot(shares, locals_, 1), constants, covariance)
+        return Prediction(locals_.mean(axis=0), constants, covariance)
 
 
 @frozen_dataclass(eq=False)
 class Member:
-    """One member of the committee: its networks and constants, and its share in predictions."""
+    """One member of the committee: its networks and constants."""
 
     nets: LensNets
     constants: Constants
-    share: float = 1.0  # relative to those of the others
 
 
 @frozen_dataclass
@@ -292,20 +281,21 @@ def _spread(J: Array, covariance: Array, Q: int) -> Array:
     return full @ covariance @ np.swapaxes(full, 1, 2)
 
 
-def _mean_constants(constants: list[Constants], shares: Array, still: bool) -> tuple[Constants, Array]:
+def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants, Array]:
     """Mean of the members' constants and the differences from it (m, 6): theta, omega, t_x, t_y."""
     theta = np.array([c.theta for c in constants])
-    mean = float(shares @ theta)
     if not still:
         zero = np.zeros((len(theta), 5))
-        return Constants(mean, np.eye(3), np.zeros(2)), np.column_stack([theta - mean, zero])
-    R_of, t_of = np.array([c.R for c in constants]), np.array([c.t for c in constants])
-    R, t = nearest_rotation(np.tensordot(shares, R_of, 1)), shares @ t_of
-    turn = R_of @ R.T
+        mean = Constants(float(theta.mean()), np.eye(3), np.zeros(2))
+        return mean, np.column_stack([theta - theta.mean(), zero])
+    t = np.array([c.t for c in constants])
+    R = nearest_rotation(np.mean([c.R for c in constants], axis=0))
+    turn = np.array([c.R for c in constants]) @ R.T
     omega = 0.5 * np.column_stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]]
     )
-    return Constants(mean, R, t), np.column_stack([theta - mean, omega, t_of - t])
+    mean = Constants(float(theta.mean()), R, t.mean(axis=0))
+    return mean, np.column_stack([theta - theta.mean(), omega, t - mean.t])
 
 
 def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance: float) -> Array:

@@ -517,9 +517,7 @@ def one_at_a_time(lens: ZoomLens, x: np.ndarray) -> np.ndarray:
     return np.mean([nets.local(x) for nets in members], axis=0)
 
 
-# What is reached, and a little for another machine.
-MOST = {"a": 1.04, "b": 1.01, "c": 1.01, "d": 1.02, "e": 1.02, "f": 1.06}
-TIE = 1.005  # where both models err by hardly more than noise
+MOST = {"a": 1.04, "b": 1.01, "c": 1.01, "d": 1.02}  # what is reached, and a little for another machine
 
 
 @pytest.mark.slow
@@ -532,7 +530,7 @@ def test_networks_beat_every_baseline_between_45_settings(bends: bool) -> None:
     for law in LAWS:
         assert held.networks[law] < MOST[law]
         assert held.networks[law] < held.alone[law]
-        assert all(held.networks[law] <= TIE * error for error in held.baselines[law].values())
+        assert all(held.networks[law] <= error for error in held.baselines[law].values())
         assert held.alternating[law] == pytest.approx(1, abs=0.1)
         assert held.cover[law] > 0.9
     assert np.mean(list(held.cover.values())) < 0.99

@@ -316,7 +316,7 @@ def test_alternating_ends_where_joint_training_ends() -> None:
     static = calibrate_each(lens, data, 0, True, lambda stage, share: None)
     tables = common_tables(data, static.local, first_constants(static, lens, True))
     x = scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
-    budget = Budget(topologies=((1, 1),), starts=4, finalists=2, members=1, schedule=Schedule(150, 30, 80))
+    budget = Budget(topologies=((1, 1),), starts=4, best=2, members=1, schedule=Schedule(150, 30, 80))
     rng = np.random.default_rng(0)
     H = tables.normal.H
     nets, *_ = fit_committee(x, data.names, tables.local, H, 0.0225, rng, budget, lambda share: None)
