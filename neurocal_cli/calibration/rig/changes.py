@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, scatter
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA, OTHER_SIZE, TWO_GEOMETRIES, Named
 from neurocal_cli.calibration.rig.edges import at_fit
@@ -73,10 +74,10 @@ def _moved_or_larger(problem: RigProblem, fit: RigFit, found: Named) -> Named:
     t, other = fit.state.t[1], own.state.t[1]
     step = np.concatenate([rotation_vector(own.state.R[1] @ fit.state.R[1].T), other - t])
     along = np.concatenate([np.zeros(3), t])
-    information = np.linalg.inv(_covariance(fit) + _covariance(own))
+    information = solve_scaled(_covariance(fit) + _covariance(own), np.eye(6))
     scale = float(along @ information @ step / (along @ information @ along))
     rest = step - scale * along
-    if float(rest @ information @ rest) > 5 * np.log(max(scatter(at_fit(problem, fit))[1], 2)):
+    if not float(rest @ information @ rest) < 5 * np.log(max(scatter(at_fit(problem, fit))[1], 2)):
         return replace(found, cause=MOVED_CAMERA, side=1)
     longer = scale if found.is_late else 1 / (1 + scale) - 1
     return replace(found, cause=OTHER_SIZE, side=-1, amounts=np.array([longer]))

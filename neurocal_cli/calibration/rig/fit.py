@@ -103,12 +103,11 @@ def fit_rig(
     start = connected(edges, names)
     _refuse_poor_camera(edges, names)
     left_out = views_left_out(edges, problem)
-    if outliers == "keep" and left_out:
-        raise DegenerateGeometryError(
-            f"{_told(left_out, problem, names)}; remove them, or use --outliers reject"
-        )
     fit, left_out, warnings = _without_contradictions(problem, start, left_out, refine_cameras, names)
     _refuse_if_most_contradict(left_out, problem, names)
+    if outliers == "keep" and left_out:
+        told = _told(left_out, problem, names)
+        raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
     least, stretched = _covariance(fit), None
     target = cameras[names[0]].target
     if target is not None and all(camera.target is target for camera in cameras.values()):

@@ -24,6 +24,7 @@ from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order,
 from neurocal_cli.calibration.rig.rivals import named_cause
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import rotation_step, rotation_vector
+from neurocal_cli.errors import DegenerateGeometryError
 
 Points = tuple[Correspondences, Correspondences]
 
@@ -123,6 +124,14 @@ def test_the_majority_wins() -> None:
     assert all(reason.startswith("taken after the rig moved") for reason in rig.left_out.values())
     turn = rotation_vector(rig.R @ scene().rig.R.T)
     assert (np.abs(turn) < 5 * np.array([rig.std[name] for name in ("R_x", "R_y", "R_z")])).all()
+
+
+def test_a_rig_that_moved_is_refused_if_nothing_may_be_left_out() -> None:
+    left, right = (
+        calibrate(side, distortion="none", skew=False) for side in in_parts(scene(), turned(scene(), 0.3), 9)
+    )
+    with pytest.raises(DegenerateGeometryError, match=r"after the rig moved .* or use --outliers"):
+        fit_stereo(left, right, outliers="keep")
 
 
 def test_two_equal_parts_are_named_and_the_cameras_are_right() -> None:
