@@ -44,6 +44,7 @@ from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.markers.ink import Ink
 from neurocal_cli.detection.markers.plain import fit_without_ink
 from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.observations.measured_directions import variance_across
 
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 
@@ -53,6 +54,7 @@ _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides,
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
 # 0.7 to 1.6 in rendered images (test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
 _AGREES = 2.0
+_WORTH = 10.0  # greatest variance along an edge that is used, over that across it
 _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to the rim is not used
 
 
@@ -185,6 +187,10 @@ class AlongEdges:
     value: Array  # (M,) [px]
     variance: Array  # (M,) [px^2]
 
+    def only(self, which: NDArray[np.bool_]) -> AlongEdges:
+        """Some of them."""
+        return AlongEdges(self.rows[which], self.direction[which], self.value[which], self.variance[which])
+
 
 def positions_along_edges(grid_image: GridImage, fitted: GridFit) -> AlongEdges | None:
     """Measure where the outermost mid-points lie along their edges; None if the map is not accurate."""
@@ -242,11 +248,13 @@ def edges_served(
 
 def _measured_both_ways(midpoints: Measured, along: AlongEdges) -> Measured:
     """Replace the positions of some mid-points along their edges by measured ones."""
-    rows, across = along.rows, midpoints.across
+    across = midpoints.across
     assert across is not None
+    variance = variance_across(midpoints.covariance[along.rows], across[along.rows])
+    # Short edges to the rim, as on tags, tell too little.
+    worth = along.variance < _WORTH * variance
+    rows, variance, along = along.rows[worth], variance[worth], along.only(worth)
     n = across[rows]
-    suu, suv, svv = midpoints.covariance[rows].T
-    variance = suu * n[:, 0] ** 2 + 2 * suv * n[:, 0] * n[:, 1] + svv * n[:, 1] ** 2
     # Intersection of two lines: n . p = value across the edge, direction . p = value along it.
     inverse = np.linalg.inv(np.stack([n, along.direction], axis=1))
     value = np.stack([(midpoints.pixels[rows] * n).sum(axis=1), along.value], axis=1)

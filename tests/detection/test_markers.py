@@ -14,7 +14,7 @@ from support.real_data import RealFiles
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.identity.placement import NoBoardError
-from neurocal_cli.detection.markers.ink import _Blurred
+from neurocal_cli.detection.markers.ink import Ink, _Blurred
 from neurocal_cli.detection.markers.lattice import place
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.errors import InputError
@@ -165,11 +165,26 @@ def test_the_light_of_a_pattern_is_that_of_the_blurred_pattern() -> None:
     pixel = np.arange(-6, 26)
     at = np.rint((pixel + 20.5) * fine - 0.5).astype(int)
     a, b = places(*(x.ravel().astype(float) for x in np.meshgrid(pixel, pixel)))
-    slopes = [np.full(len(a), x) for x in inverse.ravel()]
+    slopes = [np.full((1, len(a)), x) for x in inverse.ravel()]
     rho = inverse[0] @ inverse[1] / (np.linalg.norm(inverse[0]) * np.linalg.norm(inverse[1]))
-    blur = _Blurred.of(tuple(slopes), np.array([sigma, sigma, rho]), 0.0, np.zeros(2))  # type: ignore[arg-type]
-    light = blur.pattern(a, b, lines, cells)
-    np.testing.assert_allclose(light, blurred[np.ix_(at, at)].ravel(), atol=0.01)
+    blur = _Blurred.of(tuple(slopes), np.array([[sigma, sigma, rho]]), 0.0, np.zeros(2))  # type: ignore[arg-type]
+    light = blur.pattern(a[None], b[None], lines, cells[None])
+    np.testing.assert_allclose(light[0], blurred[np.ix_(at, at)].ravel(), atol=0.01)
+
+
+def test_only_borders_of_one_colour_are_borders() -> None:
+    light = np.array([[-1.0] * 5] * 5)[None].repeat(2, axis=0)
+    light[:, 2, 2] = 1
+    lines = np.linspace(0.1, 0.9, 6)
+    ink = Ink(np.zeros((2, 2), dtype=np.int64), lines, light, np.ones(2))
+    assert ink.border == pytest.approx(2 * 0.16)
+    assert ink.gap == pytest.approx(0.1)
+    assert ink.filled.inner.shape == (2, 1, 1)
+    light[1, 0, 3] = 1
+    assert ink.border == 0
+    # A tag is as dark as its border.
+    assert Ink(ink.cell, lines, light, -np.ones(2)).gap == pytest.approx(0.1)
+    assert Ink(ink.cell[:1], lines, light[:1], -np.ones(1)).gap == pytest.approx(0.1 + 2 * 0.16)
 
 
 @pytest.mark.slow

@@ -93,13 +93,13 @@ def _distances(
 
     The map's inverse is a polynomial through its samples around the circle.
     """
-    inverse = LocalInverse.of(seen, samples)
+    inverse = LocalInverse.of(seen[None], samples)
     point = np.stack([u, v], axis=-1).astype(float)
 
     def nearer(foot: Array, point: Array) -> tuple[Array, Array, Array]:
         """Distance from the outline, normal at a foot near it, and the radius there."""
-        a, b = inverse.at(foot)
-        au, av, bu, bv = inverse.slopes(foot)
+        a, b = (one[0] for one in inverse.at(foot[None]))
+        au, av, bu, bv = (one[0] for one in inverse.slopes(foot[None]))
         rho = np.maximum(np.hypot(a, b), 1e-9)
         slope = np.stack([a * au + b * bu, a * av + b * bv], axis=-1) / rho[:, None]
         steep = np.maximum(np.hypot(*slope.T), 1e-9)
@@ -114,7 +114,7 @@ def _distances(
         foot = point - d[:, None] * n
         d, n, _ = nearer(foot, point)
     # Curvature of an ellipse with the shape of the map at the centre: M maps pixels to the board.
-    au, av, bu, bv = (float(one[0]) for one in inverse.slopes(seen[:1]))
+    au, av, bu, bv = (float(one[0, 0]) for one in inverse.slopes(seen[None, :1]))
     M = np.array([[au, av], [bu, bv]])
     G = M.T @ M / radius**2
     q = foot - seen[0]

@@ -161,7 +161,7 @@ def fit_from(
     contrast of each edge, two arrays (E,), and the noise of a pixel [DN^2].
     """
     first = _first_fit(grid_image, mapped, sigma, shading, levels, max(noise, grid_image.floor))
-    return _last_fit(grid_image, first)
+    return fit_again(grid_image, first)
 
 
 def _wide_if_better(
@@ -278,8 +278,8 @@ def _selected(
     return mapped, required, observations
 
 
-def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
-    """Fit edges with common parameters, and the map through them."""
+def fit_again(grid_image: GridImage, first: GridFit) -> GridFit:
+    """Fit edges with the common parameters of a fit, and the map through them."""
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)

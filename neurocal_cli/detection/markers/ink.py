@@ -16,6 +16,7 @@ the fit found for all edges, and the response F applies to the sum of pattern an
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -23,17 +24,22 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.detection.fitting.edge_profile import profile, response
+from neurocal_cli.detection.fitting.edge_profile import Real, profile, response
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.detection.fitting.strips import Single
 from neurocal_cli.detection.local_inverse import LocalInverse
 
-_REACH = 4.5  # sigma around a cell of the board
-_SLACK = 1.3  # for the different sizes of a cell's parts
-_FITTED, _FITTED_PX = 6.0, 2.0  # sigma and px from an edge, beyond which fits use no pixels
-_SAMPLES = 6  # along its sides
+# sigma, beyond which a pattern changes the light by less than 0.0002 half contrasts, and beyond which the
+# inner part of a marker with a border does not matter
+_REACH = 3.7
+_FITTED, _FITTED_PX = 5.0, 2.0  # sigma and px from an edge, beyond which fits use no pixels
+_SLACK = 1.0  # px, for what the homographies of cells leave out
+_SAMPLES = 6  # along the sides of a cell
 _TERMS = ((0.02, 1), (0.1, 2), (0.3, 4), (0.5, 7), (1.0, 12))  # of the series up to a correlation
 _MOST_RHO = 0.9
+_SIGNS = (-1, 1)
+_CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @frozen_dataclass(eq=False)
@@ -44,6 +50,39 @@ class Ink:
     lines: Array  # (n + 1,) places of the pattern's lines along a side of the cell, from 0 to 1
     light: Array  # (N, n, n) -1 or 1: colours of the pattern, [b, a]
     base: Array  # (N,) -1 or 1: colour of the cell without its pattern
+
+    def only(self, which: NDArray[np.bool_]) -> Ink:
+        """Some of the cells."""
+        return Ink(self.cell[which], self.lines, self.light[which], self.base[which])
+
+    @property
+    def inner(self) -> Array:
+        """(N, n, n) what the pattern changes."""
+        return np.asarray(self.light - self.base[:, None, None])
+
+    @property
+    def border(self) -> float:
+        """Width [cells] of the border of one colour that all patterns have."""
+        inner, thick = self.inner, 0
+        n = inner.shape[1]
+        while 2 * thick < n:
+            ring = np.ones((n, n), dtype=np.bool_)
+            ring[thick + 1 : n - thick - 1, thick + 1 : n - thick - 1] = False
+            if not (inner[:, ring] == inner[:, :1, 0]).all() or not inner[:, 0, 0].all():
+                break
+            thick += 1
+        return float(self.lines[thick] - self.lines[0])
+
+    @property
+    def gap(self) -> float:
+        """Distance [cells] of the nearest change by a pattern from a side of its cell."""
+        columns = np.flatnonzero(self.inner.any(axis=(0, 1)) | self.inner.any(axis=(0, 2)))
+        return float(min(self.lines[columns[0]], 1 - self.lines[columns[-1] + 1])) if len(columns) else 1.0
+
+    @property
+    def filled(self) -> Ink:
+        """The patterns with the colour of their borders everywhere."""
+        return Ink(self.cell, self.lines[[0, -1]], self.light[:, :1, :1], self.base)
 
 
 @frozen_dataclass(eq=False)
@@ -59,6 +98,14 @@ class Appearance:
     tails: Array  # (2,) of the profile of all edges, and ...
     nonlinearity: Array  # ... of the response; see `edge_profile`
 
+    def clearance(self, ink: Ink) -> float:
+        """Least width of the cells of some ink, of those that the camera sees [sigma]."""
+        corners = self.map.at(ink.cell[:, None] + _CORNERS)
+        u, v = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+        area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+        width = area / np.maximum(np.hypot(*u.T), np.hypot(*v.T))
+        return float(np.nanmin(width / self.blur[:, :2].max(axis=1)))
+
 
 def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: float) -> NDArray[np.float32]:
     """The image (H, W) without patterns near the edges of their cells, and NaN within the patterns.
@@ -66,156 +113,183 @@ def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: fl
     `most` is the change of the light, in half contrasts, beyond which a pixel is left out.
     """
     result = image.astype(np.float32)
-    nonlinear = bool(look.nonlinearity.any())
-    for cell, light, base, blur in zip(ink.cell, ink.light, ink.base, look.blur, strict=True):
-        inner = light - base
-        inverse = _inverse(look.map, cell)
-        pixels = None if inverse is None else _pixels_of(cell, look.map, blur, result.shape)
-        if inverse is None or pixels is None or not inner.any():
-            continue
-        near, within = _selected(inverse, pixels, ink.lines, inner, float(blur[:2].max()))
-        u, v = pixels[within].T.astype(np.intp)
-        result[v, u] = np.nan
-        if not near.any():
-            continue
-        some = pixels[near]
-        a, b = inverse.at(some)
-        pattern = _Blurred.of(inverse.slopes(some), blur, look.shift, look.tails)
-        change = pattern.pattern(a, b, ink.lines, inner)
-        _, contrast = look.shading.at(some)
-        if nonlinear:
-            plain = np.clip(pattern.squares(a, b, base), -1, 1)
-            seen = np.clip(plain + change, -1, 1)
-            change = response(seen, look.nonlinearity)[0] - response(plain, look.nonlinearity)[0]
-        u, v = some.T.astype(np.intp)
-        result[v, u] -= np.where(np.abs(change) > most, np.nan, contrast * change).astype(np.float32)
+    ticks = np.linspace(0, 1, _SAMPLES)  # the next cells may be of another size
+    samples = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    seen = look.map.at(ink.cell[:, None] + samples)
+    shown = np.asarray(np.isfinite(seen).all(axis=(1, 2)) & ink.inner.any(axis=(1, 2)))
+    if not shown.any():
+        return result
+    ink, blur = ink.only(shown), look.blur[shown]
+    look = replace(look, blur=blur)
+    inverse = LocalInverse.of(seen[shown], samples)
+    corners = look.map.at(ink.cell[:, None] + _CORNERS)
+    if ink.border * look.clearance(ink) > _REACH:
+        ink = ink.filled
+    pixels, used = _near_edges(result, ink, corners, blur[:, :2].max(axis=1), len(ink.lines) == 2)
+    if not used.any():
+        return result
+    a, b = inverse.at(pixels)
+    blurred = _Blurred.of(inverse.slopes(pixels), blur, look.shift, look.tails)
+    change = blurred.pattern(a, b, ink.lines, ink.inner)
+    u, v = pixels[used].T.astype(np.intp)
+    _, contrast = look.shading.at(pixels[used])
+    change = change[used]
+    if look.nonlinearity.any():
+        plain = np.clip(blurred.squares(a, b, ink.base)[used], -1, 1)
+        seen_light = np.clip(plain + change, -1, 1)
+        change = response(seen_light, look.nonlinearity)[0] - response(plain, look.nonlinearity)[0]
+    # Some pixels are near the edges of two cells.
+    np.subtract.at(
+        result, (v, u), np.where(np.abs(change) > most, np.nan, contrast * change).astype(np.float32)
+    )
     return result
 
 
-def _pixels_of(cell: NDArray[np.int64], at: SmoothMap, blur: Array, shape: tuple[int, ...]) -> Array | None:
-    """Pixels (N, 2) of the image around a cell, as far as its blur reaches."""
-    corners = at.at(cell + np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
-    room = _REACH * blur[:2].max()
-    low = np.maximum(np.floor(corners.min(axis=0) - room), 0).astype(np.intp)
-    high = np.minimum(np.ceil(corners.max(axis=0) + room) + 1, shape[::-1]).astype(np.intp)
-    if (high <= low).any():
-        return None
-    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].reshape(2, -1)
-    return np.stack([u, v], axis=-1).astype(float)
+def _near_edges(
+    result: NDArray[np.float32], ink: Ink, corners: Array, sigma: Array, filled: bool
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels (N, M, 2) near the edges of cells that their patterns reach, padded, and a mask (N, M) of them.
 
-
-def _selected(
-    inverse: LocalInverse, pixels: Array, lines: Array, inner: Array, sigma: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Masks of the pixels near the edges of a cell that its pattern reaches, and of those within the pattern.
-
-    The latter are too far from the edges for the fits.
+    Other pixels within a pattern, which are too far from the edges for the fits, become NaN in the image.
     """
-    a, b = inverse.at(pixels)
-    au, av, bu, bv = (float(one[0]) for one in inverse.slopes(inverse.centre[None]))
-    sides = 1 / np.hypot([au, bu], [av, bv])  # [px] of the cell, between opposite edges
-    columns, rows = (np.flatnonzero(inner.any(axis=axis)) for axis in (0, 1))
-    inward, outward = np.full(len(a), np.inf), np.full(len(a), -np.inf)
-    for place, side, used in ((a, sides[0], columns), (b, sides[1], rows)):
-        inward = np.minimum(inward, side * np.minimum(place, 1 - place))
-        low, high = lines[used[0]], lines[used[-1] + 1]
-        outward = np.maximum(outward, side * np.maximum(low - place, place - high))
-    reached = outward < _SLACK * _REACH * sigma
-    near = reached & (inward < _FITTED * sigma + _FITTED_PX)
-    return near, reached & ~near
+    height, width = result.shape
+    parts = []
+    for H, box, inner, s in zip(_homographies(corners), corners, ink.inner, sigma.tolist(), strict=True):
+        room = _REACH * s + _SLACK
+        low = np.maximum(np.floor(box.min(axis=0) - room), 0).astype(int)
+        high = np.minimum(np.ceil(box.max(axis=0) + room) + 1, [width, height]).astype(int)
+        if (high <= low).any():
+            parts.append(np.zeros((0, 2), dtype=np.intp))
+            continue
+        u, v = np.arange(low[0], high[0], dtype=float), np.arange(low[1], high[1], dtype=float)[:, None]
+        a, b, w = (row[0] * u + row[1] * v + row[2] for row in H)
+        a, b = a / w, b / w
+        side_a, side_b = np.hypot(*(box[1] - box[0])), np.hypot(*(box[3] - box[0]))
+        # Distances between opposite sides.
+        slant = abs(float(np.linalg.det(np.stack([box[1] - box[0], box[3] - box[0]])))) / (side_a * side_b)
+        side_a, side_b = side_a * slant, side_b * slant
+        columns, rows = (np.flatnonzero(inner.any(axis=axis)) for axis in (0, 1))
+        inward = np.minimum(side_a * np.minimum(a, 1 - a), side_b * np.minimum(b, 1 - b))
+        beyond_a = np.maximum(ink.lines[columns[0]] - a, a - ink.lines[columns[-1] + 1])
+        beyond_b = np.maximum(ink.lines[rows[0]] - b, b - ink.lines[rows[-1] + 1])
+        outward = np.maximum(side_a * beyond_a, side_b * beyond_b)
+        reached = outward < room
+        near = reached & (inward < _FITTED * s + _FITTED_PX)
+        if filled:
+            near &= outward > -_SLACK  # pixels within the border change too much
+        result[low[1] : high[1], low[0] : high[0]][reached & ~near] = np.nan
+        parts.append(np.argwhere(near)[:, ::-1] + low)
+    count = np.array([len(part) for part in parts])
+    used = np.arange(max(int(count.max()), 1)) < count[:, None]
+    pixels = np.repeat(corners.mean(axis=1)[:, None], used.shape[1], axis=1)
+    pixels[used] = np.concatenate(parts)
+    return pixels, used
 
 
-def _inverse(at: SmoothMap, cell: NDArray[np.int64]) -> LocalInverse | None:
-    """Places in a cell of pixels; None if the camera does not see the cell."""
-    ticks = np.linspace(0, 1, _SAMPLES)  # the next cells may be of another size
-    samples = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-    pixels = at.at(cell + samples)
-    return LocalInverse.of(pixels, samples) if np.isfinite(pixels).all() else None
+def _homographies(corners: Array) -> Array:
+    """(N, 3, 3) homographies from pixels to the places in cells with corners (N, 4, 2)."""
+    n = len(corners)
+    rows = np.zeros((n, 8, 8))
+    for k, (a, b) in enumerate(_CORNERS.tolist()):
+        u, v = corners[:, k].T
+        rows[:, 2 * k, :3] = rows[:, 2 * k + 1, 3:6] = np.stack([u, v, np.ones(n)], axis=-1)
+        rows[:, 2 * k, 6:] = -a * corners[:, k]
+        rows[:, 2 * k + 1, 6:] = -b * corners[:, k]
+    values = np.linalg.solve(rows, np.tile(_CORNERS.reshape(-1, 1), (n, 1, 1)))[..., 0]
+    return np.concatenate([values, np.ones((n, 1))], axis=1).reshape(n, 3, 3)
 
 
 @frozen_dataclass(eq=False)
 class _Blurred:
-    """Blur at the pixels of a cell, in the coordinates of the cell."""
+    """Blur at M pixels of each of N cells, in the coordinates of the cell."""
 
-    a: Array  # (N,) standard deviation along a
+    a: Array  # (N, M) standard deviation along a
     b: Array
-    rho: float  # correlation
-    shift_a: float  # displacement of edges towards the light side
-    shift_b: float
+    rho: Array  # (N,) correlation
+    shift_a: Array  # (N,) displacement of edges towards the light side
+    shift_b: Array
     tails: Array  # (1, 2)
 
     @classmethod
     def of(
         cls, slopes: tuple[Array, Array, Array, Array], blur: Array, shift: float, tails: Array
     ) -> _Blurred:
-        """From the derivatives of a and b by the pixel, and the blur of a cell as in `Appearance`."""
+        """From the derivatives of a and b by the pixel, and the blur of cells as in `Appearance`."""
         au, av, bu, bv = slopes
         across_a, across_b = np.hypot(au, av), np.hypot(bu, bv)
-        rho = float(np.clip(blur[2], -_MOST_RHO, _MOST_RHO))
-        shifts = shift * float(across_a.mean()), shift * float(across_b.mean())
-        return cls(blur[0] * across_a, blur[1] * across_b, rho, *shifts, tails[None])
+        rho = np.clip(blur[:, 2], -_MOST_RHO, _MOST_RHO)
+        shifts = shift * across_a.mean(axis=1), shift * across_b.mean(axis=1)
+        return cls(blur[:, :1] * across_a, blur[:, 1:2] * across_b, rho, *shifts, tails[None])
 
     def pattern(self, a: Array, b: Array, lines: Array, cells: Array) -> Array:
-        """Blurred light (N,) of cells ``[b, a]`` between lines along both axes, with 0 around them."""
-        padded = np.pad(cells, 1)
-        total = np.zeros(len(a))
-        for (along_a, along_b), corners in _displaced(padded):
-            shifted = lines + along_a * self.shift_a, lines + along_b * self.shift_b
-            total += self._sum(a, b, *shifted, corners)
-        return total
+        """Blurred light (N, M) of cells (N, n, n) ``[b, a]`` between lines along both axes, 0 around them."""
+        signs = np.repeat(_SIGNS, len(lines))
+        moved_a, moved_b = (
+            np.tile(lines, 2) + shift[:, None] * signs for shift in (self.shift_a, self.shift_b)
+        )
+        return self._sum(a, b, moved_a, moved_b, _displaced(np.pad(cells, ((0, 0), (1, 1), (1, 1)))))
 
-    def squares(self, a: Array, b: Array, base: float) -> Array:
-        """Blurred light (N,) of the squares around the one from 0 to 1, which has the colour `base`."""
+    def squares(self, a: Array, b: Array, base: Array) -> Array:
+        """Blurred light (N, M) of the squares around the one from 0 to 1, of the colour `base` (N,)."""
         ends = np.array([0.0, 1.0])
         (ea, _), (eb, _) = (
-            self._profile((x[:, None] - ends) / s[:, None]) for x, s in ((a, self.a), (b, self.b))
+            self._profile((x[..., None] - ends) / s[..., None]) for x, s in ((a, self.a), (b, self.b))
         )
-        corners = 4 * base * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        corners = 4 * base[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         # Stripes along both axes, and what is different where they cross.
-        stripes = base - base * (1 + ea) @ [1, -1] - base * (1 + eb) @ [1, -1]
+        stripes = base[:, None] * (1 - (1 + ea) @ [1, -1] - (1 + eb) @ [1, -1])
+        ends = np.tile(ends, (len(a), 1))
         return np.asarray(stripes + self._sum(a, b, ends, ends, corners))
 
-    def _profile(self, z: Array) -> tuple[Array, Array]:
+    def _profile(self, z: Real) -> tuple[Real, Real]:
         """Profile of an edge and the normal density at distances in sigma."""
-        value, _, density = profile(z, self.tails)
-        return np.asarray(value, dtype=float), np.asarray(density, dtype=float)
+        value, _, density = profile(z.reshape(1, -1), self.tails)
+        return value.reshape(z.shape), density.reshape(z.shape)
 
-    def _sum(self, a: Array, b: Array, lines_a: Array, lines_b: Array, W: Array) -> Array:
-        """Sum over corners ``W[j, i]`` at (lines_a[i], lines_b[j])."""
-        used_a, used_b = np.flatnonzero(W.any(axis=0)), np.flatnonzero(W.any(axis=1))
-        if not len(used_a):
-            return np.zeros(len(a))
-        W = W[np.ix_(used_b, used_a)]
-        za = (a[:, None] - lines_a[used_a]) / self.a[:, None]
-        zb = (b[:, None] - lines_b[used_b]) / self.b[:, None]
+    def _sum(self, a: Array, b: Array, lines_a: Array, lines_b: Array, weights: Array) -> Array:
+        """Sum over corners ``weights[:, j, i]`` at (lines_a[:, i], lines_b[:, j])."""
+        W = _single(weights)
+        za, zb = (
+            _single((x[..., None] - lines[:, None]) / s[..., None])
+            for x, lines, s in ((a, lines_a, self.a), (b, lines_b, self.b))
+        )
         (ea, pa), (eb, pb) = (self._profile(z) for z in (za, zb))
-        total = ((0.5 * (1 + eb)) @ W * (0.5 * (1 + ea))).sum(axis=1)
-        count = next(n for limit, n in _TERMS if abs(self.rho) <= limit)
-        power = 1.0
+        total = ((0.5 * (1 + eb)) @ W * (0.5 * (1 + ea))).sum(axis=2)
+        count = next(n for limit, n in _TERMS if np.abs(self.rho).max() <= limit)
+        rho = _single(self.rho[:, None])
+        power = np.ones_like(rho)
         # Derivatives of Phi: (-1)^(n-1) He_(n-1) phi; the signs cancel in the products.
         before_a, now_a, before_b, now_b = np.zeros_like(za), pa, np.zeros_like(zb), pb
         for n in range(1, count + 1):
-            power = power * self.rho / n
-            total += power * ((now_b @ W) * now_a).sum(axis=1)
+            power *= rho / np.float32(n)
+            total += power * ((now_b @ W) * now_a).sum(axis=2)
             before_a, now_a = now_a, za * now_a - (n - 1) * before_a
             before_b, now_b = now_b, zb * now_b - (n - 1) * before_b
-        return total
+        return np.asarray(total, dtype=float)
 
 
-def _displaced(cells: Array) -> list[tuple[tuple[int, int], Array]]:
-    """Corners of a pattern ``[b, a]``, by the directions in which a shift towards the light displaces them.
+def _displaced(cells: Array) -> Array:
+    """Corners (N, 2 m, 2 m) of patterns ``[b, a]``, by the directions in which a shift to the light moves.
 
-    An edge moves with an axis if its light side is that of the growing axis. A corner is where an edge across
-    a, on one side of it, meets an edge across b; where squares of one colour touch it is four of them.
+    There are two lines for each of the m lines between the cells, moved backwards and forwards. An edge moves
+    with an axis if its light side is that of the growing axis. A corner is where an edge across a, on one
+    side of it, meets an edge across b; where squares of one colour touch it is four of them.
     """
-    corners = cells[1:, 1:] - cells[1:, :-1] - cells[:-1, 1:] + cells[:-1, :-1]
-    across_a, across_b = np.sign(np.diff(cells, axis=1)), np.sign(np.diff(cells, axis=0))
-    both_a, both_b = (across_a[:-1], across_a[1:]), (across_b[:, :-1], across_b[:, 1:])
+    corners = cells[:, 1:, 1:] - cells[:, 1:, :-1] - cells[:, :-1, 1:] + cells[:, :-1, :-1]
+    across_a, across_b = np.sign(np.diff(cells, axis=2)), np.sign(np.diff(cells, axis=1))
+    both_a, both_b = (across_a[:, :-1], across_a[:, 1:]), (across_b[:, :, :-1], across_b[:, :, 1:])
     meeting = (np.abs(both_a[0]) + np.abs(both_a[1])) * (np.abs(both_b[0]) + np.abs(both_b[1]))
     share = np.divide(corners, meeting, out=np.zeros(corners.shape), where=meeting > 0)
-    parts = []
-    for along_a, along_b in product((-1, 1), (-1, 1)):
-        met = sum(1.0 * ((x == along_a) & (y == along_b)) for x in both_a for y in both_b)
-        if np.any(met):
-            parts.append(((along_a, along_b), share * met))
-    return parts
+    return np.block(
+        [
+            [
+                share * sum(1.0 * ((x == along_a) & (y == along_b)) for x, y in product(both_a, both_b))
+                for along_a in _SIGNS
+            ]
+            for along_b in _SIGNS
+        ]
+    )
+
+
+def _single(x: Array) -> Single:
+    return np.asarray(x, dtype=np.float32)

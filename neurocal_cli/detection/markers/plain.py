@@ -16,7 +16,7 @@ from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
 from neurocal_cli.detection.fitting.common_parameters import correlation
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, erf_and_density
 from neurocal_cli.detection.fitting.grid_edges import GridImage
-from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_from, map_of_vertices
+from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from, map_of_vertices
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
 from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
@@ -25,9 +25,13 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Appearance, Ink, without_ink
 from neurocal_cli.detection.medians import upper_median
 
-# Greatest change of the light by the ink, in half contrasts, that is taken off in each fit. The first look is
-# not accurate enough for more; without more, the light side of blurred edges is not seen.
-_MOST = (0.1, 0.1, 0.5)
+# Greatest change of the light by the ink, in half contrasts, that is taken off in the first fit, and in those
+# that repeat it with what it found. The first look is not accurate enough for more; without more, the light
+# side of blurred edges is not seen. How often the fit is repeated depends on the distance of the ink from the
+# edges [sigma].
+_FIRST_MOST = 0.1
+_MOST: tuple[tuple[float, tuple[float, ...]], ...] = ((7.0, ()), (5.0, (0.5,)))
+_MOST_NEAR = (0.1, 0.5)
 _OFFSET_SIGMA = 0.05  # px, of an edge's offset from its profile
 _SIGMAS = np.geomspace(0.4, 6.0, 12)  # px, tried first
 _OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
@@ -41,12 +45,15 @@ def fit_without_ink(image: NDArray[np.generic], grid: Grid, floor: float, ink: I
     """Fit a board whose cells have patterns."""
     raw = GridImage(image, grid, floor)
     look, mapped, levels, noise = _first_look(raw, ink)
-    for most in _MOST:
+    plain = GridImage(without_ink(image, ink, look, _FIRST_MOST), grid, floor)
+    sigma = upper_median(look.blur[:, 0])
+    fitted = fit_from(plain, mapped, sigma, look.shading, levels, max(noise, floor))
+    look = _look_of(fitted, ink)
+    gap = ink.gap * look.clearance(ink)
+    for most in next((all_of for limit, all_of in _MOST if gap > limit), _MOST_NEAR):
         plain = GridImage(without_ink(image, ink, look, most), grid, floor)
-        sigma = upper_median(look.blur[:, 0])
-        fitted = fit_from(plain, mapped, sigma, look.shading, levels, max(noise, floor))
-        look, mapped = _look_of(fitted, ink), fitted.map
-        levels = look.shading.at(plain.edges.lines(mapped.map).middle)
+        fitted = fit_again(plain, fitted)
+        look = _look_of(fitted, ink)
     return fitted
 
 
