@@ -331,7 +331,9 @@ class _AtMinimum:
         if held is None or not held.causes or held.explained < _MOST:
             return None
         first = held.causes[0]
-        return held if first.pattern == "all" and not first.rival.of_board else None
+        if first.pattern != "all" or first.rival.of_board:
+            return None
+        return replace(held, of_outliers=True)
 
     def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         selected = self.calibration.lens_choice or self.calibration.straight_lines is not None

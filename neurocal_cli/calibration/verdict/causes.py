@@ -8,10 +8,10 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.contest import Contest
-from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, Finding, image_diagonal
+from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, Finding, Limit, image_diagonal
 from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Told
 
-_SIGMAS = 2.0  # of the focal length, by which a cause may bias it
+_BIASED = Limit(2.0, 5.0)  # std of the focal lengths and the centre, by which a cause biases them
 _EXCESS = 0.5  # least share of the squared error above the noise floor that named causes explain
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 _LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
@@ -66,10 +66,10 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
-    std = calibration.std["alpha_u"]
-    if found.weights.size and std > 0:
-        grade = max(grade, int(abs(told.longer) * told.alpha > _SIGMAS * std))
-    return grade, reason
+    if contest.of_outliers:  # which were left out of the calibration
+        return grade, reason
+    biased = (abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0)
+    return max(grade, _BIASED.grade(max(biased, default=0.0))), reason
 
 
 def _is_another(found: Estimate, other: Estimate) -> bool:

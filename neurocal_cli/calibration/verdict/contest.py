@@ -41,6 +41,7 @@ class Contest:
     close: tuple[tuple[Estimate, ...], ...]  # rivals that are hardly less probable, of each cause
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
+    of_outliers: bool = False  # whether the first one explains the outliers, which are included
 
     @property
     def beside_board(self) -> bool:

@@ -39,17 +39,9 @@ def glass(seen: Seen) -> Array | None:
     return (seen.by_board[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
 
 
-def turning(seen: Seen) -> Array:
-    """The camera turns while the rows are read."""
-    return seen.by_entries[:, 3:5] * seen.pixels[:, None, None, 1]
-
-
-def moving(seen: Seen) -> Array | None:
-    """The target moves past the camera while the rows are read; nearer points move farther."""
-    if seen.to_camera is None:
-        return None
-    nearer = 1 / np.linalg.norm(seen.to_camera, axis=1)
-    return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
+def rolling(seen: Seen) -> Array:
+    """The target, or the camera, moves in any direction while the rows are read."""
+    return seen.by_pose * seen.pixels[:, None, None, 1]
 
 
 def cut(axis: int) -> Effect:

@@ -8,6 +8,7 @@ tells all that the residuals say about the camera and the effects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from neurocal_cli.camera.state import CameraState
 _RIDGE = 1e-13  # as in cross-validation
 _FLAT = 0.02  # largest thickness over size of a board that counts as flat
 _ACROSS = 11  # points of a grid on the board
+_ALONG = 1e-6  # by which a normal that is an axis of the world may differ from it
 
 
 @frozen_dataclass(eq=False)
@@ -43,6 +45,9 @@ class Board:
         world += np.repeat(views.centre, views.counts, axis=0)
         centre = world.mean(axis=0)
         axes = np.linalg.eigh((world - centre).T @ (world - centre))[1][:, ::-1]
+        if np.abs(axes[:, 2]).max() > 1.0 - _ALONG:  # prints are stretched along the axes that they have
+            longer, shorter, normal = np.argsort(np.abs(world - centre).max(axis=0))[::-1]
+            axes = np.eye(3)[:, [longer, shorter, normal]]
         size = np.abs((world - centre) @ axes).max(axis=0)
         return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else None
 
@@ -59,6 +64,7 @@ class Seen:
     """T batches of n points each, for the functions that return an effect's columns (T, m, 2, n)."""
 
     by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
+    by_pose: Array  # (T, 6, 2, n) and by each view's pose
     pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
     observed: Array  # (T, 2, n) where they were observed [px]
     # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
@@ -182,9 +188,9 @@ def _derivatives(
                 off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
-        seen = Seen(J[:, :5], observed - off - middle[:, None], px)
+        seen = Seen(J[:, :5], J[:, POSE], observed - off - middle[:, None], px)
         if board is not None:
-            seen = _on_board(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
+            seen = _on_board(seen, views, state, board, view, batches.local[chunk])
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}
         yield chunk, np.concatenate([J[:, :-1], *found.values(), J[:, -1:]], axis=1), widths
@@ -197,12 +203,11 @@ def _on_board(
     board: Board,
     view: NDArray[np.intp],
     local: Array,
-    by_pose: Array,
 ) -> Seen:
     n, scale, back = local.shape[2], views.scale[view][:, None, None], np.swapaxes(state.R[view], 1, 2)
     world = local * scale + views.centre[view][:, :, None]
     places = np.moveaxis(board.axes[:, :2].T @ (world - board.centre[:, None]) / board.size, 1, 0)
-    by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
+    by_local = (back @ seen.by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
     by_board = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
     to_camera = np.einsum("ia,tin->tan", board.axes, -back @ state.t[view][:, :, None] - local)
-    return Seen(seen.by_entries, seen.pixels, seen.observed, by_board, places, to_camera)
+    return replace(seen, by_board=by_board, places=places, to_camera=to_camera)

@@ -46,10 +46,13 @@ _FEWEST_OUTLIERS = 4  # fewest outliers of a view, or views of a point
 _OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
 
 
-def odd_points(calibration: Calibration) -> Iterator[Finding]:
-    """All findings about the points of a calibration, outliers included."""
+def odd_points(calibration: Calibration, explained: bool) -> Iterator[Finding]:
+    """All findings about the points of a calibration, outliers included.
+
+    `explained` tells whether a cause that all views share explains the outliers.
+    """
     points = with_rejected(calibration)
-    yield from _rejected_points(calibration)
+    yield from _rejected_points(calibration, explained)
     # What is wrong with a view that was left out is a reason of its own.
     used = np.isin(points.view_names, calibration.points.view_names)
     yield from odd_pixels(points.select(used[points.view_index]))
@@ -270,13 +273,17 @@ def with_rejected(calibration: Calibration) -> Correspondences:
     )
 
 
-def _rejected_points(calibration: Calibration) -> Iterator[Finding]:
+def _rejected_points(calibration: Calibration, explained: bool) -> Iterator[Finding]:
     """Finding about the number of outliers, and what they have in common."""
     rejected = calibration.rejected
     lost = rejected.points
     if lost is None:
         return
     total = len(calibration.points) + len(lost)
+    if explained:
+        text = f"{len(lost)} of {total} points are outliers because of it, and were left out"
+        yield _OUTLIERS.grade(len(lost) / total), text, ""
+        return
     views = _of_views(calibration, lost)
     targets = _of_targets(calibration.points, lost, set(rejected.views))
     where = [f"{name} ({why})" for name, why in list(rejected.views.items())[:2]]

@@ -72,6 +72,13 @@ class Told:
         return float(self.found.camera[0] / self.lin.state.entries[0, 0]) if 0 in self.lin.free else 0.0
 
     @property
+    def biases(self) -> dict[str, float]:
+        """Changes of the focal lengths and the centre with this cause [px]."""
+        names = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
+        by = zip(self.lin.free.tolist(), self.found.camera.tolist(), strict=False)  # earlier causes come last
+        return {names[k]: one * self.lin.views.pixel_scale for k, one in by if k in names}
+
+    @property
     def members(self) -> list[str]:
         """The views that have it, if it is a step, a group or one view, in their sequence."""
         names, weights = self.lin.views.names, self.found.weights

@@ -232,7 +232,7 @@ def _other_camera(calibration: Calibration, doubt: Doubt) -> str:
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    yield from odd_points(calibration)
+    yield from odd_points(calibration, e.contest is not None and e.contest.of_outliers)
     yield from e.noise
     if e.repeated:
         twice = "the rows are given twice, in the view itself or in another one"

@@ -165,8 +165,10 @@ def stretched(told: Told) -> Said:
     """A print that is stretched, or whose sides lean."""
     assert told.lin.board is not None
     by, lean = told.found.amounts.tolist()
-    side = "XYZ"[int(np.argmax(np.abs(told.lin.board.axes[:, 0])))]
-    shape = f"{'stretched' if by > 0 else 'shrunk'} by {100 * abs(by):.2g} % along {side}"
+    longer, other = ("XYZ"[int(np.argmax(np.abs(axis)))] for axis in told.lin.board.axes.T[:2])
+    if by < 0:
+        longer, other = other, longer
+    shape = f"longer by {100 * abs(by):.2g} % along {longer}, compared with {other}"
     if abs(lean) > abs(by):
         shape = f"printed with sides that are {abs(lean):.2g} rad off a right angle"
     reason, size = _on_board(told, shape)
@@ -187,8 +189,9 @@ def bent_view(told: Told) -> Said:
 
 def rolling(told: Told) -> Said:
     """Rows that were read while the camera moved."""
-    rows = float(np.ptp(told.lin.views.pixels[:, 1])) * told.lin.views.pixel_scale
-    px = float(np.sqrt((told.found.amounts**2).mean())) * rows
+    rows = float(np.ptp(told.lin.views.pixels[:, 1]))
+    across = told.found.amounts[:, 3:5] / told.lin.state.t[:, 2:]  # of the centroids
+    px = float(np.sqrt((across**2).mean())) * told.alpha * rows
     return (
         f"camera or target moved while the rows of the images were read, by about {px:.2g} px from the first "
         "points to the last: a rolling shutter",
