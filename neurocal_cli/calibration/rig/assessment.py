@@ -97,7 +97,9 @@ def _evidence(rig: Rig) -> _Evidence:
     spare = max(equations - 6 * sum(map(len, fit.problem.names)) - int(fit.free.sum()), 1.0)
     alone = max(fit.cost - squares, 1e-300)
     cause, rest = named_cause(fit, names)
-    verdicts = {name: assess(camera) for name, camera in rig.cameras.items()}
+    # Frames that contradict each other have one target with an error that none of the cameras made.
+    alone_at_fault = not _SCATTER.grade(rest)
+    verdicts = {name: assess(camera, causes=alone_at_fault) for name, camera in rig.cameras.items()}
     distance, one_place = _distances(rig)
     depth, std = depth_std(fit, *(names.index(name) for name in distance[0]))
     return _Evidence(
@@ -198,7 +200,11 @@ def _distances(rig: Rig) -> tuple[tuple[tuple[str, str], float], tuple[str, str]
 def _findings(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
-    # A camera that is poor by itself, or was given wrong, spoils the frames, so it is named before them.
+    # A camera that is poor by itself, or was given wrong, spoils the frames, so it is named before them;
+    # that frames contradict each other far beyond noise is worse than a camera that is not well known.
+    given = any(camera.type != 1 for camera in rig.cameras.values())
+    if not given and _SCATTER.grade(e.rest):
+        yield from _frames(rig, e)
     for name, verdict in e.cameras.items():
         if verdict.reasons and (rig.cameras[name].type != 1 or verdict.word == "poor"):
             advice = verdict.advice[0] if verdict.advice else ""

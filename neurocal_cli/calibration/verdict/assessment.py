@@ -70,20 +70,23 @@ _DISTANT = 10.0  # times the distance of the farthest point
 
 # In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def gather_evidence(calibration: Calibration) -> Evidence:
-    """Compute all measures of the quality of a calibration, which has its points."""
-    return _AtMinimum(calibration).evidence()
+def gather_evidence(calibration: Calibration, causes: bool = True) -> Evidence:
+    """Compute all measures of the quality of a calibration, which has its points, and look for `causes`."""
+    return _AtMinimum(calibration).evidence(causes)
 
 
-def assess(calibration: Calibration) -> Verdict | None:
-    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own."""
+def assess(calibration: Calibration, causes: bool = True) -> Verdict | None:
+    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own.
+
+    `causes` tells whether causes of the residuals are looked for.
+    """
     if not _has_points(calibration):
         return None
     behind = _views_behind(calibration)
     if behind:
         reason = f"points lie behind the camera in {behind} of {len(calibration.views)} views"
         return verdict_of([(2, reason, "calibrate again, because the poses of these views were changed")], {})
-    return reach_verdict(calibration, gather_evidence(calibration))
+    return reach_verdict(calibration, gather_evidence(calibration, causes))
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
@@ -204,7 +207,7 @@ class _AtMinimum:
             return arrange(points)
         return weighed(points, -self._residuals())
 
-    def evidence(self) -> Evidence:
+    def evidence(self, causes: bool) -> Evidence:
         """All measures that the rules use."""
         views = self.views
         precision, contradiction = self._precision()
@@ -223,7 +226,7 @@ class _AtMinimum:
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
             # Sigmas that are wrong give single points the weight that all this is computed with.
-            contest=None if stated else self._contest(),
+            contest=self._contest() if causes and not stated else None,
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
             doubt=self._doubt(),
