@@ -220,5 +220,7 @@ RIVALS: tuple[Rival, ...] = (
     ),
 )
 """All rivals; those with the same name are alternatives of one cause."""
+SHAPES = tuple(rival for rival in RIVALS if rival.of_board and rival.patterns is patterns.common)
+"""Those by which the target has another shape in all views."""
 EFFECTS = tuple(dict.fromkeys(rival.effect for rival in RIVALS if rival.effect is not None))
 """All effects of the rivals."""
