@@ -34,7 +34,7 @@ from neurocal_cli.calibration.calibration import (
 )
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
-from neurocal_cli.calibration.verdict.findings import Finding, pixel_spread, verdict_of
+from neurocal_cli.calibration.verdict.findings import SPARE, Finding, pixel_spread, verdict_of
 from neurocal_cli.calibration.verdict.given_parameters import (
     Doubt,
     Reestimated,
@@ -306,7 +306,7 @@ class _AtMinimum:
     def _precision(self) -> tuple[float, float]:
         freedom = 6 + conditions_on_views(self.views, self.state)
         own_spare = self.views.n_equations - int(freedom.sum())
-        if own_spare <= 0 or freedom.sum() <= self.unknowns:
+        if own_spare < SPARE[0] or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
         own = float(self.networks.sum()) / own_spare
         px = self.views.pixel_scale

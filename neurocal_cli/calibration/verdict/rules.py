@@ -14,6 +14,7 @@ from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
     DISPLACED,
     ERROR,
+    SPARE,
     STRETCHED_PRINT,
     WRONG_PRINT,
     Finding,
@@ -35,8 +36,6 @@ from neurocal_cli.observations.target import Target
 # Repeated by test_wrong_inputs.py, in which no wrong input may be good, and by test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
 _CONTRADICTION = Limit(1.6, 2.3)
-# Spare equations from which 95 % lie within 1.4 and within 1.2 times two standard deviations (Student's t).
-_SPARE = (4, 8)
 _HELD_OUT = Limit(1.3, 2.0)  # over the rms error
 _DISAGREEMENT = Limit(6.0, 40.0)
 _CORRELATION = Limit(0.5, 0.85)
@@ -112,11 +111,11 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
 def _redundancy(calibration: Calibration) -> Iterator[Finding]:
     """Finding about residuals that are too few to tell the noise."""
     spare = spare_equations(calibration)
-    if spare >= _SPARE[1]:
+    if spare >= SPARE[1]:
         return
-    more = int(np.ceil(0.5 * (_SPARE[1] - spare)))
+    more = int(np.ceil(0.5 * (SPARE[1] - spare)))
     yield (
-        1 + int(spare < _SPARE[0]),
+        1 + int(spare < SPARE[0]),
         f"the points give only {plural(round(spare), 'equation')} more than there are unknowns, so standard "
         "deviations may be far too small by chance",
         f"give at least {plural(more, 'point')} more",
