@@ -36,12 +36,9 @@ from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import SPARE, Finding, pixel_spread, verdict_of
 from neurocal_cli.calibration.verdict.given_parameters import (
-    Doubt,
     Reestimated,
-    doubt_about_given,
     reestimate_centre,
     reestimate_centre_and_target,
-    reestimate_given,
 )
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
@@ -229,7 +226,6 @@ class _AtMinimum:
             contest=self._contest() if causes and not stated else None,
             mirrored=tuple(seen_from_behind(views, self.state)),
             reestimated=self._reestimated(),
-            doubt=self._doubt(),
             noise=(
                 *stated,
                 *self._survey(),
@@ -240,30 +236,22 @@ class _AtMinimum:
         )
 
     def _reestimated(self) -> tuple[Reestimated, ...]:
-        """Given parameters as the points have them; of several estimates of a centre, the farthest one."""
+        """A given centre as the points have it, of several estimates the farthest one."""
         given, rich = self.calibration.fixed, self.state.model == "rich"
-        found = reestimate_given(self.views, self.state, given, self.free_poses)
+        if self.calibration.type != 2 or self._is_exact():
+            return ()
         target, p = self.calibration.target, {"p1", "p2"} - given
-        if target is None and not rich and p.isdisjoint(coefficient_names(self.state.model)):
-            return found
         points, views = self._as_given()
-        simpler: tuple[Reestimated, ...] = ()
-        if not rich:
+        found: tuple[Reestimated, ...] = ()
+        if not rich and not (target is None and p.isdisjoint(coefficient_names(self.state.model))):
             state = normalised(self.given, views)
-            simpler = reestimate_centre(views, state, given, self.free_poses, self.variance)
-        if self.calibration.type == 2 and not self._is_exact():
-            simpler += reestimate_centre_and_target(points, views, self.given, given, self.variance)
+            found = reestimate_centre(views, state, given, self.free_poses, self.variance)
+        found += reestimate_centre_and_target(points, views, self.given, given, self.variance)
         farthest: dict[str, Reestimated] = {}
-        for a in (*simpler, *found):
+        for a in found:
             if a.name not in farthest or abs(a.found - a.given) > abs(farthest[a.name].found - a.given):
                 farthest[a.name] = a
         return tuple(farthest.values())
-
-    def _doubt(self) -> Doubt | None:
-        if not self.free_poses or self._is_exact() or self.state.model == "rich":
-            return None
-        std = np.sqrt(np.maximum(np.diagonal(self.pose_covariance, axis1=1, axis2=2), 0.0))
-        return doubt_about_given(self.views, self.state, self.calibration.fixed, self.normal, std)
 
     def _residuals(self) -> Array:
         """(N, 2) predicted minus observed [px], in the order of the points."""
@@ -340,10 +328,12 @@ class _AtMinimum:
 
     def _contest_at(self, views: Views, state: CameraState) -> Contest | None:
         selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
-        return contest(
+        held = contest(
             views, state, self.free, self.free_poses, self.points.image_size, named_lens=not selected,
             worth=self.repeated.worth,
         )  # fmt: skip
+        variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
+        return held and replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 
     def _as_given(self) -> tuple[Correspondences, Views]:
         """The points at the coordinates of the given target, also arranged by views."""

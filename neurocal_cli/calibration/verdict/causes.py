@@ -12,6 +12,8 @@ from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, Finding,
 from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Told
 
 _BIASED = Limit(2.0, 5.0)  # std of the focal lengths and the centre, by which a cause biases them
+_TOLD = 5.0  # std by which given values and poses are wrong
+_MOST = 0.75  # share of the squared error that other given values explain, if they are far better
 _EXCESS = 0.5  # least share of the squared error above the noise floor that named causes explain
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 _LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
@@ -36,15 +38,16 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
     """
     estimated = calibration.target is not None
     for place, (found, close) in enumerate(zip(contest.causes, contest.close, strict=True)):
-        if found.rival.of_given and given_told:
+        if found.rival.of_given and (given_told or _is_uncertain(found, contest, calibration)):
             continue
         if found.rival.of_board and estimated:
             continue  # the standard deviations include it
-        if not found.rival.of_board and any(other.rival.of_board for other in close):
+        if not (found.rival.of_board or found.rival.of_given) and any(x.rival.of_board for x in close):
             continue
         grade, reason = _graded(contest, found, calibration)
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
-            grade = max(grade, 1)  # the standard deviations do not include the board, lens and given values
+            # The standard deviations do not include the board and the lens.
+            grade = max(grade, int(not found.rival.of_given))
         names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
         single = found.rival.patterns is None
         if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
@@ -52,6 +55,29 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         if names:
             reason += f" (or, hardly less probable: {', '.join(names)})"
         yield grade, reason, found.rival.advice
+
+
+def given_camera(contest: Contest | None, calibration: Calibration) -> list[Finding]:
+    """What the points say against the camera that was given for them."""
+    if contest is None:
+        return []
+    return [
+        (*_graded(contest, found, calibration), found.rival.advice)
+        for found in contest.causes
+        if found.rival.of_given and not _is_uncertain(found, contest, calibration)
+    ]
+
+
+def _is_uncertain(found: Estimate, contest: Contest, calibration: Calibration) -> bool:
+    """Whether the change of a given focal length or centre is within its standard deviations."""
+    std, lin = calibration.std_of_given, contest.lin
+    if found.rival.steps_at(lin)[5:].any():
+        return False
+    places = lin.given[lin.given != 1].tolist()
+    alpha = float(lin.state.entries[0, 0]) * lin.views.pixel_scale
+    names = ("alpha_u", "theta", "alpha_v", "u0", "v0")
+    known = zip(places, found.amounts.tolist(), strict=True)
+    return all(abs(by) * alpha <= _TOLD * std.get(names[k], 0.0) for k, by in known)
 
 
 def closest(contest: Contest | None, calibration: Calibration) -> str:
@@ -63,12 +89,16 @@ def closest(contest: Contest | None, calibration: Calibration) -> str:
 
 def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tuple[int, str]:
     diagonal = image_diagonal(calibration.points)
-    told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal)
+    told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
+    if found.rival.of_given and told.moved_poses > _TOLD:
+        grade = max(grade, 1 + int(found.explained > _MOST))
     if contest.of_outliers:  # which were left out of the calibration
         return grade, reason
-    biased = (abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0)
+    biased = (
+        abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0
+    )
     return max(grade, _BIASED.grade(max(biased, default=0.0))), reason
 
 

@@ -28,6 +28,7 @@ _MINOR = 0.05  # share of a cause's evidence below which a further one is what i
 _FAR = 0.25  # the same after a cause that was fitted
 _PART = 0.3  # of the evidence: a good part
 _STEPS = 30
+_DETERMINE = 3  # views that determine a camera
 _MUCH = 0.3  # share of the squared error
 _LINEAR = 0.02  # of the focal length: largest difference of two cameras that is not fitted
 
@@ -42,6 +43,7 @@ class Contest:
     explained: float  # share of the squared error that all of them explain
     evidence: float  # log odds over nothing if the residuals of neighbours were independent
     of_outliers: bool = False  # whether the first one explains the outliers, which are included
+    std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 
     @property
     def beside_board(self) -> bool:
@@ -94,7 +96,7 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     causes: list[Estimate] = []
     close: list[tuple[Estimate, ...]] = []
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
-        ranking = _known_first(ranking)
+        ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, rivals, share)
         least = max(least, (_FAR if fits.get(_key(chosen[0])) else _MINOR) * chosen[0].evidence)
         for one in chosen:
@@ -109,14 +111,10 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence)
 
 
-def _known_first(ranking: list[Estimate]) -> list[Estimate]:
-    """A known cause that is hardly less probable than that of none comes first."""
-    for one in ranking:
-        if one.evidence < ranking[0].evidence - LEVEL:
-            break
-        if not one.rival.unknown:
-            return [one, *(other for other in ranking if other is not one)]
-    return ranking
+def _likeliest_first(ranking: list[Estimate]) -> list[Estimate]:
+    """Of those that are hardly less probable than the first, a given value comes first, the unknown last."""
+    n = sum(one.evidence >= ranking[0].evidence - LEVEL for one in ranking)
+    return sorted(ranking[:n], key=lambda one: (not one.rival.of_given, one.rival.unknown)) + ranking[n:]
 
 
 def _others(rivals: Iterable[Rival], causes: Iterable[Estimate]) -> tuple[Rival, ...]:
@@ -166,20 +164,22 @@ def _refined(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> E
     fit, left = _fitted(lin, one, fits), (1.0 - one.explained) * lin.cost
     if fit is None or not 0 < fit.cost < left:
         return one
-    n, camera = left / one.noise, one.camera
+    n, camera, amounts = left / one.noise, one.camera, one.amounts
     if fit.entries is not None:
-        camera = camera.copy()
+        step, camera = fit.entries - lin.state.entries[0], camera.copy()
         of_entries = lin.free < 5
-        camera[of_entries] = (fit.entries - lin.state.entries[0])[lin.free[of_entries]]
+        camera[of_entries] = step[lin.free[of_entries]]
+        if one.rival.of_given and one.rival.steps_at(lin)[:5].any():
+            amounts = step[lin.given[lin.given != 1]] / lin.state.entries[0, 0]
     gained = 0.5 * n * float(np.log(left / fit.cost))
     return replace(
-        one, evidence=one.evidence + gained, explained=1.0 - fit.cost / lin.cost, camera=camera,
-        noise=fit.cost / n,
+        one, evidence=one.evidence + gained, explained=1.0 - fit.cost / lin.cost, amounts=amounts,
+        camera=camera, noise=fit.cost / n,
     )  # fmt: skip
 
 
 def _fitted(lin: Linearised, one: Estimate, fits: dict[_Key, _Fit | None]) -> _Fit | None:
-    """Fit two cameras that are far apart, or a lens that explains much, each once; None for others."""
+    """Fit two cameras that are far apart, and lenses and given values that explain much; None for others."""
     key = _key(one)
     if key not in fits:
         fits[key] = _fit(lin, one)
@@ -195,8 +195,9 @@ def _fit(lin: Linearised, one: Estimate) -> _Fit | None:
             adjust(views.subset(some).batches, state.of_views(some), free, True, _STEPS) for some in groups
         ]
         return _Fit(sum(float(fit.cost.sum()) for fit in each))
-    if one.rival.cause == "a lens that is too simple" and one.explained > _MUCH:
-        added = lin.columns["lens"][: len(one.amounts)]
+    of_given = one.rival.of_given and views.n_views >= _DETERMINE and not state.square
+    if (of_given or one.rival.cause == "a lens that is too simple") and one.explained > _MUCH:
+        added = np.flatnonzero(one.rival.steps_at(lin).any(axis=1))
         free = np.isin(np.arange(5 + K), np.concatenate([lin.free, added]))
         fit = adjust(views.batches, state, free, True, _STEPS)
         return _Fit(float(fit.cost.sum()), fit.state.entries[0], point_residuals(views, fit.state))

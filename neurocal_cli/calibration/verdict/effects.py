@@ -100,17 +100,22 @@ def given(lin: Linearised) -> Array:
 
 
 def given_lens(lin: Linearised) -> Array:
-    """A change of the given coefficients of the lens, if the focal length is given as well."""
-    end = lin.columns["lens"][0] if lin.columns["lens"].size else 5 + len(lin.state.k)
-    of_lens = np.arange(5, end)
+    """A change of the given coefficients of the lens, if the focal length is given; k1 and k2 without any."""
+    of_model = lin.columns["lens"][0] - 5 if lin.columns["lens"].size else len(lin.state.k)
+    of_lens = np.arange(5, 5 + (of_model or min(2, len(lin.state.k))))
     places = of_lens[~np.isin(of_lens, lin.free)]  # np.setdiff1d would load numpy.ma
     return np.eye(lin.width)[:, places if 0 in lin.given else places[:0]]
 
 
 def lens(model: str) -> Steps:
-    """The coefficients that a model has and the chosen one lacks."""
-    lacking = 5 + len(coefficient_names(model))
-    return lambda lin: np.eye(lin.width)[:, lin.columns["lens"][lin.columns["lens"] < lacking]]
+    """The coefficients that a model has and the chosen one, which is not given with the camera, lacks."""
+    end = 5 + len(coefficient_names(model))
+
+    def steps(lin: Linearised) -> Array:
+        lacking = lin.columns["lens"]
+        return np.eye(lin.width)[:, lacking[lacking < (5 if 0 in lin.given else end)]]
+
+    return steps
 
 
 def _of_entries(lin: Linearised, *changes: Array) -> Array:

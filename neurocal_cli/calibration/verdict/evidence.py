@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.contest import Contest
 from neurocal_cli.calibration.verdict.findings import Finding
-from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated
+from neurocal_cli.calibration.verdict.given_parameters import Reestimated
 from neurocal_cli.calibration.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.calibration.verdict.proportions import Proportions
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -86,8 +86,7 @@ class Evidence:
     projection: ProjectionUncertainty | None
     repeated: tuple[str, ...]  # views that are copies of others
     mirrored: tuple[str, ...]  # views that show the target mirrored
-    reestimated: tuple[Reestimated, ...]  # given parameters, estimated from the points
-    doubt: Doubt | None  # another camera that explains the points better than a given one, with other poses
+    reestimated: tuple[Reestimated, ...]  # a given centre, estimated from the points
     noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
     stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
     poses: int  # number of different poses among the views (`repeated_poses`)

@@ -12,7 +12,7 @@ the poses with those of a camera with other parameters, or with another distorti
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.covariance import covariance
 from neurocal_cli.adjustment.problem import Problem, normalised, problem_for
-from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array, rotation_vector
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
 
@@ -53,18 +51,6 @@ class Reestimated:
     given: float
     found: float
     std: float
-
-
-@frozen_dataclass
-class Doubt:
-    """Another camera that explains the points decidedly better than the given one."""
-
-    what: str  # in what it differs: "focal length or centre" or "distortion"
-    model: str  # its distortion model
-    explained: float  # share of the squared error that it explains
-    # Rms change of the poses in their standard deviations; of the six parameters of a pose the one that
-    # changes most.
-    poses: float
 
 
 def reestimate_given(
@@ -172,66 +158,3 @@ def reestimate_centre_and_target(
 def told_apart(reestimated: tuple[Reestimated, ...], std: Mapping[str, float]) -> list[Reestimated]:
     """Those that the points tell apart from what is given with these standard deviations."""
     return [a for a in reestimated if abs(a.found - a.given) > TOLD_APART * np.hypot(a.std, std[a.name])]
-
-
-def doubt_about_given(
-    views: Views, state: CameraState, given: frozenset[str], normal: Array, std_of_poses: Array
-) -> Doubt | None:
-    """The camera that explains the points best if other parameters are allowed; None if the given one does.
-
-    The likelihood must tell them apart by more than five standard deviations, and the poses must differ by
-    more than five of those that are reported. `state` is normalised and at its minimum, and `normal` are the
-    normal matrices of the views there. `std_of_poses` (V, 6) are the reported standard deviations of omega
-    and tau, normalised.
-    """
-    before = float(normal[:, -1, -1].sum())
-    if given.isdisjoint(_NAMES) or not before > 0:
-        return None
-    best, most = None, 0.0
-    for what, start, some in _alternatives(state, given):
-        names = (*_ENTRIES, *coefficient_names(start.model))
-        for added in some:
-            free = np.array([name not in given for name in names], dtype=bool) | added
-            adjusted = adjust(views.batches, start, free, True, _STEPS)
-            if covariance(adjusted.normal, free, True, views.n_equations).smallest > _WELL_POSED:
-                break
-        else:
-            continue
-        left = float(adjusted.cost.sum()) / before
-        alike = correlation(views, point_residuals(views, adjusted.state))
-        spare = views.n_equations - 6 * views.n_views - int(free.sum())
-        n = effective_number(max(spare, 1.0), alike)
-        gain = -0.5 * n * np.log(max(left, _ROUNDING)) - (added.sum() - 1)
-        moved = _change_of_poses(state, adjusted.state, std_of_poses)
-        if gain > max(most, _DECISIVE) and moved > TOLD_APART:
-            best, most = Doubt(what, start.model, 1.0 - left, moved), gain
-    return best
-
-
-def _alternatives(
-    state: CameraState, given: frozenset[str]
-) -> Iterator[tuple[str, CameraState, list[NDArray[np.bool_]]]]:
-    """In what a camera may differ from the given one: its name, where to start, and what is then free.
-
-    One view of a flat target may not determine the focal length and the centre together.
-    """
-    none = np.zeros(5 + len(state.k), dtype=bool)
-    asked, in_part = none.copy(), none.copy()
-    asked[:5] = [name in given and name != "theta" for name in _ENTRIES]
-    in_part[[0, 2]] = asked[0]
-    yield "focal length or centre", state, [asked, in_part]
-    if asked[0]:
-        if state.model == "none":
-            state = state.with_model(_DISPLACED)
-        yield "distortion", state, [np.arange(5 + len(state.k)) >= 5]
-
-
-def _change_of_poses(before: CameraState, after: CameraState, std: Array) -> float:
-    """Rms change over the views in standard deviations, of the parameter that changes most."""
-    change = np.concatenate(
-        [rotation_vector(after.R @ np.swapaxes(before.R, 1, 2)), after.t - before.t], axis=1
-    )
-    known = (std > 0).all(axis=1)
-    if not known.any():
-        return 0.0
-    return float(np.sqrt(((change[known] / std[known]) ** 2).mean(axis=0)).max())

@@ -10,6 +10,7 @@ import numpy as np
 from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.drift import Drift
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
+from neurocal_cli.calibration.verdict.causes import given_camera as against_given
 from neurocal_cli.calibration.verdict.findings import (
     ERROR,
     WORDS,
@@ -20,7 +21,6 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.rules import given_parameters
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.observations.points import Correspondences
 
@@ -71,7 +71,7 @@ def given_camera(calibration: Calibration, fit: Calibration | None) -> list[Find
     """Findings about the camera from views whose poses were fitted with it."""
     if fit is None:
         return []
-    return list(given_parameters(gather_evidence(fit).reestimated, calibration.intrinsics, calibration.std))
+    return against_given(gather_evidence(fit).contest, fit)
 
 
 def with_findings(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:

@@ -60,6 +60,7 @@ class Told:
     unit: str  # of the world
     std: Mapping[str, float]  # reported standard deviations of the parameters
     diagonal: float  # of the image [px]
+    std_of_poses: Array | None = None  # (V, 6) reported ones of omega and tau, normalised
 
     @property
     def alpha(self) -> float:
@@ -77,6 +78,17 @@ class Told:
         names = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
         by = zip(self.lin.free.tolist(), self.found.camera.tolist(), strict=False)  # earlier causes come last
         return {names[k]: one * self.lin.views.pixel_scale for k, one in by if k in names}
+
+    @property
+    def moved_poses(self) -> float:
+        """Rms change of the poses in their standard deviations, of the parameter that changes most."""
+        if self.std_of_poses is None or not (self.std_of_poses > 0).all():
+            return 0.0
+        lin, found = self.lin, self.found
+        step = found.rival.steps_at(lin) @ found.amounts
+        step[lin.free] += found.camera[: len(lin.free)]
+        moved = (lin.solved[:, :, :-1] @ step) / self.std_of_poses
+        return float(np.sqrt((moved**2).mean(axis=0)).max())
 
     @property
     def members(self) -> list[str]:

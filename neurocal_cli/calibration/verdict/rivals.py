@@ -54,9 +54,7 @@ RIVALS: tuple[Rival, ...] = (
         "a wrong given distortion",
         "other coefficients than the given ones take the residuals away",
         "check that what is given is of the same camera at the same zoom, focus and image size",
-        words.plain(
-            "another distortion than the given one fits the points, which it displaces by {px} px rms"
-        ),
+        words.wrongly_given_lens,
         DISPLACED,
         patterns.common,
         steps=effects.given_lens,

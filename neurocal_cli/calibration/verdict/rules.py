@@ -25,7 +25,7 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.given_parameters import Doubt, Reestimated, told_apart
+from neurocal_cli.calibration.verdict.given_parameters import Reestimated, told_apart
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
 from neurocal_cli.camera.pinhole import Intrinsics
@@ -56,7 +56,6 @@ _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED_POOR = 0.025  # stretch of one side against the other
 _SPACING = 0.004  # rms over rms; of nine boards of photographs none is off by more than 0.0017
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
-_FAR_BETTER = 0.5  # share of the error that remains with another camera than the given one
 _SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 _TOLD = 3.0  # standard deviations
 
@@ -94,7 +93,7 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         yield 2, f"training did not converge: {calibration.stop_reason}", more
     yield from _redundancy(calibration)
     # A given camera that is wrong explains the errors, so it is reported before them.
-    given = list(_given(calibration, evidence))
+    given = list(given_parameters(evidence.reestimated, calibration.intrinsics, calibration.std))
     yield from given
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
@@ -203,31 +202,6 @@ def given_parameters(
         off = max(abs(a.found - a.given) for a in told) / given.alpha_u
         texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
         yield _GIVEN.grade(off), ", ".join(texts), _SAME
-
-
-def _given(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    """Findings about given parameters: those that the points contradict, and those that harm the poses."""
-    std = dict(calibration.std) | calibration.std_of_given
-    found = list(given_parameters(e.reestimated, calibration.intrinsics, std))
-    doubt, grade = e.doubt, max((grade for grade, *_ in found), default=0)
-    if doubt is None or (grade and doubt.what != "distortion"):
-        yield from found
-        return
-    left = np.sqrt(1.0 - doubt.explained)
-    poses = f"the poses are then {doubt.poses:.2g} standard deviations from the reported ones"
-    if found and doubt.what != "distortion":
-        reason = f"{found[0][1]}; {poses}"
-    else:
-        reason = f"{_other_camera(calibration, doubt)} lowers the error by {100 * (1 - left):.2g} %; {poses}"
-    yield max(grade, 1 + int(left < _FAR_BETTER)), reason, _SAME
-
-
-def _other_camera(calibration: Calibration, doubt: Doubt) -> str:
-    if doubt.what != "distortion":
-        return f"the given camera does not fit these points: another {doubt.what}"
-    if calibration.distortion_model == "none":
-        return f"the camera is given without distortion, but {doubt.model} estimated from these points"
-    return "the given distortion does not fit these points: one estimated from them"
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:

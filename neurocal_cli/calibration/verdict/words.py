@@ -21,6 +21,7 @@ _STRETCHED = 0.004  # relative
 _LINEAR = 0.2  # of the focal length: changes up to this are estimated, if roughly
 _DETERMINE = 3  # views that determine a camera of their own
 _STEPS = 30
+_SOME = 0.15  # share of the largest change of a given value from which on others are told, too
 
 
 def plain(text: str) -> Say:
@@ -232,16 +233,36 @@ def too_simple(model: str) -> Say:
 
 
 def wrongly_given(told: Told) -> Said:
-    """Given parameters, and how far off they are."""
+    """Given focal lengths and centre, what the points have, and what that does to the poses."""
+    lin, amounts = told.lin, told.found.amounts
+    places = lin.given[lin.given != 1].tolist()
+    largest = float(np.abs(amounts).max())
+    if lin.state.square and len(places) == 1:
+        amount = float(amounts[0])
+        return f"the pixels are not square: alpha_v - alpha_u is {100 * amount:+.2g} % of alpha_u", largest
+    if lin.views.n_views < _DETERMINE and len(places) > 2:
+        text = "the given camera does not fit these points: another focal length or centre does"
+        return text + _poses(told), largest
     names: Mapping[int, str] = {0: "alpha_u", 2: "alpha_v", 3: "u0", 4: "v0"}
-    places = told.lin.given[told.lin.given != 1].tolist()
-    by = [f"{names[k]} {a * told.alpha:+.2g} px" for k, a in zip(places, told.found.amounts, strict=True)]
-    if told.lin.state.square and len(places) == 1:
-        amount = float(told.found.amounts[0])
-        return f"the pixels are not square: alpha_v - alpha_u is {100 * amount:+.2g} % of alpha_u", abs(
-            amount
-        )
-    return (
-        f"other values than the given ones fit the points: {', '.join(by)}",
-        float(np.abs(told.found.amounts).max()),
-    )
+    before = lin.state.entries[0] * lin.views.pixel_scale + [0, 0, 0, *lin.views.pixel_centre]
+    by = [
+        f"{names[k]} = {before[k]:.5g} is given, but the points give {before[k] + a * told.alpha:.5g} px"
+        for k, a in zip(places, amounts.tolist(), strict=True)
+        if abs(a) > _SOME * largest
+    ]
+    return ", ".join(by) + _poses(told), largest
+
+
+def wrongly_given_lens(told: Told) -> Said:
+    """Given distortion, or none."""
+    px = told.displaced
+    text = f"the given distortion does not fit these points, by {px:.2g} px rms: another one does"
+    lacking = told.lin.columns["lens"]
+    if lacking.size and lacking[0] == 5:
+        text = f"the camera is given without distortion, but the points show one, by {px:.2g} px rms"
+    return text + _poses(told), px / told.diagonal
+
+
+def _poses(told: Told) -> str:
+    moved = told.moved_poses
+    return f"; the poses are then {moved:.2g} standard deviations from the reported ones" if moved > 1 else ""
