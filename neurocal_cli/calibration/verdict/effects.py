@@ -39,6 +39,11 @@ def glass(seen: Seen) -> Array | None:
     return (seen.by_board[:, :2] * shift[:, :, None]).sum(axis=1, keepdims=True)
 
 
+def turning(seen: Seen) -> Array:
+    """The camera turns while the rows are read: the image moves."""
+    return seen.by_entries[:, 3:5] * seen.pixels[:, None, None, 1]
+
+
 def rolling(seen: Seen) -> Array:
     """The target, or the camera, moves in any direction while the rows are read."""
     return seen.by_pose * seen.pixels[:, None, None, 1]

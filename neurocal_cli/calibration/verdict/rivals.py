@@ -172,13 +172,16 @@ RIVALS: tuple[Rival, ...] = (
         patterns.common,
         effect=effects.glass,
     ),
-    Rival(
-        "a rolling shutter",
-        "displacements that grow with the row, as the target moves in any way, in each view another one",
-        _STILL,
-        words.rolling,
-        _MOVED,
-        effect=effects.rolling,
+    *(
+        Rival(
+            "a rolling shutter",
+            "displacements that grow with the row, in each view others",
+            _STILL,
+            words.rolling,
+            _MOVED,
+            effect=effect,
+        )
+        for effect in (effects.turning, effects.rolling)
     ),
     *(
         Rival(

@@ -191,8 +191,10 @@ def bent_view(told: Told) -> Said:
 def rolling(told: Told) -> Said:
     """Rows that were read while the camera moved."""
     rows = float(np.ptp(told.lin.views.pixels[:, 1]))
-    across = told.found.amounts[:, 3:5] / told.lin.state.t[:, 2:]  # of the centroids
-    px = float(np.sqrt((across**2).mean())) * told.alpha * rows
+    amounts, lin = told.found.amounts, told.lin
+    if amounts.shape[1] > 2:  # how the centroids of the targets move
+        amounts = amounts[:, 3:5] * lin.state.entries[0, 0] / lin.state.t[:, 2:]
+    px = float(np.sqrt((amounts**2).mean())) * rows * lin.views.pixel_scale
     return (
         f"camera or target moved while the rows of the images were read, by about {px:.2g} px from the first "
         "points to the last: a rolling shutter",

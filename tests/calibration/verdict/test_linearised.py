@@ -93,7 +93,7 @@ def test_rows_that_are_read_while_the_target_moves() -> None:
     X += late * (np.cross(w[view], turned) + v[view])
     pixels = X[:, :2] / X[:, 2:] * state.entries[0, [0, 2]] + state.entries[0, 3:]
     lin, *_ = at(replace(points, pixels=pixels), state)
-    (rolling,) = (one for one in RIVALS if one.cause == "a rolling shutter")
+    _, rolling = (one for one in RIVALS if one.cause == "a rolling shutter")
     (found,) = estimates(lin, lin.spare, (rolling,))
     assert found.explained > 0.99
 
