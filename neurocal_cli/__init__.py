@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.camera.remapping import undistort_image
     from neurocal_cli.commands.show.results import plot, report
-    from neurocal_cli.detection.board_size import find_board
+    from neurocal_cli.detection.board_kind import find_board
     from neurocal_cli.detection.detect import Detection, detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.files.board_yaml import read_board
@@ -83,7 +83,7 @@ _HOMES = {
     "evaluate_lens": "calibration.zoom.evaluation",
     "evaluate_stereo_rig": "calibration.rig.evaluation",
     "evaluate_stereo": "calibration.rig.evaluation",
-    "find_board": "detection.board_size",
+    "find_board": "detection.board_kind",
     "find_drift": "calibration.drift",
     "fit_lens": "calibration.zoom.fit",
     "fit_lens_cameras": "calibration.zoom.fit",

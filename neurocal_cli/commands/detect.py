@@ -112,11 +112,11 @@ def detect(
 ) -> None:
     """Detect boards in images and measure points on them.
 
-    The number of columns and rows of a chessboard is found if neither these nor a board are given; at least
-    some images must show the whole board then. Give the side of a square by --square; without it, the unit
-    of all lengths is a square. Each image becomes a view with the name of its file. A chessboard that is
-    partly hidden or cut off by the image is used if enough of its outer border is visible to tell which
-    part it is. Other boards are described by --board.
+    The board is found if it is not described: a chessboard, a ChArUco board, an AprilGrid or circles, and
+    its numbers of columns and rows; at least some images must show the whole board then. Give the side of a
+    square or tag, or the distance of circles, by --square; without it, that is the unit of all lengths. Each
+    image becomes a view with the name of its file. A chessboard that is partly hidden or cut off by the image
+    is used if enough of its outer border is visible to tell which part it is.
 
     Boards with markers (ChArUco, AprilGrid) are found by these, and any part with two of them is used. The
     dictionary of a ChArUco board, and whether it has OpenCV's legacy pattern, are told from the image if they

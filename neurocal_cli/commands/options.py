@@ -358,7 +358,13 @@ def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
         ),
         size("--cols", "C", "Number of inner vertices in a row of the board."),
         size("--rows", "R", "Number of rows of inner vertices."),
-        number("--square", "S", "Side length of a square.", without="none", positive=True),
+        number(
+            "--square",
+            "S",
+            "Side length of a square, or of a tag, or the distance of circles.",
+            without="none",
+            positive=True,
+        ),
         click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
     )
     return collected(BoardOptions, added, "board")

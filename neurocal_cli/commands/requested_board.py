@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Size = tuple[int, int]
 
+_UNKNOWN = "the {} is not given, so it is the unit of all lengths; give it by --square"
+
 _SELDOM = 0.2  # ratio of images with the described size to those with another; boards are seen in mirrors
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
@@ -27,8 +29,8 @@ _FEW = 3  # images; fewer may by chance show the same part of the board
 def described_board(options: BoardOptions) -> Board | None:
     """The described board in its measured size; None if its size is to be found."""
     board = options.read_or_unknown()
-    if options.file is None and options.square is None:
-        note("the side of a square is not given, so it is the unit of all lengths; give it by --square")
+    if board is not None and options.file is None and options.square is None:
+        note(_UNKNOWN.format("side of a square"))
     if board is None or not board.distances:
         return board
     scale = board.scale
@@ -41,28 +43,45 @@ def described_board(options: BoardOptions) -> Board | None:
 
 
 def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) -> Board:
-    """Find the size of the board in image files, and say what it is; see `find_board`.
+    """Find the board in image files, and say what it is; see `find_board`.
 
     Unless an image shows all ends of the board, it is a NoBoardError to have less than `enough` images.
     """
-    from neurocal_cli.detection.board_size import found_size
+    from neurocal_cli.detection.board_kind import found_board
     from neurocal_cli.detection.identity.placement import NoBoardError
     from neurocal_cli.observations.board import Board
+    from neurocal_cli.observations.board_kinds import found_words, unit_length
 
     with ProgressBar() as progress:
-        found = found_size(_readable(_spread(paths), progress))
+        found = found_board(_readable(_spread(paths), progress))
+    plane = found.plane
     if not found.sure and len(paths) < enough:
         raise NoBoardError(
             "it is not certain where the board ends; more images of the whole board are needed"
         )
-    (cols, rows), (square, unit) = found.size, options.side
-    say(f"found a chessboard of {cols} x {rows} inner vertices")
-    if not found.sure:
+    (side, unit), length = options.side, unit_length(plane)
+    say(f"found {found_words(plane)}")
+    warn(*found.doubts)
+    if not found.sure and plane.markers is None:
         warn(
-            f"no image shows that the board ends on all sides; if it has more than {cols} x {rows} inner "
-            "vertices, give their numbers by --cols and --rows"
+            f"no image shows that the board ends on all sides; if it has more than {plane.cols} x "
+            f"{plane.rows} inner vertices, give their numbers by --cols and --rows"
         )
-    return Board.single(cols, rows, square, unit)
+    elif not found.sure:
+        warn(
+            "no image shows that the board ends at its first and last row; if it has more rows, describe it "
+            "by --board"
+        )
+    if options.square is None:
+        note(_UNKNOWN.format(length))
+        unit = (
+            "squares"
+            if length == "side of a square"
+            else "tags"
+            if length == "side of a tag"
+            else "distances"
+        )
+    return Board((plane.rescaled(side),), unit)
 
 
 def _spread(paths: Sequence[str]) -> list[str]:
@@ -77,7 +96,7 @@ def _readable(paths: Sequence[str], progress: Callable[[str, float], None]) -> I
 
     problem, read = None, False
     for number, path in enumerate(paths):
-        progress("finding the size of the board", number / len(paths))
+        progress("finding the board", number / len(paths))
         try:
             grey = read_image(path).grey
         except NeurocalError as error:

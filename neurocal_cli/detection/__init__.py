@@ -9,7 +9,7 @@ image -> pyramid -> saddle points           `finding.saddles`
 -> links along edges -> seeds of lattices   `finding.links`
 -> growing lattices                         `finding.grow` (`finding.lattice`)
 -> grids, one for each plane                `finding.grids` (`overlaps`, `straighten`, `wide_lens`)
--> size of the board, if it is not given    `board_size`
+-> kind and size, if they are not given      `board_kind` (`board_size`, `markers`, `circles`)
 -> identity: the board's coordinates        `identity.identify` (`identity.placement`, `identity.ends`)
 -> edge fits to all pixels nearby           `fitting.grid_fit` (`grid_edges`, `initial_fit`,
                                             `common_parameters`, `edge_fit`, `edge_profile`, `sharpening`,

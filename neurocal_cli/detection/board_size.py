@@ -1,4 +1,4 @@
-"""Find the size of a chessboard from images of it: the most complete grid that enough images agree on.
+"""Tell the size of a chessboard from grids in images: the most complete grid that enough images agree on.
 
 Each image votes for the size of its foremost grid, unless the image cuts it off. A vote for a grid without
 gaps counts before one with gaps, and a vote is sure if the board is seen to end at all sides. Parts of a
@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.placement import NoBoardError
-from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import plural
-from neurocal_cli.observations.board import Board
 
 Size = tuple[int, int]  # columns and rows of inner vertices, the larger number first
 
@@ -33,7 +32,8 @@ _BORDER = 2.5  # squares between a grid with gaps and the image border
 _BESIDE = 1.5  # boards whose squares are smaller by more than this are behind the foremost one
 _ENOUGH = 0.2  # least share of the votes for the board's size, and greatest share of the grids that exceed it
 _CERTAIN, _CERTAIN_UNSURE = 5, 10  # votes after which no more images are examined, if one is sure, and if not
-_MOST_TRIED = 5  # images without a chessboard that are searched for another target
+_WITHIN = np.linspace(0.2, 0.8, 9)  # of a square, where its levels are looked at
+_LEVEL = 0.2  # greatest spread of a square of one level, over the contrast
 
 
 class Vote(IntEnum):
@@ -52,6 +52,7 @@ class SeenBoard:
     size: Size
     vote: Vote
     beside: tuple[Size, ...] = ()  # whole grids next to it, not far behind
+    plain: bool = True  # whether its squares have one colour each, and no markers in them
 
 
 @frozen_dataclass
@@ -77,7 +78,26 @@ def seen_board(grey: NDArray[np.generic]) -> SeenBoard | None:
     else:
         vote = Vote.SURE if states == {End.BOARD} else Vote.WHOLE
     near = (x for x in others if _is_whole(x.seen) and x.square * _BESIDE > foremost.square)
-    return SeenBoard(_ordered(foremost.shape), vote, tuple(_ordered(x.shape) for x in near))
+    beside = tuple(_ordered(x.shape) for x in near)
+    return SeenBoard(_ordered(foremost.shape), vote, beside, _is_plain(grey, foremost))
+
+
+def _is_plain(grey: NDArray[np.generic], grid: Grid) -> bool:
+    """Whether most squares of either colour are of one level, compared with the contrast of the board."""
+    p = grid.pixels
+    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
+    whole = np.isfinite(corners).all(axis=(2, 3))
+    a, b = np.meshgrid(_WITHIN, _WITHIN)
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b]).reshape(4, -1)
+    levels = interpolate(grey_levels(grey), np.einsum("kn,mkd->mnd", weights, corners[whole]))
+    # Means of nine samples are hardly noisy.
+    means = levels.reshape(-1, 3, 3, 3, 3).mean(axis=(2, 4)).reshape(-1, 9)
+    colour = (np.indices(whole.shape).sum(axis=0) % 2)[whole]
+    if min(np.bincount(colour, minlength=2)) == 0:
+        return True
+    middle = [float(np.median(means[colour == k])) for k in (0, 1)]
+    spread = max(float(np.median(means[colour == k].std(axis=1))) for k in (0, 1))
+    return spread < _LEVEL * abs(middle[1] - middle[0])
 
 
 def _is_whole(seen: NDArray[np.bool_]) -> bool:
@@ -99,25 +119,7 @@ def _holds(large: Size, small: Size) -> bool:
     return large[0] >= small[0] and large[1] >= small[1]
 
 
-def found_size(images: Iterable[NDArray[np.generic]]) -> FoundSize:
-    """Find the size of the board in grey images, which are examined until it is certain; see `find_board`."""
-    seen: list[SeenBoard] = []
-    others: list[str] = []
-    for image in images:
-        board = seen_board(image)
-        if board is not None:
-            seen.append(board)
-        elif not seen and len(others) < _MOST_TRIED:
-            others.append(other_target(image))
-        if _is_certain(seen):
-            break
-    if not seen:
-        named = next(filter(None, others), "")
-        raise NoBoardError(named or "no image shows a chessboard; show the whole board, sharp and evenly lit")
-    return agreed_size(seen)
-
-
-def _is_certain(seen: Sequence[SeenBoard]) -> bool:
+def is_certain(seen: Sequence[SeenBoard]) -> bool:
     """Whether further images need not be examined: there are enough votes, and all grids are parts of it."""
     votes = Counter(one.size for one in seen if one.vote >= Vote.WHOLE and not one.beside)
     if not votes:
@@ -129,7 +131,7 @@ def _is_certain(seen: Sequence[SeenBoard]) -> bool:
 
 
 def agreed_size(seen: Sequence[SeenBoard]) -> FoundSize:
-    """The size of the board that at least one image shows; see `find_board`."""
+    """The size of the board that at least one image shows; see `board_kind`."""
     several = [one for one in seen if one.beside]
     if 2 * len(several) > len(seen):
         sizes, _ = Counter(tuple(sorted((one.size, *one.beside))) for one in several).most_common(1)[0]
@@ -172,30 +174,3 @@ def _with_enough_votes(seen: Sequence[SeenBoard], least: Vote) -> dict[Size, int
 def _names(sizes: Iterable[Size]) -> str:
     *names, last = (f"{cols} x {rows}" for cols, rows in sizes)
     return f"{', '.join(names)} and {last}" if names else last
-
-
-def find_board(images: Iterable[NDArray[np.generic]], square: float = 1.0, unit: str = "squares") -> Board:
-    """Find the chessboard that grey images show: its numbers of columns and rows.
-
-    Parameters
-    ----------
-    images : iterable of (height, width) arrays
-        Of 8 or 16 bits, of one board. They are examined until its size is certain.
-    square : float
-        Side of a square, which images do not show.
-    unit : str
-        Unit of the side.
-
-    Returns
-    -------
-    board : Board
-        With at least as many columns as rows.
-
-    Raises
-    ------
-    NoBoardError
-        No image shows a chessboard, or only parts, or the images do not agree; the message says what they
-        show.
-    """
-    cols, rows = found_size(images).size
-    return Board.single(cols, rows, square, unit)

@@ -135,3 +135,33 @@ def described(plane: Plane, unit: str) -> str:
         squares = f"{plane.cols + 1} x {plane.rows + 1} squares with markers"
         return f"{squares}, square {plane.square:g}, marker {plane.markers.side:g} {unit}"
     return f"{plane.cols} x {plane.rows} inner vertices, square {plane.square:g} {unit}"
+
+
+def found_words(plane: Plane) -> str:
+    """What was found of a plane: its kind, what one counts on it, and its markers."""
+    markers = plane.markers
+    if isinstance(plane, CirclePlane):
+        kind = "asymmetric circles" if plane.asymmetric else "circles"
+        return f"a grid of {plane.cols} x {plane.rows} {kind}"
+    if markers is None:
+        return f"a chessboard of {plane.cols} x {plane.rows} inner vertices"
+    first = f"from {markers.first_id} on"
+    if isinstance(plane, TagPlane):
+        family = markers.dictionary.replace("DICT_APRILTAG_", "tag")
+        cells = "cells" if plane.border > 1 else "cell"
+        return (
+            f"an AprilGrid of {plane.tags[0]} x {plane.tags[1]} tags, spacing {plane.spacing:g}, {family} "
+            f"with a border of {plane.border} {cells}, {first}"
+        )
+    pattern = ", the legacy pattern, whose first square is light" if markers.legacy else ""
+    return (
+        f"a ChArUco board of {plane.cols + 1} x {plane.rows + 1} squares, markers of "
+        f"{markers.side / plane.square:g} of a square, {markers.dictionary} {first}{pattern}"
+    )
+
+
+def unit_length(plane: Plane) -> str:
+    """The length that tells the size of a plane."""
+    if isinstance(plane, CirclePlane):
+        return "distance of rows" if plane.asymmetric else "distance of circles"
+    return "side of a tag" if isinstance(plane, TagPlane) else "side of a square"

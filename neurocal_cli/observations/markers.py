@@ -79,6 +79,11 @@ def code_count(dictionary: str) -> int:
     return int(_predefined(dictionary).bytesList.shape[0])
 
 
+def correctable(dictionary: str) -> int:
+    """Number of wrong cells that the codes of a dictionary still tell apart."""
+    return int(_predefined(dictionary).maxCorrectionBits)
+
+
 @lru_cache(maxsize=4096)
 def code(dictionary: str, number: int, border: int = 1) -> NDArray[np.bool_]:
     """Dark cells of an upright marker, with its border of this many cells; ``[row, column]``.

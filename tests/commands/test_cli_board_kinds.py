@@ -44,6 +44,27 @@ def test_a_printed_board_is_found_by_its_file(tmp_path: Path, form: str, points:
     assert np.abs(world @ linear - pixels).max() < 0.08
 
 
+def test_a_printed_board_is_found_without_a_description(tmp_path: Path) -> None:
+    picture, found = tmp_path / "board.png", tmp_path / "found.yaml"
+    run("board", "--board", "charuco:6x4:30:24:DICT_5X5_50", "--dpi", 60, "-o", picture)
+    image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    image = cv2.copyMakeBorder(image, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=(90,))
+    cv2.imwrite(str(picture), cv2.GaussianBlur(image, (0, 0), 0.7))
+    words = "--points", "vertices", "--save-board", found, "-o", tmp_path / "p.csv"
+    result = run("detect", picture, *words)
+    assert result.exit_code == 0, result.stderr
+    said = "found a ChArUco board of 6 x 4 squares, markers of 0.8 of a square, DICT_5X5_50 from 0 on"
+    assert result.stderr.splitlines()[0] == said
+    assert "the side of a square is not given, so it is the unit of all lengths" in result.stderr
+    board = read_board(found)
+    assert board.unit == "squares"
+    result = run("detect", picture, "--board", found, *words[:2], "-o", tmp_path / "q.csv")
+    assert (tmp_path / "q.csv").read_bytes() == (tmp_path / "p.csv").read_bytes()
+    result = run("detect", picture, "--square", 30, *words)
+    assert read_board(found).planes[0].square == 30
+
+
 def test_circles_are_printed_at_their_places_in_all_formats(tmp_path: Path) -> None:
     form = "asymmetric_circles:4x5:20"
     for name in ("b.svg", "b.pdf", "b.png"):

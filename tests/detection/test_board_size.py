@@ -9,12 +9,14 @@ from support.real_data import RealFiles
 from support.rendered import CONDITIONS, condition, picture
 from support.slow_cases import slow_but
 
-from neurocal_cli.detection.board_size import SeenBoard, Vote, agreed_size, find_board, found_size, seen_board
+from neurocal_cli.detection.board_kind import find_board, found_board
+from neurocal_cli.detection.board_size import SeenBoard, Vote, agreed_size, seen_board
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
 from neurocal_cli.detection.identity.identify import identify
 from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.files.board_kinds import kind_of
 from neurocal_cli.observations.board import Board
 
 FIRST = 1400  # seeds that nothing was developed on
@@ -138,7 +140,8 @@ def test_rendered_boards_have_their_size_in_every_image_that_tells_it(name: str)
 def test_the_sizes_of_real_boards_are_found(
     real_files: RealFiles, pattern: str, size: tuple[int, int], step: int
 ) -> None:
-    assert found_size(grey(path) for path in real_files(pattern)[::step]).size == size
+    found = found_board(grey(path) for path in real_files(pattern)[::step]).plane
+    assert (kind_of(found), (found.cols, found.rows)) == ("chessboard", size)
 
 
 @pytest.mark.slow
@@ -163,7 +166,7 @@ def test_no_single_photograph_tells_another_size(
 def test_walls_of_a_corner_are_no_single_board(real_files: RealFiles) -> None:
     images = (grey(path) for path in real_files("ortho3/*_calib.jpg"))
     with pytest.raises(NoBoardError, match="3 chessboards beside each other, of 7 x 6, 8 x 6 and 8 x 6"):
-        found_size(images)
+        found_board(images)
 
 
 def test_photographs_of_circles_have_no_grid(real_files: RealFiles) -> None:
@@ -192,7 +195,7 @@ def test_the_border_of_a_shadow_is_no_end_of_the_board(real_files: RealFiles) ->
     (located,) = identify(Board.single(9, 7, 25.0), grids, image).located
     assert located.grid.shape == (7, 5)
     with pytest.raises(NoBoardError, match="only parts of a chessboard are seen, of 7 x 5"):
-        found_size([image])
+        found_board([image])
 
 
 def in_shadow(light: float) -> tuple[np.ndarray, Grid]:

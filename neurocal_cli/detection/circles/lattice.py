@@ -32,7 +32,7 @@ _SYMMETRIC = (
     "image; to get the same point ids in all images, use an asymmetric grid with an odd number of rows"
 )
 # Bases of the lattice: matrices of determinant 1 with small entries.
-_BASES = tuple(
+BASES = tuple(
     np.array(entries).reshape(2, 2)
     for entries in product((-2, -1, 0, 1, 2), repeat=4)
     if entries[0] * entries[3] - entries[1] * entries[2] == 1 and sum(map(abs, entries)) <= 4
@@ -56,7 +56,7 @@ def place_circles(plane: CirclePlane, blobs: Blobs) -> PlacedCircles | None:
     Raises NoBoardError if a part of the board is seen that may be several parts.
     """
     count = plane.cols * plane.rows
-    best = _largest(blobs, count)
+    best = largest_lattice(blobs, count)
     if len(best) < max(min(_FEWEST, count), _LEAST_SHARE * count):
         return None
     at = np.array(list(best.values()), dtype=np.int64)
@@ -64,8 +64,8 @@ def place_circles(plane: CirclePlane, blobs: Blobs) -> PlacedCircles | None:
     return _placed(plane, blobs, index, at)
 
 
-def _largest(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
-    """The largest lattice that grows from a start: the blob of each place."""
+def largest_lattice(blobs: Blobs, enough: int) -> dict[tuple[int, int], int]:
+    """The largest lattice that grows from a start, or the first of `enough` places: the blob of each."""
     best: dict[tuple[int, int], int] = {}
     if len(blobs) < 4:
         return best
@@ -172,7 +172,7 @@ def _placed(
     """Compare a lattice with the board in all bases and places."""
     board = _lattice_of(plane)
     found: list[tuple[NDArray[np.int64], Array]] = []
-    for basis in _BASES:
+    for basis in BASES:
         turned = index @ basis.T
         found += [(turned + shift, basis) for shift in _shifts(turned, board)]
     if not found:

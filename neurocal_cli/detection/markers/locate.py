@@ -112,7 +112,9 @@ def _told(plane: Plane, placed: Placed) -> str:
 
 def smallest(dictionary: str, cells: Cells) -> str:
     """The smallest dictionary with the same codes for the cells, since larger ones begin like it."""
-    bits = dictionary.rpartition("_")[0]
+    bits, _, count = dictionary.rpartition("_")
+    if not count.isdigit():
+        return dictionary
     last = int(cells.number.max())
     return next(
         (d for d in DICTIONARIES if d.rpartition("_")[0] == bits and code_count(d) > last), dictionary

@@ -7,7 +7,8 @@ have cannot be read.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -61,27 +62,47 @@ def read_markers(
 
     The caller stops when enough of them are read. `border` is the width of a marker's border in cells.
     """
-    longest = max(grey.shape)
-    scales = [1.0]
-    if longest > _LONGEST:
-        scales = [0.5 ** int(np.ceil(np.log2(longest / _LONGEST))), 1.0]
-    elif longest <= _SMALL:
-        scales = [1.0, _ENLARGED]
     detector = _detector(dictionary, first, count, border)
     if detector is None:
         return
-    for scale in scales:
-        image = _scaled(grey, scale)
-        parameters = detector.getDetectorParameters()
-        parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(scale, 1.0) / max(image.shape)
-        detector.setDetectorParameters(parameters)
-        corners, ids, _ = detector.detectMarkers(image)
+    for scale in scales_of(grey):
+        corners, ids, _ = _detected(detector, grey, scale)
         if ids is None or not len(ids):
             continue
         number = np.asarray(ids).reshape(-1).astype(np.int64) + first
-        # The corners of OpenCV lie on the centres of the outermost dark pixels.
-        places = (np.stack(corners).reshape(-1, 4, 2).astype(float) + 0.5) / scale - 0.5
-        yield Marks(number, places, dictionary)
+        yield Marks(number, _places(corners, scale), dictionary)
+
+
+def candidates(grey: NDArray[np.uint8], scale: float) -> Array:
+    """Quadrangles (N, 4, 2) [px] that may be markers of any dictionary, at a scale of an image."""
+    detector = _detector(USUAL[0], 0, 1, 1)
+    if detector is None:
+        return np.zeros((0, 4, 2))
+    corners, _, rejected = _detected(detector, grey, scale)
+    return _places([*corners, *rejected], scale)
+
+
+def scales_of(grey: NDArray[np.uint8]) -> list[float]:
+    """Scales of an image at which markers are looked for, one after the other."""
+    longest = max(grey.shape)
+    if longest > _LONGEST:
+        return [0.5 ** int(np.ceil(np.log2(longest / _LONGEST))), 1.0]
+    return [1.0, _ENLARGED] if longest <= _SMALL else [1.0]
+
+
+def _detected(detector: Any, grey: NDArray[np.uint8], scale: float) -> tuple[Any, Any, Any]:
+    image = _scaled(grey, scale)
+    parameters = detector.getDetectorParameters()
+    parameters.minMarkerPerimeterRate = 4 * _SMALLEST * max(scale, 1.0) / max(image.shape)
+    detector.setDetectorParameters(parameters)
+    corners, ids, rejected = detector.detectMarkers(image)
+    return corners, ids, rejected
+
+
+def _places(corners: Sequence[NDArray[np.float32]], scale: float) -> Array:
+    """Corners (N, 4, 2) [px]; those of OpenCV lie on the centres of the outermost dark pixels."""
+    found = np.array(corners, dtype=float).reshape(-1, 4, 2)
+    return np.asarray((found + 0.5) / scale - 0.5)
 
 
 def eight_bits(image: NDArray[np.generic]) -> NDArray[np.uint8]:

@@ -1,0 +1,137 @@
+"""Tell the pattern of a grid of circles from images: its rows, and whether every second one is shifted.
+
+The circles of an image are a lattice whose steps may be any. In the steps of the board they fill a rectangle,
+as rows or as shifted rows. An image whose border cuts the board off tells nothing, nor does one in which a
+circle is hidden.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.circles.blobs import Blobs, find_blobs
+from neurocal_cli.detection.circles.lattice import BASES, largest_lattice
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.markers.lattice import homographies, homography_at
+from neurocal_cli.detection.markers.reading import eight_bits
+from neurocal_cli.observations.board_kinds import CirclePlane
+
+_FEWEST = 12  # circles
+_FEWEST_ROWS = 3  # and columns
+_MOST_CIRCLES = 3000
+_BENT = 0.1  # greatest median of the second differences of centres, over the step
+_ENOUGH = 0.2  # least share of the votes for the board's pattern
+
+
+@frozen_dataclass
+class SeenCircles:
+    """A grid of circles in an image."""
+
+    cols: int
+    rows: int
+    asymmetric: bool
+    whole: bool  # whether it fills the pattern, and the image shows that it ends at all sides
+
+    def __str__(self) -> str:
+        """What one counts on it."""
+        return f"{self.cols} x {self.rows}{' asymmetric' if self.asymmetric else ''} circles"
+
+
+def seen_circles(image: NDArray[np.generic]) -> SeenCircles | None:
+    """The grid of circles that a grey image shows, dark or light; None if there is none."""
+    grey = eight_bits(image)
+    found: list[tuple[int, Blobs, dict[tuple[int, int], int]]] = []
+    for light in (False, True):
+        blobs = find_blobs(255 - grey if light else grey)
+        lattice = largest_lattice(blobs, _MOST_CIRCLES)
+        if len(lattice) >= _FEWEST:
+            found.append((len(lattice), blobs, lattice))
+    if not found:
+        return None
+    # The gaps between circles are a lattice, too, of fewer places.
+    _, blobs, lattice = max(found, key=lambda one: one[0])
+    index = np.array(list(lattice), dtype=np.int64)
+    centre = blobs.centre[list(lattice.values())]
+    if _bent(index, centre) > _BENT:
+        return None
+    share, seen, places = max((one for basis in BASES for one in _patterns(index @ basis.T)), key=_likelihood)
+    if min(seen.cols, seen.rows) < _FEWEST_ROWS:
+        return None
+    return replace(seen, whole=share == 1 and _ends_seen(places, centre, seen, grey.shape))
+
+
+def _likelihood(one: tuple[float, SeenCircles, Array]) -> tuple[float, bool, int]:
+    """Fuller, then plain rather than shifted, then lying rather than upright; shifted ones upright."""
+    share, seen, _ = one
+    lying = seen.cols - seen.rows
+    return round(share, 6), not seen.asymmetric, -lying if seen.asymmetric else lying
+
+
+def _patterns(index: NDArray[np.int64]) -> list[tuple[float, SeenCircles, Array]]:
+    """Patterns that contain all places of a lattice: filled share, pattern, and places in its distances."""
+    n = len(index)
+    plain = index - index.min(axis=0)
+    cols, rows = (int(one) + 1 for one in plain.max(axis=0))
+    found = [(n / (cols * rows), SeenCircles(cols, rows, False, whole=False), plain.astype(float))]
+    shifted = np.stack([index[:, 0] - index[:, 1], index[:, 0] + index[:, 1]], axis=-1)
+    shifted = shifted - shifted.min(axis=0)
+    x, r = shifted.T
+    if (x % 2 == r % 2).all():  # else the first row is shifted
+        cols, rows = int(((x - r % 2) // 2).max()) + 1, int(r.max()) + 1
+        found.append((n / (cols * rows), SeenCircles(cols, rows, True, whole=False), shifted.astype(float)))
+    return found
+
+
+def _bent(index: NDArray[np.int64], centre: Array) -> float:
+    """Median of the second differences of the centres along both axes, over the steps."""
+    at = {tuple(one): k for k, one in enumerate(index.tolist())}
+    bent = []
+    for (i, j), k in at.items():
+        for di, dj in ((1, 0), (0, 1)):
+            before, after = at.get((i - di, j - dj)), at.get((i + di, j + dj))
+            if before is not None and after is not None:
+                step = np.hypot(*(centre[after] - centre[before])) / 2
+                bent.append(np.hypot(*(centre[before] + centre[after] - 2 * centre[k])) / max(step, 1e-9))
+    return float(np.median(bent)) if bent else np.inf
+
+
+def _ends_seen(places: Array, centre: Array, seen: SeenCircles, shape: tuple[int, ...]) -> bool:
+    """Whether the places around the pattern lie in the image, where further circles would have been found."""
+    H = homographies(places[None], centre[None])
+    low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
+    x, y = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+    around = np.concatenate(
+        [np.column_stack([x, np.full(len(x), end)]) for end in (low[1], high[1])]
+        + [np.column_stack([np.full(len(y), end), y]) for end in (low[0], high[0])]
+    )
+    pixels = homography_at(H, around[None])[0]
+    return bool(((pixels >= 0) & (pixels < shape[::-1])).all())
+
+
+def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
+    """The pattern that images agree on, its distance 1, and whether it is seen to end at all sides.
+
+    Raises NoBoardError if they show only parts of a grid, or different ones.
+    """
+    whole = Counter(replace(one, whole=False) for one in seen if one.whole)
+    enough = [one for one, count in whole.items() if count >= _ENOUGH * whole.total()]
+    if len(enough) > 1:
+        raise NoBoardError(
+            f"the images show different grids, {' and '.join(map(str, enough[:3]))}; describe yours by "
+            "--board"
+        )
+    if not enough:
+        one, _ = Counter(seen).most_common(1)[0]
+        raise NoBoardError(
+            f"only parts of a grid of circles are seen, such as {one}; show the whole board and what is "
+            "around it, or describe it by --board, for example circles:7x6:20"
+        )
+    (one,) = enough
+    return CirclePlane("", one.cols, one.rows, 1.0, asymmetric=one.asymmetric), True

@@ -1,0 +1,165 @@
+"""Which board has markers with these numbers at these places: its columns, rows, pattern and first number.
+
+On a ChArUco board of C columns, marker n is on the square (x, y) with n = first + floor((y C + x) / 2). On a
+grid of tags, tag n is at (c, r) with n = first + r C + c. So the numbers of the markers of an image tell C.
+The images together tell where the board begins and ends.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.detection.markers.lie import Lie
+
+_MOST_COLUMNS = 60
+_FEWEST = 4  # markers of an image whose numbers agree
+_LEAST_SHARE = 0.6  # of the markers of an image
+_SURE = 3  # more markers that agree with a number of columns than with any other
+
+
+@frozen_dataclass(eq=False)
+class Numbered:
+    """Markers of an image, all of whose numbers agree with a number of columns."""
+
+    source: int  # number of the image
+    lie: Lie
+    axes: NDArray[np.int64]  # (2, 2) rows: steps of the lattice along the board's rows and columns
+    place: NDArray[np.int64]  # (N, 2) along the board's rows and columns, from an unknown origin
+
+
+@frozen_dataclass
+class Numbering:
+    """How the markers of images are numbered, and which of them agree with that."""
+
+    cols: int
+    as_text: bool  # rows follow each other downwards; those of AprilGrids upwards
+    parts: tuple[Numbered, ...]
+
+
+@frozen_dataclass
+class Layout:
+    """A board of markers."""
+
+    tags: bool
+    cols: int  # of squares, or of tags
+    rows: int
+    legacy: bool  # whether the first square of a ChArUco board is light
+    first_id: int
+
+
+@frozen_dataclass
+class _Way:
+    """A way in which numbers may grow: along the board's rows and its columns."""
+
+    cols: int
+    axes: tuple[tuple[int, int], tuple[int, int]]  # rows: directions of growing c and r in the lattice
+    odd: int  # of a ChArUco board with an even number of columns: the columns' parity in the lattice
+
+
+def _ways(tags: bool) -> Iterator[_Way]:
+    for cols in range(1 if tags else 2, _MOST_COLUMNS + 1):
+        if not tags:
+            yield from (_Way(cols, ((1, 0), (0, 1)), odd) for odd in ((0,) if cols % 2 else (0, 1)))
+            continue
+        # Rows run along an axis; columns may run either way.
+        for c, r in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+            yield _Way(cols, ((c, r), (r, -c)), 0)
+            yield _Way(cols, ((c, r), (-r, c)), 0)
+
+
+def _offsets(lie: Lie, way: _Way) -> NDArray[np.int64]:
+    """Number (N,) of each marker less what its place says; all the same if they agree."""
+    c, r = (lie.index @ np.array(way.axes).T).T
+    grown = r * way.cols + c
+    return np.asarray(lie.marks.number - (grown if lie.tags else (grown + way.odd) // 2))
+
+
+def numbered(lies: Sequence[Lie]) -> Numbering | None:
+    """How the markers of images are numbered; None if they do not tell it."""
+    score: Counter[tuple[int, bool]] = Counter()
+    best: list[dict[tuple[int, bool], tuple[int, _Way]]] = []
+    for lie in lies:
+        mine: dict[tuple[int, bool], tuple[int, _Way]] = {}
+        for way in _ways(lie.tags):
+            count = int(np.unique(_offsets(lie, way), return_counts=True)[1].max())
+            key = way.cols, _is_as_text(way)
+            if count > mine.get(key, (0, way))[0]:
+                mine[key] = count, way
+        best.append(mine)
+        score.update({key: count for key, (count, _) in mine.items()})
+    (key, most), *others = [*score.most_common(2), ((0, True), 0)]
+    if most < _FEWEST or others[0][1] > most - _SURE:
+        return None
+    found = []
+    for source, (lie, mine) in enumerate(zip(lies, best, strict=True)):
+        count, way = mine[key]
+        if count >= max(_FEWEST, _LEAST_SHARE * len(lie.marks)):
+            offsets, axes = _offsets(lie, way), np.array(way.axes)
+            kept = lie.only(offsets == Counter(offsets.tolist()).most_common(1)[0][0])
+            found.append(Numbered(source, kept, axes, kept.index @ axes.T))
+    return Numbering(*key, tuple(found)) if found else None
+
+
+def _is_as_text(way: _Way) -> bool:
+    (a, b), (c, d) = way.axes
+    return a * d - b * c > 0
+
+
+def joined(parts: Iterable[Numbered]) -> tuple[Numbered, ...]:
+    """The parts in the coordinates of the largest one, without those that have no markers in common."""
+    waiting = sorted(parts, key=lambda part: -len(part.place))
+    known: dict[int, tuple[int, int]] = {}
+    found: list[Numbered] = []
+    while waiting:
+        for k, part in enumerate(waiting):
+            numbers = part.lie.marks.number.tolist()
+            shifts = Counter(
+                (known[n][0] - x, known[n][1] - y)
+                for n, (x, y) in zip(numbers, part.place.tolist(), strict=True)
+                if n in known
+            )
+            if known and not shifts:
+                continue
+            shift = np.array(shifts.most_common(1)[0][0] if shifts else (0, 0))
+            found.append(replace(part, place=part.place + shift))
+            for n, place in zip(numbers, found[-1].place.tolist(), strict=True):
+                known.setdefault(n, tuple(place))
+            del waiting[k]
+            break
+        else:
+            break
+    return tuple(found)
+
+
+def layouts(
+    tags: bool, cols: int, parts: Sequence[Numbered], more: tuple[int, int], begins: bool
+) -> list[Layout]:
+    """Boards of `cols` columns with the markers of joined parts, the likeliest first.
+
+    There are `more` rows before and after those of the parts, and none before these if the board `begins`
+    there.
+    """
+    place, at = np.unique(np.concatenate([part.place for part in parts]), axis=0, return_index=True)
+    number = np.concatenate([part.lie.marks.number for part in parts])[at]
+    low, high = place.min(axis=0), place.max(axis=0)
+    before, after = more
+    found: list[tuple[tuple[bool, int, bool], Layout]] = []
+    rows_seen = int(high[1] - low[1]) + 1
+    for left in range(cols - int(high[0] - low[0])):
+        for above in range(before, before + (1 if begins else rows_seen + 1)):
+            c, r = (place - low + [left, above]).T
+            grown = r * cols + c
+            first = number - (grown if tags else grown // 2)
+            legacy = not tags and int(c[0] + r[0]) % 2 == 0
+            rows = int(r.max()) + 1 + after
+            # OpenCV has no legacy boards of an odd number of rows.
+            if first.min() >= 0 and (first == first[0]).all() and not (legacy and rows % 2):
+                one = Layout(tags, cols, rows, legacy, int(first[0]))
+                found.append(((bool(first[0]), above, legacy), one))
+    return [one for _, one in sorted(found, key=lambda each: each[0])]

@@ -1,0 +1,145 @@
+"""The kind and the size of a board are found without being told, and never another one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from support.marked import marked_scene, plane_of, taken
+from support.real_data import RealFiles
+
+from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
+from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles
+from neurocal_cli.detection.identity.placement import NoBoardError
+from neurocal_cli.detection.markers.lie import lie_of
+from neurocal_cli.detection.markers.numbering import joined, layouts, numbered
+from neurocal_cli.detection.markers.reading import Marks
+from neurocal_cli.files.board_kinds import kind_of
+from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.board_kinds import TagPlane
+from neurocal_cli.observations.marked_cells import Print, marked_cells
+
+
+def board_in(form: str, *, legacy: bool = False, square: float = 32.0, first_id: int = 0) -> FoundBoard:
+    """The board that is found in one picture of a board in short."""
+    plane = plane_of(form, legacy)
+    if first_id:
+        assert plane.markers is not None
+        plane = replace(plane, markers=replace(plane.markers, first_id=first_id))
+    return found_board([taken(marked_scene(plane, 1, square=square), 1, 4).image])
+
+
+def marks_of(plane: Plane, numbers: list[int], *, legacy: bool = False) -> Marks:
+    """Markers of a plane seen in perspective."""
+    H = np.array([[40.0, 6, 300], [-5, 35, 400], [1e-2, 2e-2, 1]])
+    cells = marked_cells(plane, Print(legacy=legacy))
+    at = cells.of(np.array(numbers))
+    seen = np.concatenate([plane.spread(cells.corners[at]), np.ones((len(at), 4, 1))], axis=2) @ H.T
+    return Marks(cells.number[at], seen[..., :2] / seen[..., 2:], "DICT_4X4_1000")
+
+
+@pytest.mark.parametrize(
+    ("form", "legacy", "first_id"),
+    [
+        ("charuco:6x5:40:30:DICT_4X4_50", False, 0),
+        ("charuco:7x6:40:28:DICT_5X5_50", True, 7),
+        ("aprilgrid:4x3:40:0.25:tag36h11", False, 0),
+    ],
+)
+def test_boards_with_markers_are_found(form: str, legacy: bool, first_id: int) -> None:
+    found = board_in(form, legacy=legacy, first_id=first_id, square=28.0)
+    plane, true = found.plane, plane_of(form)
+    assert found.sure
+    assert (kind_of(plane), plane.cols, plane.rows) == (kind_of(true), true.cols, true.rows)
+    assert plane.markers is not None
+    assert true.markers is not None
+    assert (plane.markers.dictionary, plane.markers.first_id) == (true.markers.dictionary, first_id)
+    assert bool(plane.markers.legacy) == legacy
+    if isinstance(plane, TagPlane):
+        assert plane.spacing == 0.25
+        assert plane.border == 2
+    else:
+        assert plane.markers.side == pytest.approx(true.markers.side / true.square, abs=1e-6)
+
+
+@pytest.mark.parametrize("form", ["asymmetric_circles:4x7:20:16", "circles:7x6:20:12"])
+def test_grids_of_circles_are_found(form: str) -> None:
+    found = board_in(form, square=18.0 if "asym" in form else 26.0)
+    true = plane_of(form)
+    assert found.sure
+    assert (kind_of(found.plane), found.plane.cols, found.plane.rows) == (kind_of(true), true.cols, true.rows)
+
+
+def test_the_unit_and_the_side_are_the_callers() -> None:
+    image = taken(marked_scene(plane_of("charuco:6x5:40:30:DICT_4X4_50"), 1, square=32.0), 1, 4).image
+    board = find_board([image], 25.0, "mm")
+    (plane,) = board.planes
+    assert (plane.square, board.unit) == (25.0, "mm")
+    assert plane.markers is not None
+    assert plane.markers.side == 18.75
+
+
+def test_parts_of_a_board_tell_it_together() -> None:
+    plane = plane_of("charuco:8x8:40:30:DICT_4X4_50")
+    halves = [[0, 1, 4, 5, 8, 9, 12, 13, 16, 17], [14, 15, 17, 18, 19, 22, 23, 26, 27, 30, 31]]
+    lies = [lie for half in halves if (lie := lie_of(marks_of(plane, half))) is not None]
+    numbering = numbered(lies)
+    assert numbering is not None
+    assert numbering.cols == 8
+    first, *_ = layouts(False, 8, joined(numbering.parts), (0, 0), begins=True)
+    assert (first.rows, first.first_id, first.legacy) == (8, 0, False)
+
+
+def test_markers_of_one_row_do_not_tell_the_board() -> None:
+    lie = lie_of(marks_of(plane_of("charuco:8x8:40:30:DICT_4X4_50"), [0, 1, 2, 3]))
+    assert lie is not None
+    assert numbered([lie]) is None
+
+
+def test_rows_that_no_image_shows_are_told_by_the_first_number() -> None:
+    plane = plane_of("charuco:7x6:40:30:DICT_4X4_50")
+    lie = lie_of(marks_of(plane, list(range(7, 20))))
+    assert lie is not None
+    numbering = numbered([lie])
+    assert numbering is not None
+    unsure = layouts(False, 7, joined(numbering.parts), (0, 0), begins=False)
+    assert (unsure[0].first_id, unsure[0].rows) == (0, 6)
+    assert len(unsure) > 1
+    (sure,) = layouts(False, 7, joined(numbering.parts), (0, 0), begins=True)
+    assert (sure.first_id, sure.rows) == (7, 4)
+
+
+def test_markers_that_stand_alone_are_named() -> None:
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    image = cv2.aruco.GridBoard((6, 4), 30.0, 8.0, family).generateImage((1000, 750), None, 60)
+    with pytest.raises(NoBoardError, match="6 columns of markers of DICT_5X5_1000 that stand alone"):
+        found_board([image])
+
+
+def test_grids_of_circles_that_differ_are_refused() -> None:
+    one, other = SeenCircles(7, 6, False, whole=True), SeenCircles(4, 11, True, whole=True)
+    plane, sure = agreed_circles([one, one, one, replace(other, whole=False)])
+    assert (plane.cols, plane.rows, plane.asymmetric, sure) == (7, 6, False, True)
+    with pytest.raises(NoBoardError, match="different grids, 7 x 6 circles and 4 x 11 asymmetric circles"):
+        agreed_circles([one, other])
+    with pytest.raises(NoBoardError, match="only parts of a grid of circles"):
+        agreed_circles([replace(one, whole=False)])
+
+
+@pytest.mark.parametrize(("pattern", "legacy"), [("new", False), ("legacy", True)])
+def test_photographs_of_a_charuco_board_tell_it(real_files: RealFiles, pattern: str, legacy: bool) -> None:
+    paths = real_files(f"charuco_lifecam/{pattern}*.jpg")[::3]
+    plane = found_board(np.asarray(cv2.imread(str(path), 0)) for path in paths).plane
+    markers = plane.markers
+    assert markers is not None
+    assert (plane.cols, plane.rows, markers.dictionary) == (7, 7, "DICT_4X4_50")
+    assert (markers.legacy, markers.first_id) == (legacy, 0)
+    assert markers.side == pytest.approx(0.75, abs=0.02)
+
+
+def test_photographs_of_circles_tell_their_pattern(real_files: RealFiles) -> None:
+    for path in real_files("photographs/circles*.jpg"):
+        plane = found_board([np.asarray(cv2.imread(str(path), 0))]).plane
+        assert (kind_of(plane), plane.cols, plane.rows) == ("asymmetric_circles", 7, 10)
