@@ -140,6 +140,19 @@ def calibrate(
     InputError, DegenerateGeometryError
         The points do not determine the camera; the message says why.
     """
+    if points.image is not None:
+        from neurocal_cli.calibration.arranged_boards import arranged
+
+        def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> Calibration:
+            return calibrate(
+                some[camera_name], type, image_center, intrinsics, extrinsics, method, trainer, distortion,
+                skew, outliers, seed, target=target, preferred=preferred, fix=fix,
+                square_pixels=square_pixels, starts=starts, backprop=backprop, camera_name=camera_name,
+                progress=progress,
+            )  # fmt: skip
+
+        several, told = arranged({camera_name: points}, target, fitted, lambda found: {camera_name: found})
+        return replace(several, warnings=(*told, *several.warnings))
     known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed)

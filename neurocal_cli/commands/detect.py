@@ -93,6 +93,12 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     without="no",
     positive=True,
 )
+@options.path(
+    "--board-name",
+    "NAME",
+    "Name of this board, where images show several boards: it becomes a column board. Detect each board by "
+    "itself, and calibrate with the files of all of them.",
+)
 @options.path("--save-board", "BOARD.yaml", "Write the board, as it was described or found, to this file.")
 @options.summary
 @options.output("POINTS.csv", "Write the points to this file.")
@@ -106,6 +112,7 @@ def detect(
     frames: int,
     cache: str | None,
     watch: float | None,
+    board_name: str | None,
     save_board: str | None,
     as_json: bool,
     output: str,
@@ -177,10 +184,13 @@ def detect(
     from neurocal_cli.files.board_yaml import format_board
     from neurocal_cli.files.points_csv import format_points
     from neurocal_cli.observations.points import Correspondences
+    from neurocal_cli.observations.separate_boards import of_one_board
 
     if save_board is not None:
         write_whole(save_board, format_board(target))
     found = Correspondences.from_detections(detections(outcomes), target.unit, target.distances)
+    if board_name is not None:
+        found = of_one_board(found, board_name)
     text = format_points(found)
     if overlay is not None:
         make_folder(overlay)

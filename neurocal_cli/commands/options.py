@@ -57,7 +57,7 @@ _GROUPS = {
     "What is known": "type image_center intrinsics extrinsics left_intrinsics right_intrinsics known "
     "image_size fix alpha_u",
     "Lens": "distortion distortion_of models no_skew skew square_pixels",
-    "Target and outliers": "file cols rows square unit points target gamma outliers",
+    "Target and outliers": "file board_name cols rows square unit points target gamma outliers",
     "Output": "output plot plots html lean as_json camera_name ros alpha overlay save_board cache help",
     "Research": "method trainer starts seed epochs rate rate_gamma training hidden",
 }

@@ -6,6 +6,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from neurocal_cli.files.table_header import Schema, quoted_field
 from neurocal_cli.files.writing import write_whole
 from neurocal_cli.observations.labels import first_moved
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.separate_boards import by_board, parts_of
 
 PLACE = ("X", "Y", "Z")
 PIXEL = ("u", "v")
@@ -40,8 +42,8 @@ _IMAGE = (
 POINTS = Schema(
     kind="points",
     required=(*PLACE, *PIXEL),
-    optional=("view", "point", "camera", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
-    labels=frozenset({"view", "point", "camera"}),
+    optional=("view", "point", "camera", "board", "sigma", *chain(*OPTIONAL.values()), *_SETTINGS),
+    labels=frozenset({"view", "point", "camera", "board"}),
     headerless=True,
     aliases={
         **{axis: tuple(form.format(axis.lower()) for form in _WORLD) for axis in PLACE},
@@ -110,11 +112,14 @@ def write_points(points: Correspondences, path: str | Path) -> None:
 def format_points(points: Correspondences) -> str:
     """Points as the text of a CSV file; an InputError if a label is empty or has a line break."""
     labels = {}
-    if points.view is not None:
-        quoted = [_quoted(label, "view") for label in points.view_names]
-        labels["view"] = [quoted[k] for k in points.view_index.tolist()]
-    if points.point is not None:
-        labels["point"] = [_quoted(str(label), "point") for label in np.asarray(points.point).tolist()]
+    view, board, point = parts_of(points)
+    if view is not None:
+        quoted = {label: _quoted(label, "view") for label in dict.fromkeys(view)}
+        labels["view"] = [quoted[label] for label in view]
+    if board is not None:
+        labels["board"] = board
+    if point is not None:
+        labels["point"] = [_quoted(label, "point") for label in point]
     names, blocks = value_columns(points)
     numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
     rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
@@ -158,6 +163,8 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     _check_settings(tables, notes)
     _check_one_camera(tables)
     several = len(tables) > 1
+    images = _images(tables)
+    tables = [_told_apart(table) for table in tables] if images is not None else tables
     views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
     owners = _owners(tables, views) if several and views else None
     points, without = None, [table.source for table in tables if "point" not in table.labels]
@@ -174,6 +181,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         world_std=_where_known(tables, OPTIONAL["world_std"]),
         across=_where_known(tables, OPTIONAL["across"]),
         time=_times(tables, notes),
+        image=images,
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
         distances=_agreed("distances", tables) or () if points is not None or not several else (),
@@ -191,6 +199,26 @@ def _times(tables: list[Table], notes: list[str]) -> Array | None:
     if without and len(without) < len(tables):
         notes.append(f"{without[0]}: has no column time, so the times of the other files are not used")
     return None if without else _joined([table.numbers["time"] for table in tables])
+
+
+def _images(tables: list[Table]) -> NDArray[Any] | None:
+    """The image of each row, if the rows name the boards in it, as those of all files or none must."""
+    without = [table.source for table in tables if "board" not in table.labels]
+    if len(without) == len(tables):
+        return None
+    if without:
+        raise FormatError("has no column board as other files do; give it in all or none", without[0])
+    return _joined([_views_of_file(table) for table in tables])
+
+
+def _told_apart(table: Table) -> Table:
+    """The table with a view for each board in each image, and with ids of each board's points."""
+    try:
+        view, point = by_board(_views_of_file(table), table.labels.get("point"), table.labels["board"])
+    except InputError as error:
+        raise FormatError(str(error), table.source) from None
+    named = {"view": view} | ({} if point is None else {"point": point})
+    return replace(table, labels=table.labels | named)
 
 
 def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:

@@ -17,6 +17,9 @@ from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.labels import factorise, first_repeat
 
 _LARGEST = 1e100  # largest coordinate, so that squares do not overflow
+_BY_ROW = (
+    "world", "pixels", "view", "point", "covariance", "world_std", "across", "time", "image", "lines",
+)  # fmt: skip
 
 
 class Detected(Protocol):
@@ -85,6 +88,9 @@ class Correspondences:
     time : (N,) array, optional [s]
         When the image of each row was taken; for cameras of one rig that do not take theirs at the same
         moment.
+    image : (N,) labels, optional
+        The image of each row, if the views are those of several boards in one image (`separate_boards`): then
+        `view` is ``IMAGE:BOARD``, and `point` ``BOARD/ID``.
     distances : tuple of Distance
         Distances measured on the points' board; they determine its scale.
     undistorted : str
@@ -119,6 +125,7 @@ class Correspondences:
     sources: Mapping[str, str] | None = None
     world_std: Array | None = None
     time: Array | None = None
+    image: NDArray[Any] | Sequence[Any] | None = None
     distances: tuple[Distance, ...] = ()
     undistorted: str = ""
     view_names: tuple[str, ...] = field(init=False)
@@ -135,7 +142,7 @@ class Correspondences:
         if n == 0:
             raise InputError(f"{self.source}: there are no points; give at least one row of X,Y,Z,u,v")
         self._set(world=_frozen(world), pixels=_frozen(pixels))
-        for name in ("view", "point", "lines"):
+        for name in ("view", "point", "lines", "image"):
             labels = getattr(self, name)
             if labels is not None:
                 if not isinstance(labels, np.ndarray) or labels.flags.writeable:
@@ -300,8 +307,7 @@ class Correspondences:
         def pick(values: Any) -> Any:
             return None if values is None else np.asarray(values)[rows]
 
-        by_row = ("world", "pixels", "view", "point", "covariance", "world_std", "across", "time", "lines")
-        return replace(self, **{name: pick(getattr(self, name)) for name in by_row})
+        return replace(self, **{name: pick(getattr(self, name)) for name in _BY_ROW})
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

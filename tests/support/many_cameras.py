@@ -10,6 +10,7 @@ import numpy as np
 from neurocal_cli import Correspondences, Pose
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.geometry import Array, rotation_step
+from neurocal_cli.observations.separate_boards import of_one_board
 from neurocal_cli.simulation.rigs import SimulatedRig, random_rig
 
 SIGMA = 0.3
@@ -85,3 +86,32 @@ def errors_over_std(rig: Rig, truth: SimulatedRig) -> Array:
             if camera.std[key] > 0
         ]
     return np.array(found)
+
+
+def two_boards(
+    rig: SimulatedRig, relative: Pose | None, rng: np.random.Generator, only: dict[str, str] | None = None
+) -> Points:
+    """What the cameras see of two boards, A and B, of which a camera may see one only.
+
+    `relative` is the pose X_A = R X_B + t; None: board B is held by itself, where A is in another frame.
+    """
+    poses = list(rig.frames.values())
+    if relative is None:
+        held = poses[len(poses) // 2 :] + poses[: len(poses) // 2]
+    else:
+        held = [Pose(A.R @ relative.R, A.R @ relative.t + A.t) for A in poses]
+    other = replace(rig, frames=dict(zip(rig.frames, held, strict=True)))
+    boards = {"A": rig.points(SIGMA, rng), "B": other.points(SIGMA, rng)}
+    found = {}
+    for name in rig.cameras:
+        seen = [
+            of_one_board(points[name], board)
+            for board, points in boards.items()
+            if (only or {}).get(name, board) == board
+        ]
+        both = replace(seen[0], image=None)
+        image = np.concatenate([np.asarray(one.image) for one in seen])
+        for one in seen[1:]:
+            both = joined(both, one)
+        found[name] = replace(both, image=image)
+    return found

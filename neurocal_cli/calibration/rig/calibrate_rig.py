@@ -6,13 +6,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from neurocal_cli.calibration.arranged_boards import arranged
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import connected_frames
 from neurocal_cli.calibration.rig.rig import Rig
-from neurocal_cli.calibration.rig.several_cameras import cameras_on_one_target, check_options, with_poses
-from neurocal_cli.errors import UsageError
+from neurocal_cli.calibration.rig.several_cameras import (
+    SeveralCameras,
+    cameras_on_one_target,
+    check_options,
+    with_poses,
+)
+from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import Target, TargetChoice
 
 
 def calibrate_rig(
@@ -61,8 +68,24 @@ def calibrate_rig(
     of_each = {name: {**options, **extra.get(name, {})} for name in points}
     check_options(of_each)
     points, told = with_poses(points)
-    connected_frames(points)  # errors are reported before the training
-    found = cameras_on_one_target(points, of_each, progress)
+    several = [name for name, one in points.items() if one.image is not None]
+    if several and len(several) < len(points):
+        without = next(name for name in points if name not in several)
+        raise InputError(
+            f"camera {without} has no column board, but {several[0]} has; give it to all cameras"
+        )
+    if several:
+
+        def fitted(some: Mapping[str, Correspondences], target: TargetChoice | Target) -> SeveralCameras:
+            with_target = {name: {**own, "target": target} for name, own in of_each.items()}
+            return cameras_on_one_target(some, with_target, progress)
+
+        choice = next(iter(of_each.values())).get("target", "auto")
+        found, about_boards = arranged(points, choice, fitted, lambda fit: fit.cameras)
+        told += about_boards
+    else:
+        connected_frames(points)  # errors are reported before the training
+        found = cameras_on_one_target(points, of_each, progress)
     rig = fit_rig(
         found.cameras,
         refine_cameras=found.refinable,

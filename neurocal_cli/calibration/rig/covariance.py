@@ -139,7 +139,7 @@ def not_smaller(least: Array, other: Array) -> Array:
 def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
     prior = prior_of_target(target)
-    info = _information(target, fit).turned(prior.axes)
+    info = information_of_rig(target, fit).turned(prior.axes)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     variance = info.cost / max(spare, 1.0)
     info = info.around_given(prior.along_axes(target.offsets))
@@ -152,7 +152,8 @@ def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     return found.variance * found.camera
 
 
-def _information(target: Target, fit: RigFit) -> Information:
+def information_of_rig(target: Target, fit: RigFit) -> Information:
+    """The quadratic in the found target's points, the free shared unknowns and the poses."""
     problem, state, n = fit.problem, fit.state, len(target.given)
     columns, shared = state.columns, np.flatnonzero(fit.free)
     normal = fit.normal.only(shared)

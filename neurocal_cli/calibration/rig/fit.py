@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
+from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig, is_significant, scatter
 from neurocal_cli.calibration.rig.agreeing_poses import with_agreeing_poses
 from neurocal_cli.calibration.rig.assessment import assess_rig
+from neurocal_cli.calibration.rig.board import with_board
 from neurocal_cli.calibration.rig.causes import LATE_CAMERA, TAKEN, TWO_GEOMETRIES
 from neurocal_cli.calibration.rig.changes import evidence_by_parts, evidence_of_odd, of_rig, seen_again
 from neurocal_cli.calibration.rig.combine import rig_problem
@@ -108,9 +109,13 @@ def fit_rig(
     if outliers == "keep" and left_out:
         told = _told(left_out, problem, names)
         raise DegenerateGeometryError(f"{told}; remove them, or use --outliers reject")
-    least, stretched = _covariance(fit), None
     target = cameras[names[0]].target
-    if target is not None and all(camera.target is target for camera in cameras.values()):
+    common = target is not None and all(camera.target is target for camera in cameras.values())
+    if target is not None and common:
+        fit = with_board(fit, target, lambda within, start: adjust_rig(within, start, fit.free))
+        target = fit.problem.calibrations[0].target
+    least, stretched = _covariance(fit), None
+    if target is not None and common:
         uncertain = with_target_uncertainty(target, fit)
         least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
     if target_kept or any(camera.target_stretched for camera in cameras.values()):

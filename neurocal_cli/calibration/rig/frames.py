@@ -12,10 +12,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration.rig.pairing import pair_points, pair_views
+from neurocal_cli.calibration.rig.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import InputError
+from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.labels import first_moved
 from neurocal_cli.observations.points import Correspondences
 
@@ -68,13 +69,30 @@ def connected_frames(points: Mapping[str, Correspondences]) -> FrameNames:
         return views
     left, right = points.values()
     pairs = pair_views(left.view_names, right.view_names)
-    pair_points(left, right, pairs)
+    if _of_other_planes(left, right, pairs):
+        check_one_target(points)
+    else:
+        pair_points(left, right, pairs)
     partner = {b: a for a, b in pairs.both}
     place = {name: k for k, name in enumerate(left.view_names)}
     others = {name: len(place) + k for k, name in enumerate(pairs.right_only)}
     of_right = [place[partner[name]] if name in partner else others[name] for name in right.view_names]
     names = (*left.view_names, *pairs.right_only)
     return FrameNames(names, (np.arange(len(place)), np.array(of_right, dtype=np.intp)))
+
+
+def _of_other_planes(left: Correspondences, right: Correspondences, pairs: ViewPairs) -> bool:
+    """Whether pairs of views show other planes of a target, whose ids name them, so no point in common."""
+    planes = []
+    for one, names in zip((left, right), zip(*pairs.both, strict=True), strict=True):
+        if one.point is None:
+            return False
+        paired = np.isin(one.view_names, names)[one.view_index]
+        ids = np.unique(np.asarray(one.point)[paired].astype(str))
+        if not planes_are_named(ids):
+            return False
+        planes.append({label.split("/")[0] for label in ids.tolist()})
+    return planes[0].isdisjoint(planes[1])
 
 
 def _without_camera(camera: str, names: Sequence[str]) -> list[str]:

@@ -15,6 +15,7 @@ from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration.calibrate import calibrate
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import can_tell, common_target
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.network.options import Progress
@@ -130,7 +131,8 @@ def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:
     """Cameras that could take another distortion model, that of most cameras; first those that lose least.
 
     Cameras of a rig are mostly of the same type, so their models differ only if the points require it. Of two
-    cameras, each could take the other's.
+    cameras, each could take the other's. A fisheye among many ordinary lenses stays one: few views of it by
+    itself may fit an ordinary lens, and those of the rig do not.
     """
     models = [camera.distortion_model for camera in cameras]
     if len(set(models)) == 1 or (len(cameras) == 2 and not all(camera.lens_choice for camera in cameras)):
@@ -145,7 +147,10 @@ def _likely_models(cameras: Sequence[Calibration]) -> list[tuple[int, str]]:
     could = [
         k
         for k, camera in enumerate(cameras)
-        if wanted[k] != models[k] and math.isfinite(loss(k)) and wanted[k] in camera.would_take
+        if wanted[k] != models[k]
+        and math.isfinite(loss(k))
+        and wanted[k] in camera.would_take
+        and (len(cameras) == 2 or (wanted[k] in WIDE) == camera.camera.distortion.wide)
     ]
     return [(k, wanted[k]) for k in sorted(could, key=loss)]
 

@@ -1,0 +1,88 @@
+"""Several boards in one image: each with its own pose, or fixed to each other, which the images show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.many_cameras import Points, errors_over_std, of_frames, two_boards
+
+from neurocal_cli import Pose, calibrate, read_points, write_points
+from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
+from neurocal_cli.camera.geometry import Array, nearest_similarity, rotation_step
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.simulation.rigs import SimulatedRig, random_rig
+
+BESIDE = Pose(rotation_step(np.array([0.1, 0.6, 0.2])), np.array([520.0, 40.0, 60.0]))
+
+
+def seen(
+    relative: Pose | None, n: int = 2, only: dict[str, str] | None = None, seed: int = 1
+) -> tuple[SimulatedRig, Points]:
+    rng = np.random.default_rng(seed)
+    rig = random_rig("line", n, 14, rng)
+    return rig, two_boards(rig, relative, rng, only)
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_boards_with_poses_of_their_own_are_views_of_their_own() -> None:
+    truth, points = seen(None)
+    rig = calibrate_rig(points, skew=False, distortion="k1k2", target="given")
+    assert rms(errors_over_std(rig, truth)) < 2
+    assert {name.rpartition(":")[2] for name in rig.cameras["cam0"].views} == {"A", "B"}
+    assert not any("fixed to each other" in warning for warning in rig.warnings)
+
+
+def test_cameras_that_see_no_board_together_are_tied_by_boards_that_are_fixed_to_each_other() -> None:
+    truth, points = seen(BESIDE, only={"cam1": "B"})
+    # The first camera sees the second board in six images only, of which the other camera sees none.
+    first = np.array([int(image) < 6 for image in np.asarray(points["cam0"].image)])
+    of_a = np.array([str(label).startswith("A/") for label in np.asarray(points["cam0"].point)])
+    points["cam0"] = points["cam0"].select(first | of_a)
+    points["cam1"] = points["cam1"].select(np.array([int(i) >= 6 for i in np.asarray(points["cam1"].image)]))
+    rig = calibrate_rig(points, skew=False, distortion="k1k2")
+    assert any("boards A, B are fixed to each other" in warning for warning in rig.warnings)
+    assert rms(errors_over_std(rig, truth)) < 2
+    target = rig.cameras["cam0"].target
+    assert target is not None
+    # The second board is estimated where it stands to the first one.
+    labels = [str(label) for label in np.asarray(target.point)]
+    of_b = np.array([label.startswith("B/") for label in labels])
+    placed = truth.board[[int(label[3:]) for label in labels]]
+    placed[of_b] = placed[of_b] @ BESIDE.R.T + BESIDE.t
+    s, R, t = nearest_similarity(target.found[~of_b], placed[~of_b])
+    apart = s * target.found @ R.T + t - placed
+    assert rms(np.linalg.norm(apart[of_b], axis=1)) < 3
+
+
+def test_one_camera_sees_boards_that_are_fixed_to_each_other_as_one_target() -> None:
+    _, points = seen(BESIDE, n=1)
+    fixed = calibrate(points["cam0"], skew=False, distortion="k1k2")
+    assert len(fixed.views) == 14
+    alone = calibrate(replace(points["cam0"], image=None), skew=False, distortion="k1k2", target="given")
+    assert len(alone.views) > 20
+    assert fixed.rmse_px < 1.05 * alone.rmse_px
+
+
+def test_boards_are_a_column_of_the_points(tmp_path: Path) -> None:
+    _, points = seen(None)
+    path = tmp_path / "cam0.csv"
+    write_points(points["cam0"], path)
+    assert path.read_text().splitlines()[2] == "view,board,point,X,Y,Z,u,v"
+    again = read_points(path)
+    for name in ("view", "point", "image"):
+        assert np.asarray(getattr(again, name)).tolist() == np.asarray(getattr(points["cam0"], name)).tolist()
+    part = of_frames(
+        replace(points["cam1"], view=np.asarray(points["cam1"].image), point=None), lambda k: k < 3
+    )
+    other = tmp_path / "other.csv"
+    write_points(replace(part, image=None), other)
+    with pytest.raises(FormatError, match="has no column board as other files do"):
+        read_points([path, other])
+    with pytest.raises(InputError, match="camera cam1 has no column board, but cam0 has"):
+        calibrate_rig({"cam0": points["cam0"], "cam1": replace(points["cam1"], image=None)})
