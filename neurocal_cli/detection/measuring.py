@@ -19,7 +19,8 @@ the errors of all mid-points stay independent of each other.
 
 The map must be accurate up to the rim. So it contains the lens, with tangential distortion and k3, and no
 polynomial, which would extrapolate badly. If the edges do not agree with it within their noise, as on paper
-boards, the mid-points stay as they are. So do those whose edges to the rim alone do not agree.
+boards, what they depart in common is taken off instead (`departures`). Mid-points whose edges to the rim alone
+do not agree stay as they are.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.fitting.departures import Departures, find_departures
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response, sharp_profile
 from neurocal_cli.detection.fitting.grid_edges import GridEdges, GridImage
@@ -54,6 +56,8 @@ _FAR, _PLACES = 3.0, 601  # to find an edge's middle level: sigma on both sides,
 # Ratio of the variance around the map to that of the fits, up to which the edges agree with the map. It is
 # 0.7 to 1.6 in rendered images (test_rendered_sets.py), and 9 to 300 in photographs of paper boards.
 _AGREES = 2.0
+_ENDS = np.array([[0, 0], [1, 0]])  # of an edge along c, from its first vertex
+_MOST_EXPLAINED = 0.8  # share of the unevenness
 _WORTH = 10.0  # greatest variance along an edge that is used, over that across it
 _OUTLIER = 4.0  # standard deviations beyond which the departure of an edge to the rim is not used
 
@@ -86,7 +90,8 @@ def measure(
     vertices[grid.seen] = fitted.map.map.at(grid_image.vertices)
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
-    inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
+    uneven = fitted.map.excess > _AGREES
+    inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices, uneven)
     if points == "midpoints":
         along = positions_along_edges(grid_image, fitted)
         return (inner if along is None else _measured_both_ways(inner, along)).only(fitted.good)
@@ -105,20 +110,32 @@ def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
     return np.asarray(full * (np.clip(image.astype(np.float32), 0, None) / full) ** gamma, dtype=np.float32)
 
 
-def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
+def _midpoints(
+    edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array, uneven: bool = False
+) -> Measured:
     """Combine positions along the edges from the map with those across from the edge fits.
 
-    The variance across the edges includes `unevenness` [px^2].
+    The variance across the edges includes `unevenness` [px^2]. If the board is `uneven`, departures from the
+    map that the edges have in common are taken from them; see `departures`.
     """
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
     centre = edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
-    d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
-    d += 0.5 * lines.curvature * s * s - fitted.shift
-    pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
     across = fit.covariance[:, OFFSET, OFFSET] * fit.variance_growth * min(mapped.excess, 1.0)
     across += fitted.shift_variance + unevenness
+    shift = fitted.shift
+    if uneven:
+        found = _departures(edges, fitted)
+        slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.tangent)).mean(axis=1)
+        s += found.along / slant
+        shift = shift + found.shift
+        across -= np.minimum(found.explained, _MOST_EXPLAINED * unevenness)
+        told = found.counted > 0
+        along[told] = upper_median(across) / found.counted[told] / slant[told] ** 2
+    d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
+    d += 0.5 * lines.curvature * s * s - shift
+    pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
         [
@@ -138,6 +155,18 @@ def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: A
         rejected=0,
         polarity=_polarity(fitted),
     )
+
+
+def _departures(edges: GridEdges, fitted: GridFit) -> Departures:
+    """Departures of the edges from the map that have causes in common."""
+    lines, fit, at = fitted.lines, fitted.fit, fitted.map.map
+    ends = edges.index[:, None] + np.where(edges.vertical[:, None, None], _ENDS[:, ::-1], _ENDS)
+    # Where the map has both ends, beside the lines of the fits.
+    mapped = ((at.at(ends.astype(float)) - lines.middle[:, None]) * lines.normal[:, None]).sum(axis=2)
+    mapped -= 0.5 * lines.curvature[:, None] * lines.ends**2
+    tilt = fit.values[:, TILT] - 0.5 * (mapped[:, 1] - mapped[:, 0])
+    departure, variance = fitted.map.residual[: len(tilt)], fit.covariance[:, OFFSET, OFFSET]
+    return find_departures(ends, edges.light, departure, tilt, variance, fitted.good)
 
 
 def _polarity(fitted: GridFit) -> float:
