@@ -19,8 +19,8 @@ the errors of all mid-points stay independent of each other.
 
 The map must be accurate up to the rim. So it contains the lens, with tangential distortion and k3, and no
 polynomial, which would extrapolate badly. If the edges do not agree with it within their noise, as on paper
-boards, what they depart in common is taken off instead (`departures`). Mid-points whose edges to the rim alone
-do not agree stay as they are.
+boards, what they depart in common is taken off instead (`departures`). Mid-points whose edges to the rim
+alone do not agree stay as they are.
 """
 
 from __future__ import annotations
