@@ -34,6 +34,12 @@ class WideLens:
         away = pixels - self.centre
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
 
+    def directions(self, pixels: Array) -> Array:
+        """Unit directions (..., 3) of pixels (..., 2)."""
+        angle, away = self.angles(pixels), pixels - self.centre
+        across = np.sinc(angle / np.pi)[..., None] * away / self.focal
+        return np.concatenate([across, np.cos(angle)[..., None]], axis=-1)
+
     def pixels(self, directions: Array) -> Array:
         """Pixels (..., 2) of directions (..., 3) of any length."""
         across = np.hypot(directions[..., 0], directions[..., 1])

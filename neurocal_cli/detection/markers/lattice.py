@@ -5,7 +5,8 @@ image. So a marker that is read wrongly, or is not on the board, is left out. Of
 be printed (`Print`), the one with the most such markers is taken.
 
 Vertices are predicted by homographies of the markers around them, and refined to the saddle points of the
-brightness. From there, further vertices are predicted by those already found.
+brightness. From there, further vertices are predicted by those already found. The image of a wide lens is
+mapped to a plane for the homographies.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import Image, interpolate, refine_saddles
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.markers.flattening import Flattening
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.observations.board import Plane
 from neurocal_cli.observations.board_kinds import TagPlane
@@ -142,12 +144,15 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     found = np.full(grid.shape, np.nan)
     contrast = np.full(grid.shape[:2], np.nan)
     corners, pixels = placed.ground.reshape(-1, 2), placed.marks.corners.reshape(-1, 2)
+    all_in_one = homography_at(homographies(corners[None], pixels[None]), corners[None])[0] - pixels
+    left = float(np.sqrt((all_in_one**2).sum(axis=1).mean()))
+    flattening = Flattening.of(corners, pixels, left, (image.shape[1], image.shape[0]))
     dark = int(placed.how.legacy)  # the cell at (c, r) is dark where c + r plus this is even
     count = 0
     while True:
         missing = np.isnan(contrast)
         at = np.argwhere(missing)
-        start, cell = _predicted(ground[missing], corners, pixels)
+        start, cell = _predicted(ground[missing], corners, pixels, flattening)
         near = np.isfinite(start[:, 0])
         at, start, cell = at[near], start[near], cell[near]
         new, size = _refined(plane, image, grid[tuple(at.T)], start, cell, dark)
@@ -155,7 +160,7 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
         usual = float(np.nanmedian(every)) if np.isfinite(every).any() else np.inf
         good = size > _LEAST_CONTRAST * max(usual, 0.0)
         found[tuple(at[good].T)], contrast[tuple(at[good].T)] = new[good], size[good]
-        _leave_out_strays(ground, found, contrast)
+        _leave_out_strays(ground, found, contrast, flattening)
         seen = np.isfinite(contrast)
         if seen.sum() < _FEWEST or seen.sum() <= count:
             break
@@ -174,11 +179,11 @@ def find_vertices(plane: Plane, placed: Placed, image: Image) -> tuple[Grid, tup
     return Grid(np.ascontiguousarray(part), dark), first
 
 
-def _leave_out_strays(ground: Array, found: Array, contrast: Array) -> None:
+def _leave_out_strays(ground: Array, found: Array, contrast: Array, flattening: Flattening) -> None:
     """Remove found vertices that are not where those around them predict, in place."""
     while (seen := np.isfinite(contrast)).sum() > _FEWEST_AROUND:
         places, pixels = ground[seen], found[seen]
-        start, cell = _predicted(places, places, pixels, itself=False)
+        start, cell = _predicted(places, places, pixels, flattening, itself=False)
         off = np.hypot(*(pixels - start).T)
         side = np.sqrt(np.abs(np.linalg.det(cell)))
         near = np.abs(places[:, None] - places).max(axis=2) < _AROUND
@@ -189,7 +194,9 @@ def _leave_out_strays(ground: Array, found: Array, contrast: Array) -> None:
         found[tuple(at.T)], contrast[tuple(at.T)] = np.nan, np.nan
 
 
-def _predicted(ground: Array, known: Array, pixels: Array, itself: bool = True) -> tuple[Array, Array]:
+def _predicted(
+    ground: Array, known: Array, pixels: Array, flattening: Flattening, itself: bool = True
+) -> tuple[Array, Array]:
     """Pixels (N, 2) of places (N, 2) by homographies of the known places around each; NaN far from these.
 
     Also (N, 2, 2) the steps of a square along both axes [px]. If not `itself`, a known place says nothing of
@@ -202,10 +209,10 @@ def _predicted(ground: Array, known: Array, pixels: Array, itself: bool = True) 
     order = np.argsort(away, axis=1)[:, :count]
     near = np.take_along_axis(away, order, axis=1)
     weight = np.where(near < np.maximum(_AROUND, near[:, min(7, count - 1), None] + 1e-9), 1.0, 0.0)
-    H = homographies(known[order], pixels[order], weight)
+    H = homographies(known[order], flattening.flat(pixels)[order], weight)
     step = 0.05
     around = np.array([[0, 0], [step, 0], [-step, 0], [0, step], [0, -step]])
-    places = homography_at(H, ground[:, None] + around)
+    places = flattening.pixels(homography_at(H, ground[:, None] + around))
     start = np.where((near[:, 0] < _REACH)[:, None], places[:, 0], np.nan)
     along = np.stack([places[:, 1] - places[:, 2], places[:, 3] - places[:, 4]], axis=1) / (2 * step)
     return start, along
