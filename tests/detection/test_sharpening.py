@@ -8,14 +8,17 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.marked import errors_of as marked_errors
+from support.marked import marked_scene, plane_of, taken
 from support.measured import errors_of, take
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density
 from neurocal_cli.detection.fitting.sharpening import EdgeProfile, Sharpening, find_sharpening
-from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.simulation.rendering import Rendered, Scene
 
@@ -60,6 +63,26 @@ def test_vertices_of_sharpened_images_are_measured_to_the_bound() -> None:
     assert found.kept == 1
 
 
+def sharpened_target(form: str, square: float) -> tuple[Array, Array]:
+    """Errors of a board of another kind, and their squares over the covariance."""
+    scene = marked_scene(plane_of(form), 1, square=square)
+    picture = taken(scene, 1, 4)
+    pale = 128 + 0.5 * (picture.image.astype(float) - 128)
+    image = np.clip(np.rint(sharpened(pale, 2.0, 1.0)), 0, 255).astype(np.uint8)
+    return marked_errors(detect_points(image, scene.board, "vertices"), picture)
+
+
+def test_other_boards_in_sharpened_images_are_measured_as_well() -> None:
+    error, squared = sharpened_target("charuco:6x5:40:30:DICT_4X4_50", 40.0)
+    assert len(error) == 20
+    assert np.sqrt((error**2).mean()) < 0.0039  # 0.0045 if it is not undone
+    assert 0.6 < squared.mean() < 1.6  # 0.50
+    error, squared = sharpened_target("asymmetric_circles:4x7:20:16", 22.0)
+    assert len(error) == 28
+    assert np.sqrt((error**2).mean()) < 0.0043  # 0.0049
+    assert 0.6 < squared.mean() < 1.6  # 0.33
+
+
 def edge(sigma: float, amount: float, radius: float) -> EdgeProfile:
     d = np.arange(-8, 8.01, 0.25)
     fine, smooth = (erf_and_density(d / width)[0] for width in (sigma, np.hypot(sigma, radius)))
@@ -87,10 +110,8 @@ def test_an_edge_that_is_only_blurred_is_not_sharpened(sigma: float) -> None:
 @pytest.mark.parametrize(("amount", "radius"), [kind for kind in KINDS if kind[1] >= 1])
 def test_undoing_gives_back_the_image(amount: float, radius: float) -> None:
     image = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(120, 150)), (0, 0), 0.7)
-    c, r = np.meshgrid([50.0, 75.0, 100.0], [50.0, 60.0, 70.0])
-    undone = Sharpening(amount, radius).undone(
-        sharpened(image, amount, radius), Grid(np.stack([c, r], axis=-1), 0)
-    )
+    points = np.array([[50.0, 50.0], [100.0, 70.0]])
+    undone = Sharpening(amount, radius).undone(sharpened(image, amount, radius), points, 20.0)
     middle = np.s_[45:75, 45:105]
     assert np.abs(undone - image)[middle].max() < 0.02 * np.abs(image).max()
 

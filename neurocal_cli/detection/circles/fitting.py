@@ -38,8 +38,9 @@ from neurocal_cli.detection.fitting.grid_fit import map_of_vertices
 from neurocal_cli.detection.fitting.initial_fit import is_reliable
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, select_map
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading
+from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Single
+from neurocal_cli.detection.fitting.strips import Single, Strips
 from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -52,9 +53,12 @@ _LEAST_SCALE = 0.1  # least ratio of the noise variance from the residuals to th
 
 
 def measure_circles(
-    image: NDArray[np.generic], plane: CirclePlane, circles: PlacedCircles, floor: float
+    image: NDArray[np.generic], plane: CirclePlane, circles: PlacedCircles, floor: float, undo: bool = True
 ) -> Measured:
-    """Measure the centres of dark circles in a grey image; `floor` [DN^2] is the least noise of a pixel."""
+    """Measure the centres of dark circles in a grey image, with sharpening by the camera undone if `undo`.
+
+    `floor` [DN^2] is the least noise of a pixel.
+    """
     light = np.asarray(image, dtype=np.float32)
     places = plane.spread(circles.place.astype(float))
     grid = _sparse(places, circles.centre)
@@ -69,6 +73,12 @@ def measure_circles(
     for _ in range(_ROUNDS):
         pixels = outline_pixels(light, found.map, places, radius, blur, apart, shading)
         fit = _fitted(pixels, blur, floor)
+        sharpening = find_sharpening(_profile(pixels, fit)) if undo else None
+        if sharpening is not None:
+            undone = sharpening.undone(light, raw.pixels, 2 * _pixel_radius(found.map, places, radius))
+            gained = float((sharpening.inverse**2).sum())
+            return measure_circles(undone, plane, circles, floor * gained, undo=False)
+        undo = False
         centre = found.map.at(places) + fit.values[:, :2]
         mapped, departure = _mapped(found, places, centre, fit)
         good = is_reliable(fit, departure)
@@ -142,6 +152,16 @@ def _fitted(pixels: CirclePixels, blur: float, floor: float) -> BatchFit:
     unit = replace(pixels, root=pixels.root / np.float32(np.sqrt(noise)))
     fit = fit_batch(circle_model, unit, start, prior, shape, _STEPS)
     return fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE * floor / noise))
+
+
+def _profile(pixels: CirclePixels, fit: BatchFit) -> EdgeProfile | None:
+    """Mean profile of the outlines of fitted circles."""
+    along_u, along_v, growth, mean, contrast, _ = fit.values.T.astype(np.float32)[:, :, None]
+    d = pixels.d - pixels.u * along_u - pixels.v * along_v - growth
+    light = (pixels.value - mean) / (contrast * pixels.gain)
+    zero, inside = np.zeros(len(d)), (pixels.root > 0) & (fit.step < 1)[:, None]
+    strips = Strips(d, d, light, inside, d, d, pixels.beyond)
+    return edge_profile(strips, zero, zero, np.ones(len(d)))
 
 
 def _mean(values: Single, which: NDArray[np.bool_]) -> Array:

@@ -27,7 +27,6 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density
 from neurocal_cli.detection.fitting.strips import Single, Strips
-from neurocal_cli.detection.grid import Grid
 
 _STEP, _FARTHEST = 0.25, 8.0  # px; width of the profile's bins, and greatest distance from the edges
 _NARROWEST = 4.0  # px; least such distance, so narrow squares tell nothing
@@ -89,12 +88,12 @@ class Sharpening:
         part = kernel[middle - half : middle + half + 1, middle - half : middle + half + 1]
         return np.asarray(part / part.sum(), dtype=np.float32)
 
-    def undone(self, image: NDArray[np.generic], grid: Grid) -> Single:
-        """Undo it around a grid in an image."""
+    def undone(self, image: NDArray[np.generic], points: Array, room: float) -> Single:
+        """Undo it around points (N, 2) in an image, and `room` [px] beyond them."""
         whole = image.astype(np.float32)
-        room = self.inverse.shape[0] + 2 * grid.square
-        low = np.maximum(np.nanmin(grid.pixels, axis=(0, 1)) - room, 0).astype(int)
-        high = np.nanmax(grid.pixels, axis=(0, 1)).astype(int) + int(room)
+        room += self.inverse.shape[0]
+        low = np.maximum(points.min(axis=0) - room, 0).astype(int)
+        high = points.max(axis=0).astype(int) + int(room)
         part = np.s_[low[1] : high[1], low[0] : high[0]]
         whole[part] = cv2.filter2D(whole[part], cv2.CV_32F, self.inverse, borderType=cv2.BORDER_REFLECT)
         return whole

@@ -14,13 +14,15 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import interpolate
 from neurocal_cli.detection.fitting.batched_newton import LEAST_BLUR
 from neurocal_cli.detection.fitting.common_parameters import correlation
+from neurocal_cli.detection.fitting.edge_fit import usual_stride
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, erf_and_density
 from neurocal_cli.detection.fitting.grid_edges import GridImage
 from neurocal_cli.detection.fitting.grid_fit import GridFit, fit_again, fit_from, map_of_vertices
 from neurocal_cli.detection.fitting.map_fit import MapFit, fit_map
 from neurocal_cli.detection.fitting.shading import LEVEL_VARIANCE, Levels, fit_shading, square_levels
+from neurocal_cli.detection.fitting.sharpening import EdgeProfile, edge_profile, find_sharpening
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Lines, grid_lines
+from neurocal_cli.detection.fitting.strips import Lines, Strips, grid_lines, strip_pixels
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.markers.ink import Appearance, Ink, without_ink
 from neurocal_cli.detection.medians import upper_median
@@ -37,14 +39,21 @@ _SIGMAS = np.geomspace(0.4, 6.0, 12)  # px, tried first
 _OFFSETS = np.linspace(-1.0, 1.0, 9)  # px, of an edge from the found vertices
 _FINER = np.geomspace(0.75, 1.33, 9)  # factors on the blur tried afterwards
 _INTERPOLATED = 1 / 6  # px^2, variance that linear interpolation adds to the blur
+_WIDEST = 10.0  # px; greatest distance from the edges at which sharpening is looked for
 _PLACES = 13  # samples across an edge
 _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 
 
-def fit_without_ink(image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink) -> GridFit:
-    """Fit a board whose cells have patterns."""
+def fit_without_ink(
+    image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink, undo: bool = True
+) -> GridFit:
+    """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
     raw = GridImage(image, grid, floor)
     look, mapped, levels, noise = _first_look(raw, ink)
+    sharpening = find_sharpening(_plain_profile(raw, mapped, _gaps(raw, ink), *levels)) if undo else None
+    if sharpening is not None:
+        undone = sharpening.undone(image, raw.pixels, 2 * grid.square)
+        return fit_without_ink(undone, grid, floor * float((sharpening.inverse**2).sum()), ink, undo=False)
     plain = GridImage(without_ink(image, ink, look, _FIRST_MOST), grid, floor)
     sigma = upper_median(look.blur[:, 0])
     fitted = fit_from(plain, mapped, sigma, look.shading, levels, max(noise, floor))
@@ -139,6 +148,33 @@ def _profiles(
         least[better], offset_of[better] = cost[better], offset
         best[better] = np.column_stack([level[..., 0], np.full(len(d), sigma)])[better]
     return best, offset_of
+
+
+def _plain_profile(
+    raw: GridImage, mapped: MapFit, gaps: tuple[Array, Array], mean: Array, contrast: Array
+) -> EdgeProfile | None:
+    """Mean profile of the edges by the sides that have no patterns.
+
+    What is beyond an edge with a pattern is what is before it, with the levels exchanged.
+    """
+    lines, (gap, side) = raw.edges.lines(mapped.map), gaps
+    offset = mapped.residual[: len(gap)] + mapped.shift[0]
+    half = np.minimum(_WIDEST, 0.35 * lines.width)
+    strips = strip_pixels(raw.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
+    zero, middle = (x.astype(np.float32)[:, None] for x in (offset, mean))
+    patterned = (gap < 0.5)[:, None]
+    plain = strips.inside & ~(patterned & (side[:, None] * (strips.d - zero) > 0))
+    d, value, inside = (
+        np.concatenate(pair, axis=1)
+        for pair in (
+            (strips.d, 2 * zero - strips.d),
+            (strips.value, 2 * middle - strips.value),
+            (plain, plain & patterned),
+        )
+    )
+    both = (np.concatenate([one, one], axis=1) for one in (strips.s, strips.u, strips.v))
+    s, u, v = both
+    return edge_profile(Strips(s, d, value, inside, u, v, strips.beyond), offset, mean, contrast)
 
 
 def _gaps(raw: GridImage, ink: Ink) -> tuple[Array, Array]:
