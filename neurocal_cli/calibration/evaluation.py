@@ -20,6 +20,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.observations.laid_points import laid
 from neurocal_cli.observations.points import Correspondences
 
 # In the same image, most points lie within these distances of the calibration's prediction, even after small
@@ -104,7 +105,7 @@ def evaluate_camera(
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
         if given is not None and calibration.target is not None:
-            points = calibration.target.applied(given)
+            points = laid(calibration.target, given)
         if given is not None:
             renamed = other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}

@@ -34,6 +34,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median, rotation_vector
 from neurocal_cli.camera.pinhole import Pose, in_cameras
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
+from neurocal_cli.observations.laid_points import laid
 from neurocal_cli.observations.points import Correspondences
 
 # Given points show a target of another size if the baseline differs by more than this share while the views'
@@ -142,7 +143,7 @@ class _Evaluator:
         self.warnings = [failure] if rig is None else list(rig.warnings)
         self.given, target = points is not None, cameras[0].target
         if points is not None and target is not None:
-            points = target.applied(points[0]), target.applied(points[1])
+            points = laid(target, points[0]), laid(target, points[1])
         self.points = points or (cameras[0].points, cameras[1].points)
         if self.given:
             for camera, given in zip(cameras, self.points, strict=True):

@@ -22,6 +22,7 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.observations.laid_points import laid
 from neurocal_cli.observations.points import Correspondences
 
 
@@ -82,7 +83,7 @@ def evaluate_rig(rig: Rig, points: Mapping[str, Correspondences] | None = None) 
         refuse_another_size(rig.cameras[name], one)
     target = rig.cameras[rig.first].target
     if given and target is not None:
-        points = {name: target.applied(one) for name, one in points.items()}
+        points = {name: laid(target, one) for name, one in points.items()}
     check_one_target(points)
     label, frames, camera, pixels, world = _rows(points)
     found = triangulate_many(rig, label, camera, pixels)
