@@ -132,8 +132,11 @@ def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: fl
     blurred = _Blurred.of(inverse.slopes(pixels), blur, look.shift, look.tails)
     change = blurred.pattern(a, b, ink.lines, ink.inner)
     u, v = pixels[used].T.astype(np.intp)
-    _, contrast = look.shading.at(pixels[used])
-    change = change[used]
+    # Linear within a cell: a local shading takes long at so many places.
+    middle = corners.mean(axis=1)
+    _, slope = look.shading.slopes(middle)
+    contrast = look.shading.at(middle)[1][:, None] + ((pixels - middle[:, None]) @ slope[:, :, None])[..., 0]
+    change, contrast = change[used], contrast[used]
     if look.nonlinearity.any():
         plain = np.clip(blurred.squares(a, b, ink.base)[used], -1, 1)
         seen_light = np.clip(plain + change, -1, 1)

@@ -41,6 +41,7 @@ _FINER = np.geomspace(0.75, 1.33, 9)  # factors on the blur tried afterwards
 _INTERPOLATED = 1 / 6  # px^2, variance that linear interpolation adds to the blur
 _WIDEST = 10.0  # px; greatest distance from the edges at which sharpening is looked for
 _PLACES = 13  # samples across an edge
+_TINY = 1e-9  # least variance of the samples of a profile
 _ALONG = (-0.2, -0.1, 0.0, 0.1, 0.2)  # of an edge, in squares
 
 
@@ -137,16 +138,20 @@ def _profiles(
         middle = lines.middle + (part * lines.length)[:, None] * lines.tangent
         seen += interpolate(image, middle[:, None] + d[..., None] * lines.normal[:, None]) / len(_ALONG)
     least, best, offset_of = np.full(len(d), np.inf), np.zeros((len(d), 3)), np.zeros(len(d))
+    total, square = seen.sum(axis=1), (seen**2).sum(axis=1)
     for sigma, offset in product(sigmas.tolist(), offsets.tolist()):
         beyond = (side[:, None] * (d - offset) - gap[:, None]) / sigma
         x = erf_and_density((d - offset) / sigma)[0]
         x -= (side * near)[:, None] * (1 + erf_and_density(beyond)[0])
-        A = np.stack([np.ones_like(d), x], axis=-1)
-        level = np.linalg.solve(A.swapaxes(1, 2) @ A + 1e-9 * np.eye(2), A.swapaxes(1, 2) @ seen[..., None])
-        cost = ((seen[..., None] - A @ level) ** 2).sum(axis=(1, 2))
-        better = (cost < least) & (level[:, 1, 0] > 0)
+        # The line through the profile over x.
+        sum_x, product_x = x.sum(axis=1), (x * seen).sum(axis=1)
+        contrast = _PLACES * product_x - sum_x * total
+        contrast /= np.maximum(_PLACES * (x**2).sum(axis=1) - sum_x**2, _TINY)
+        mean = (total - contrast * sum_x) / _PLACES
+        cost = square - mean * total - contrast * product_x
+        better = (cost < least) & (contrast > 0)
         least[better], offset_of[better] = cost[better], offset
-        best[better] = np.column_stack([level[..., 0], np.full(len(d), sigma)])[better]
+        best[better] = np.column_stack([mean, contrast, np.full(len(d), sigma)])[better]
     return best, offset_of
 
 
