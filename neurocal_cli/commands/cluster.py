@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
+from itertools import islice
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from neurocal_cli import __version__
 from neurocal_cli.errors import NeurocalError
@@ -20,6 +22,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _AHEAD = 8  # tasks per thread that wait at the workers' side, so that no worker waits
+_TOGETHER = 0.1  # seconds in which results are collected
 _WAIT = 30  # seconds for the first worker
 _GONE = 10  # seconds without the scheduler, after which it will not come back
 _LOST = "the scheduler is gone; start it, then the same command goes on"
@@ -41,6 +44,12 @@ def local_cluster(workers: int) -> Iterator[Client]:
         "distributed.scheduler.allowed-failures": _TRIES,
         "distributed.admin.log-format": "%(message)s",
         "distributed.worker.memory.terminate": 0.95,  # of its share; the task is then tried elsewhere
+        # What a cluster does all the time, so that the cores are left to the jobs.
+        "distributed.worker.profile.enabled": False,
+        "distributed.worker.memory.monitor-interval": "500ms",
+        "distributed.admin.tick.interval": "500ms",
+        # Without Dask's MALLOC_TRIM_THRESHOLD_, with which all large arrays are new pages of the system.
+        "distributed.nanny.pre-spawn-environ": {},
     }
     _silence()
     with dask.config.set(settings), interrupts_held():
@@ -128,37 +137,45 @@ def _content(path: str) -> str:
 
 
 def work_off_by(
-    client: Client, work: Callable[[Task], Result], tasks: Iterable[Task]
+    client: Client, work: Callable[[Task], Result], tasks: Iterable[Task], ahead: int = _AHEAD
 ) -> Iterator[tuple[Task, Result | None]]:
     """Tasks with their results as they are finished; see `worker_pool.work_off`.
 
-    Raises NeurocalError if the scheduler is gone.
+    `ahead` tasks for each thread are with the workers. Tasks are sent, and results are fetched, several at a
+    time, because a message costs as much time as a dozen tasks in it. Raises NeurocalError if the scheduler
+    is gone.
     """
-    rest, open_tasks = iter(tasks), dict[str, Task]()
+    rest, open_tasks, most = iter(tasks), dict[str, Task](), ahead * threads(client)
     finished: SimpleQueue[Future] = SimpleQueue()
+    while True:
+        if len(open_tasks) <= most // 2:
+            some = list(islice(rest, most - len(open_tasks)))
+            for task, future in zip(some, client.map(work, some, pure=False), strict=True):
+                open_tasks[future.key] = task
+                future.add_done_callback(finished.put)
+        if not open_tasks:
+            return
+        futures = {future.key: future for future in _finished(client, finished)}
+        results = _results(client, futures)
+        del futures  # so that the workers forget them
+        for key, result in results.items():
+            yield open_tasks.pop(key), result
 
-    def submit(task: Task) -> None:
-        future = client.submit(work, task, pure=False)
-        open_tasks[future.key] = task
-        future.add_done_callback(finished.put)
 
-    for _, task in zip(range(_AHEAD * threads(client)), rest, strict=False):
-        submit(task)
-    lost = 0
-    while open_tasks:
-        try:
-            future = finished.get(timeout=1.0)
-        except Empty:
-            lost = 0 if client.status == "running" else lost + 1
-            if lost < _GONE:
-                continue
-            raise NeurocalError(_LOST) from None
-        if future.status not in ("finished", "error"):  # cancelled, for the scheduler is gone
-            raise NeurocalError(_LOST)
-        task = open_tasks.pop(future.key)
-        result = future.result() if future.status == "finished" else None  # else its worker died, again
-        future.release()
-        for following in rest:
-            submit(following)
-            break
-        yield task, result
+def _finished(client: Client, queue: SimpleQueue[Future]) -> list[Future]:
+    """Wait for finished tasks, and a moment for more of them."""
+    for _ in range(_GONE):
+        with suppress(Empty):
+            found = [queue.get(timeout=1.0)]
+            time.sleep(_TOGETHER)
+            return found + [queue.get() for _ in range(queue.qsize())]
+        if client.status == "running":
+            return []
+    raise NeurocalError(_LOST)
+
+
+def _results(client: Client, futures: dict[str, Future]) -> dict[str, Any]:
+    """Results of finished tasks; None for a task whose worker died, again."""
+    if any(future.status not in ("finished", "error") for future in futures.values()):  # cancelled
+        raise NeurocalError(_LOST)
+    return dict(client.gather(futures, errors="skip"))

@@ -12,6 +12,7 @@ import platform
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
+from functools import cache
 from html import escape
 from importlib.metadata import PackageNotFoundError, version
 
@@ -159,6 +160,7 @@ class Origin:
     versions: Mapping[str, str] = field(default_factory=dict)  # of the programs that computed the result
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of the running programs."""
     found = {"neurocal": __version__, "Python": platform.python_version()}
