@@ -38,7 +38,7 @@ _SETTLED = 1e-12  # rad
 # Best known std of a combination of parameters, over that of pixels. test_drift.py has halves of real sets.
 _BEST_KNOWN = 0.3
 _SPARE = 40  # equations beyond the unknowns, from which on new points tell whether the camera has changed
-_FEW_VIEWS = 10  # degrees of freedom of a covariance if the file does not tell, or the camera has one view
+FEW_VIEWS = 10  # degrees of freedom of a covariance if the file does not tell, or the camera has one view
 
 
 @frozen_dataclass(eq=False)
@@ -120,7 +120,7 @@ def find_drift(old: Calibration | Camera, new: Calibration | Camera) -> Drift:
     changes = _solved(columns, difference[..., None], weight)[:, 0]
     changes_std = np.linalg.norm(_solved(columns, root, weight), axis=1)
     views = _freedom(old) + _freedom(new)
-    by_changes = [_tail(ratio, 1.0, views) for ratio in ((changes / changes_std) ** 2).tolist()]
+    by_changes = [tail(ratio, 1.0, views) for ratio in ((changes / changes_std) ** 2).tolist()]
     # Each of the four statistics has a quarter of the share.
     share = min(1.0, 4 * min(_share_of_size(difference, root, weight, views), *by_changes))
     return Drift(pixels, difference, std, turn, changes, changes_std, share)
@@ -197,7 +197,7 @@ def _freedom(given: Calibration | Camera) -> float:
     """Degrees of freedom of a camera's covariance, by its number of views; 0 if it is exact."""
     if isinstance(given, Camera) or not given.known_covariance[0]:
         return 0.0
-    return len(given.views) - 1.0 if len(given.views) > 1 else _FEW_VIEWS
+    return len(given.views) - 1.0 if len(given.views) > 1 else FEW_VIEWS
 
 
 def _share_of_size(difference: Array, root: Array, weight: Array, views: float) -> float:
@@ -214,10 +214,10 @@ def _share_of_size(difference: Array, root: Array, weight: Array, views: float) 
     known = s**2 + _BEST_KNOWN**2 * len(weight)
     part = s**2 / known
     total = float((along**2 / known).sum()) + beyond / len(weight)
-    return _tail(total / float(part.sum()), float(part.sum() ** 2 / (part**2).sum()), views)
+    return tail(total / float(part.sum()), float(part.sum() ** 2 / (part**2).sum()), views)
 
 
-def _tail(ratio: float, freedom: float, views: float) -> float:
+def tail(ratio: float, freedom: float, views: float) -> float:
     """Probability that Fisher's F with these degrees of freedom exceeds the ratio."""
     from scipy.special import betainc
 

@@ -48,7 +48,7 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
     "--against",
     "SUMMARY.csv",
     "Compare each camera with that of the same name in an earlier summary, and mark those that have changed, "
-    "as neurocal drift does.",
+    "as neurocal drift does, and cameras of rigs that have moved.",
 )
 @options.count(
     "--workers",
@@ -301,6 +301,8 @@ class _Batch:
 
     def _tell(self, rows: list[dict[str, Any]], as_json: bool) -> None:
         """Report what was done, and what stands out."""
+        from neurocal_cli.commands.batch_rows import drift_text
+
         outcomes = self._outcomes
         failed = {name: one.problem for name, one in outcomes.items() if one.record.get("status") != "done"}
         for name, problem in list(failed.items())[:_MOST_TOLD]:
@@ -310,7 +312,7 @@ class _Batch:
         n_unchanged = sum(one.status == "unchanged" for one in outcomes.values())
         verdicts = Counter(row["verdict"] for row in rows if row.get("verdict"))
         outliers = [row for row in rows if row["outlier"]]
-        changed = [row for row in rows if row["drift"] == "changed"]
+        changed = {_named(row): text for row in rows if (text := drift_text(row))}
         seconds = time.perf_counter() - self._start
         if as_json:
             print_summary(
@@ -321,17 +323,15 @@ class _Batch:
                     "failed": failed,
                     "verdicts": dict(verdicts),
                     "outliers": {_named(row): row["outlier"] for row in outliers},
-                    "changed": {_named(row): row["drift_px"] for row in changed},
+                    "changed": changed,
                     "seconds": seconds,
                 }
             )
             return
         for row in outliers:
             warn(f"{_named(row)}: {row['outlier']}")
-        for row in changed:
-            warn(
-                f"{_named(row)}: has changed, {row['drift_px']:.2g} px rms (std {row['drift_std_px']:.2g} px)"
-            )
+        for name, text in changed.items():
+            warn(f"{name}: {text}")
         n_new = len(outcomes) - n_unchanged
         say(
             f"{len(outcomes) - len(failed)} of {len(outcomes)} jobs are done"

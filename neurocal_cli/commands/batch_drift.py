@@ -5,11 +5,13 @@ from __future__ import annotations
 from contextvars import Context
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import NeurocalError
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration.calibration import Calibration
+    from neurocal_cli.calibration.drift import Drift
 
 
 @frozen_dataclass
@@ -29,25 +31,42 @@ def compare(pair: Pair) -> dict[str, Any]:
 
 def _compared(pair: Pair) -> dict[str, Any]:
     from neurocal_cli.calibration.drift import find_drift
+    from neurocal_cli.files.calibration_tree import read_calibration
 
     try:
-        found = find_drift(_camera(pair.old, pair.camera), _camera(pair.new, pair.camera))
+        if not pair.camera:
+            return _in_image(find_drift(read_calibration(pair.old), read_calibration(pair.new)))
+        return _in_rigs(pair)
     except NeurocalError as error:
         return {"drift": f"unknown: {error}"}
+
+
+def _in_rigs(pair: Pair) -> dict[str, Any]:
+    """What changed in a camera of a rig, and in its pose relative to the first camera."""
+    from neurocal_cli.calibration.drift import find_drift
+    from neurocal_cli.calibration.rig.pose_drift import find_pose_drift
+    from neurocal_cli.files.rig_yaml import read_rig
+
+    old, new, name = read_rig(pair.old), read_rig(pair.new), pair.camera
+    if name not in old.cameras:
+        raise NeurocalError(f"{pair.old} has no camera {name}")
+    cells = _in_image(find_drift(old.cameras[name], new.cameras[name]))
+    if name == new.first:
+        return cells
+    moved = find_pose_drift(old, new, name)
+    return cells | {
+        "turn_rad": float(np.linalg.norm(moved.turn)),
+        "turn_std_rad": float(np.linalg.norm(moved.turn_std)),
+        "baseline_change": moved.baseline,
+        "baseline_change_std": moved.baseline_std,
+        "pose_share": moved.share,
+    }
+
+
+def _in_image(found: Drift) -> dict[str, Any]:
     return {
-        "drift": "same",  # or "changed", which depends on the number of cameras
+        "drift": "same",  # or what has changed, which depends on the number of cameras
         "drift_px": found.rms_px,
         "drift_std_px": found.rms_std,
         "drift_share": found.share,
     }
-
-
-def _camera(file: str, name: str) -> Calibration:
-    """A camera of a file of one camera or of a rig."""
-    from neurocal_cli.files.calibration_tree import calibration_from_field, read_calibration
-    from neurocal_cli.files.file_storage import read_tree
-
-    if not name:
-        return read_calibration(file)
-    root = read_tree(file)
-    return calibration_from_field(root["cameras"][name] if "cameras" in root else root[name])

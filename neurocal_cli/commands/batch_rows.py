@@ -14,25 +14,43 @@ from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
 if TYPE_CHECKING:
     from neurocal_cli.commands.batch_jobs import Job, Outcome
 
+Row = dict[str, Any]
+
 # Parameters that have a column; a rich lens has dozens more.
 _NAMED = re.compile(r"alpha_[uv]|[uv]0|theta|[kps]\d|tau_[xy]|xi|alpha|beta")
-_OF_FLEET = ("alpha_u", "alpha_v", "u0", "v0")  # parameters that are compared with those of the fleet
+_OF_FLEET = (
+    "alpha_u",
+    "alpha_v",
+    "u0",
+    "v0",
+    "baseline",
+)  # parameters that are compared with those of the fleet
 _FALSE = 0.1  # share of batches with any unchanged camera that is said to have changed
+# What has happened if the chance of an unchanged camera, and of an unchanged pose, is too small.
+_SHARES = {"drift_share": "changed", "pose_share": "moved"}
 _MEASURES = {"held_out_px": "held_out_px", "projection_px": "std_px"}
 
 
-def rows_of(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def rows_of(summary: Mapping[str, Any]) -> list[Row]:
     """The rows of a job from the summary of its result; None for what does not exist."""
+    baselines: dict[str, tuple[float, float | None]] = {}
     if "cameras" in summary:
-        cameras = dict(summary["cameras"])
+        cameras, poses = dict(summary["cameras"]), summary["poses"]
+        for name in list(cameras)[1:]:
+            baselines[name] = float(np.linalg.norm(poses[name]["t"])), poses[name]["std"]["baseline"]
     elif "left" in summary:
         cameras = {side: summary[side] for side in ("left", "right")}
+        baselines["right"] = summary["baseline"], summary["baseline_std"]
     elif "controls" in summary:  # a zoom lens has no single camera
         own = {key: summary[key] for key in ("n_points", "rmse_px", "distortion")}
         return [_judged(summary) | {"camera": ""} | own]
     else:
         cameras = {"": summary}
-    return [_judged(summary) | _camera(name, one) for name, one in cameras.items()]
+    rows = [_judged(summary) | _camera(name, one) for name, one in cameras.items()]
+    for row in rows:
+        if row["camera"] in baselines:
+            row["baseline"], row["baseline_std"] = baselines[row["camera"]]
+    return rows
 
 
 def _judged(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,7 +61,9 @@ def _judged(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _camera(name: str, summary: Mapping[str, Any]) -> dict[str, Any]:
+    size = summary["image_size"]
     row: dict[str, Any] = {"camera": name, "n_views": len(summary["views"])}
+    row["image_size"] = "" if size is None else f"{size[0]} x {size[1]}"
     row |= {key: summary[key] for key in ("n_points", "n_rejected", "distortion", "rmse_px")}
     for key, entry in summary["parameters"].items():
         if _NAMED.fullmatch(key):
@@ -57,9 +77,9 @@ def fleet_rows(
     jobs: Iterable[Job],
     outcomes: Mapping[str, Outcome],
     changes: Mapping[tuple[str, str], Mapping[str, Any]],
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """All rows in the order of the jobs, with the outliers of the fleet and the cameras that have changed."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for job in jobs:
         outcome = outcomes.get(job.name)
         record = {} if outcome is None else outcome.record
@@ -67,22 +87,47 @@ def fleet_rows(
         common = {"name": job.name, "status": status, "seconds": record.get("seconds"), "log": bool(record)}
         common["problem"] = "" if outcome is None else outcome.problem
         for row in record.get("rows") or [{"camera": ""}]:
-            found = {"file": f"{job.name}/{job.result}"} if "verdict" in row else {}
-            rows.append(common | row | found | {"drift": ""} | changes.get((job.name, row["camera"]), {}))
+            file = {"file": f"{job.name}/{job.result}"} if "verdict" in row else {}
+            rows.append(common | row | file | {"drift": ""} | changes.get((job.name, row["camera"]), {}))
     _mark_outliers(rows)
-    limit = min(SHARE, _FALSE / max(len(changes), 1))
+    shares = [row[key] for row in rows for key in _SHARES if row.get(key) is not None]
+    limit = min(SHARE, _FALSE / max(len(shares), 1))
     for row in rows:
-        if row.get("drift_share") is not None and row["drift_share"] < limit:
-            row["drift"] = "changed"
+        found = [
+            word for key, word in _SHARES.items() if (share := row.get(key)) is not None and share < limit
+        ]
+        row["drift"] = " and ".join(found) or row["drift"]
     return rows
 
 
-def _mark_outliers(rows: Sequence[dict[str, Any]]) -> None:
-    """Mark cameras of which a parameter is far from those of the fleet's cameras of the same name."""
+def drift_text(row: Mapping[str, Any]) -> str:
+    """What has changed since an earlier batch, in words; "" if nothing has."""
+    told, words = [], row.get("drift", "").split(" and ")
+    if "changed" in words:
+        told.append(
+            f"has changed, {row['drift_px']:.2g} px rms over the image (std {row['drift_std_px']:.2g} px)"
+        )
+    if "moved" in words:
+        told.append(
+            f"has moved, turned by {1000 * row['turn_rad']:.2g} mrad (std {1000 * row['turn_std_rad']:.2g} "
+            f"mrad), its baseline by {row['baseline_change']:+.2g} (std {row['baseline_change_std']:.2g})"
+        )
+    return "; ".join(told)
+
+
+def of_one_kind(rows: Iterable[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows by the name of the camera and the size of its images: cameras that can be compared."""
+    kinds: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        kinds.setdefault((row["camera"], row.get("image_size", "")), []).append(row)
+    return kinds
+
+
+def _mark_outliers(rows: Sequence[Row]) -> None:
+    """Mark cameras of which a parameter is far from those of the fleet's cameras of their kind."""
     for row in rows:
         row["outlier"] = ""
-    for name in dict.fromkeys(row["camera"] for row in rows):
-        alike = [row for row in rows if row["camera"] == name]
+    for alike in of_one_kind(rows).values():
         for parameter in _OF_FLEET:
             values, std = (
                 np.array([np.nan if row.get(key) is None else row[key] for row in alike], dtype=float)

@@ -156,7 +156,7 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     from neurocal_cli.calibration.verdict.assessment import assess
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
-    from neurocal_cli.commands.show.drift_report import drift_json, since_lines
+    from neurocal_cli.commands.show.drift_report import drift_json, since_line
     from neurocal_cli.commands.show.plane_report import plane_json, plane_table
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
@@ -172,11 +172,12 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
         on_plane = judged.errors_at(_in_unit(at, unit))
     evaluation = evaluate_camera(judged, seen)
     verdict, drift = None, None
+    anew = isinstance(judged, Calibration) and given is not None and evaluation.fit is not None
     if isinstance(judged, Calibration):
         verdict = assess(judged)
+        if evaluation.fit is not None and anew:
+            drift = drift_since(judged, evaluation.fit.points)
         if verdict is not None and given is not None:
-            if evaluation.fit is not None:
-                drift = drift_since(judged, evaluation.fit.points)
             verdict = judged_by_points(verdict, judged, evaluation.given_points, drift)
     renamed = evaluation.renamed
     for names, why in (
@@ -195,7 +196,7 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     else:
         tables = [*evaluation_tables(evaluation)]
         tables += [] if on_plane is None else [plane_table(on_plane, unit)]
-        show(tables, [*since_lines(drift), *verdict_lines(verdict)])
+        show(tables, [*([since_line(drift)] if anew else []), *verdict_lines(verdict)])
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera

@@ -57,13 +57,14 @@ def locked(folder: str) -> Iterator[None]:
             "give another folder"
         ) from error
     try:
+        _remove_left_over(folder)
         with suppress(OSError):
             owner = f"process {os.getpid()} of {getpass.getuser()} on {platform.node()}"
             os.truncate(descriptor, 0)
             os.write(descriptor, f"{owner}, since {time.strftime('%Y-%m-%d %H:%M:%S')}\n".encode())
-        _remove_left_over(folder)
         yield
     finally:
+        _remove_left_over(folder)
         with suppress(OSError):
             os.unlink(path)
         os.close(descriptor)
@@ -109,11 +110,18 @@ def work_folder(results: str) -> str:
 def publish(made: str, results: str) -> None:
     """Let a folder take the place of that of the results."""
     parent, name = os.path.split(results)
-    old = os.path.join(parent, f"{_OLD}{name}-{os.getpid()}-{os.urandom(4).hex()}")
-    with suppress(FileNotFoundError):
-        os.rename(results, old)
-    os.rename(made, results)
-    shutil.rmtree(old, ignore_errors=True)
+    while True:
+        old = os.path.join(parent, f"{_OLD}{name}-{os.getpid()}-{os.urandom(4).hex()}")
+        with suppress(FileNotFoundError):
+            os.rename(results, old)
+        try:
+            os.rename(made, results)
+            break
+        except OSError as error:  # a worker of a batch that was killed was faster
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def is_of_machine(error: BaseException | None) -> bool:

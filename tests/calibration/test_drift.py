@@ -133,10 +133,18 @@ def test_the_command_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert summary["changes"]["centre_v"]["value"] > 5 * summary["changes"]["centre_v"]["std"]
     assert run("drift", flat, tmp_path / "none.yaml").exit_code == 1
     told = run("evaluate", "camera", flat, SAMPLES / "stereo_right.csv")
-    assert "calibrated from these points, the camera has changed" in told.stdout
+    assert (
+        "the calibration no longer holds: calibrated from these points, the camera differs by" in told.stdout
+    )
     assert "the camera has changed since: its scale by" in told.stdout
     told = run("evaluate", "camera", flat, SAMPLES / "stereo_left.csv")
-    assert "calibrated from these points, the camera is the same within chance" in told.stdout
+    assert "the calibration still holds: calibrated from these points, the camera differs by" in told.stdout
+    lines = (SAMPLES / "stereo_left.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "few.csv").write_text(
+        "".join(line for line in lines if line[:4] != "left" or line[:6] == "left01")
+    )
+    told = run("evaluate", "camera", flat, tmp_path / "few.csv")
+    assert "these points alone do not determine the camera" in told.stdout
 
 
 @pytest.mark.slow

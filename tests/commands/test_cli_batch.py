@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,11 @@ from support.sessions import camera, session
 
 from neurocal_cli import write_points
 from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
+from neurocal_cli.commands.batch_drift import Pair, compare
+from neurocal_cli.commands.batch_jobs import Job, Outcome
+from neurocal_cli.commands.batch_rows import drift_text, fleet_rows, of_one_kind
 from neurocal_cli.commands.show.fleet_page import fleet_page
+from neurocal_cli.files.job_files import publish, work_folder
 
 QUICK = ("--set", "distortion=none", "--set", "target=given", "--set", "outliers=keep")
 BOARD = ("--set", "cols=9", "--set", "rows=6", "--set", "square=25")
@@ -84,6 +88,7 @@ def test_the_results_are_those_of_the_commands_one_by_one(
     again = files_of(place / "again")
     assert again == {name: content for name, content in made.items() if name in again}
     assert len(again) == 2 + 2 + 3
+    assert not [name for name, content in made.items() if str(place).encode() in content]
 
 
 def test_the_log_begins_with_the_command_and_holds_the_summary(place: Path) -> None:
@@ -189,6 +194,53 @@ def test_outliers_of_a_fleet_are_far_in_units_of_its_spread() -> None:
     assert np.isnan(fleet_sigmas(values[:4], np.zeros(4))).all()
 
 
+def test_cameras_of_other_images_are_no_outliers() -> None:
+    small = [
+        {"camera": "", "image_size": "640 x 480", "alpha_u": 800.0 + k, "alpha_u_std": 0.1} for k in range(9)
+    ]
+    large = [{**small[k], "image_size": "1280 x 960", "alpha_u": 1600.0 + k} for k in range(6)]
+    kinds = of_one_kind([*small, *large])
+    assert [len(alike) for alike in kinds.values()] == [9, 6]
+    rows = fleet_rows([Job("a", "", (), (), "")], {"a": Outcome("done", {"rows": [*small, *large]})}, {})
+    assert [row["outlier"] for row in rows] == [""] * 15
+
+
+def test_a_rig_is_compared_with_its_poses(place: Path) -> None:
+    file = str(place / "out" / "pair" / "rig.yaml")
+    cells = {name: compare(Pair("pair", name, file, file)) for name in ("left", "right")}
+    assert cells["left"]["drift"] == "same"
+    assert cells["right"]["pose_share"] == 1.0
+    record = json.loads((place / "out" / "pair" / ".job.json").read_text())
+    knocked = {("pair", "right"): cells["right"] | {"pose_share": 1e-9, "turn_rad": 0.004}}
+    rows = fleet_rows([Job("pair", "", (), (), "rig.yaml")], {"pair": Outcome("done", record)}, knocked)
+    assert [row["drift"] for row in rows] == ["", "moved"]
+    assert rows[1]["baseline"] == pytest.approx(119.3, abs=1)
+    assert "has moved, turned by 4 mrad (std " in drift_text(rows[1])
+    assert "has moved, turned by 4 mrad" in fleet_page(rows, "rigs")
+    assert "unknown: " in compare(Pair("pair", "third", file, file))["drift"]
+
+
+def test_results_that_another_worker_put_there_first_are_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results, rename = tmp_path / "cam", os.rename
+
+    def faster(old: str, new: str) -> None:
+        """Results appear just before those that were made get their name."""
+        if new == str(results) and not (tmp_path / "seen").exists():
+            (tmp_path / "seen").touch()
+            results.mkdir()
+            (results / "camera.yaml").write_text("other")
+        rename(old, new)
+
+    made = Path(work_folder(str(results)))
+    (made / "camera.yaml").write_text("mine")
+    monkeypatch.setattr(os, "rename", faster)
+    publish(str(made), str(results))
+    assert (results / "camera.yaml").read_text() == "mine"
+    assert sorted(os.listdir(tmp_path)) == ["cam", "seen"]
+
+
 def test_names_on_the_page_are_harmless() -> None:
     row = {"name": "a&b <i>", "camera": "", "status": "failed", "problem": "<script>", "log": True}
     page = fleet_page([row], "<b>")
@@ -220,12 +272,38 @@ def test_an_interrupted_batch_says_so_and_goes_on(tmp_path: Path) -> None:
     assert files_of(tmp_path / "out2") == files_of(tmp_path / "out9")
 
 
-@pytest.mark.slow
-def test_dask_gives_the_same_bytes(tmp_path: Path) -> None:
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """The address of a scheduler with two workers, all processes of their own."""
     pytest.importorskip("distributed")
-    manifest = fleet(tmp_path / "data", 1, 6)
+    file, tool = tmp_path / "scheduler.json", [sys.executable, "-m", "distributed.cli"]
+    (tmp_path / "far").mkdir()
+    words = ([f"{tool[2]}.dask_scheduler", "--port", "0", "--no-dashboard"],
+             [f"{tool[2]}.dask_worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard"])  # fmt: skip
+    processes = [
+        subprocess.Popen([*tool[:2], *own, "--scheduler-file", str(file)], cwd=tmp_path / "far",
+                         stderr=subprocess.DEVNULL)
+        for own in words
+    ]  # fmt: skip
+    while not file.exists():
+        time.sleep(0.1)
+    yield json.loads(file.read_text())["address"]
+    for process in reversed(processes):
+        process.terminate()
+        process.wait()
+
+
+@pytest.mark.slow
+def test_dask_gives_the_same_bytes(tmp_path: Path, scheduler: str) -> None:
+    manifest = fleet(tmp_path / "data", 1, 30)
     words = [sys.executable, "-m", "neurocal_cli", "batch", str(manifest)]
-    for name, options in {"own": ["--jobs", "1"], "dask": ["--workers", "2"]}.items():
+    for name, options in {
+        "own": ["--jobs", "1"],
+        "one": ["--workers", "1"],
+        "two": ["--workers", "2"],
+        "elsewhere": ["--scheduler", scheduler],
+        "shipped": ["--scheduler", scheduler, "--ship"],
+    }.items():
         subprocess.run([*words, *options, "-o", str(tmp_path / name)], capture_output=True, check=True)
-    assert files_of(tmp_path / "own") == files_of(tmp_path / "dask")
-    assert len(files_of(tmp_path / "own")) == 18
+        assert files_of(tmp_path / "own") == files_of(tmp_path / name), name
+    assert len(files_of(tmp_path / "own")) == 90

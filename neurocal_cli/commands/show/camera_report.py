@@ -160,6 +160,7 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
     """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
     return {
         "camera_name": calibration.camera_name,
+        "image_size": calibration.image_size and list(calibration.image_size),
         "n_points": len(calibration.points),
         "n_rejected": calibration.n_rejected,
         "unit": calibration.unit,

@@ -58,15 +58,15 @@ def drift_lines(drift: Drift) -> list[str]:
     ]
 
 
-def since_lines(drift: Drift | None) -> list[str]:
-    """What new points say of a calibration, in one line; none if they say nothing."""
+def since_line(drift: Drift | None) -> str:
+    """What new points say of an old calibration."""
     if drift is None:
-        return []
-    word = "has changed" if drift.different else "is the same within chance"
-    return [
-        f"calibrated from these points, the camera {word}: {_in_pixels(drift)}; {_chance(drift)} of "
-        "unchanged cameras differ as much"
-    ]
+        return "these points alone do not determine the camera, so they do not tell whether it has changed"
+    word = "no longer holds" if drift.different else "still holds"
+    return (
+        f"the calibration {word}: calibrated from these points, the camera differs by {_in_pixels(drift)}; "
+        f"{_chance(drift)} of unchanged cameras differ as much"
+    )
 
 
 def _in_pixels(drift: Drift) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 from urllib.parse import quote
@@ -13,6 +13,7 @@ import numpy as np
 
 from neurocal_cli.calibration.fleet import fleet_sigmas
 from neurocal_cli.camera.geometry import Array
+from neurocal_cli.commands.batch_rows import Row, drift_text, of_one_kind
 from neurocal_cli.commands.show.html_page import figure, page, section
 from neurocal_cli.commands.show.text import printable
 
@@ -33,8 +34,6 @@ _COLUMNS = (
 )  # fmt: skip
 _CHANGE = (("drift", "drift", ""), ("drift rms", "drift_px", ".2g"), ("its std", "drift_std_px", ".2g"))
 
-Row = Mapping[str, Any]
-
 
 def fleet_page(rows: Sequence[Row], name: str) -> str:
     """Make the page of the rows of a summary; it stands beside the folders of the jobs, to which it links."""
@@ -44,9 +43,9 @@ def fleet_page(rows: Sequence[Row], name: str) -> str:
     judged = ", ".join(f"{verdicts[word]} {word}" for word in _WORDS if verdicts[word])
     parts = [f'<p class="soft">{escape(head)}{f"; cameras: {judged}" if judged else ""}</p>']
     parts += [
-        section("Changed since the earlier batch", _list(rows, "drift", "changed")),
-        section("Far from the fleet", _list(rows, "outlier")),
-        section("Failed", _list(rows, "problem")),
+        section("Changed since the earlier batch", _list(rows, drift_text)),
+        section("Far from the fleet", _list(rows, lambda row: row.get("outlier", ""))),
+        section("Failed", _list({row["name"]: row for row in rows}.values(), lambda row: row["problem"])),
         section("The fleet", *_histograms(rows)),
         section("Cameras", _table(rows)),
     ]
@@ -57,19 +56,10 @@ def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {word}" for word, count in counts.items())
 
 
-def _list(rows: Sequence[Row], key: str, wanted: str = "") -> str:
-    """The rows with a text, or a certain one, under the key."""
-    found = [row for row in rows if (row.get(key) == wanted if wanted else row.get(key))]
-    if key == "problem":
-        found = list({row["name"]: row for row in found}.values())
-    lines = []
-    for row in found[:_MOST_ROWS]:
-        text = row[key] if not wanted else (
-            f"{row['drift_px']:.2g} px rms over the image, std {row['drift_std_px']:.2g} px; "
-            f"{100 * row['drift_share']:.1g} % of unchanged cameras differ as much"
-        )  # fmt: skip
-        lines.append(f"<li>{_link(row)}: {escape(str(text))}</li>")
-    return f"<ul>{''.join(lines)}</ul>" if lines else ""
+def _list(rows: Iterable[Row], text: Callable[[Row], str]) -> str:
+    """The rows that have a text."""
+    lines = [f"<li>{_link(row)}: {escape(said)}</li>" for row in rows if (said := text(row))]
+    return f"<ul>{''.join(lines[:_MOST_ROWS])}</ul>" if lines else ""
 
 
 def _link(row: Row) -> str:
@@ -88,7 +78,7 @@ def _table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows[:_MOST_ROWS]:
         cells = "".join(f"<td>{_cell(row.get(key), form)}" for _, key, form in columns)
-        marked = row.get("outlier") or row.get("drift") == "changed" or row["status"] != "done"
+        marked = row.get("outlier") or drift_text(row) or row["status"] != "done"
         lines.append(f"<tr{' class=mark' if marked else ''}><td>{_link(row)}{cells}")
     style = "<style>tr.mark{background:var(--card)}tr.mark a{color:var(--poor)}a{color:var(--accent)}</style>"
     more = len(rows) - _MOST_ROWS
@@ -104,14 +94,14 @@ def _cell(value: Any, form: str) -> str:
 
 
 def _histograms(rows: Sequence[Row]) -> list[str]:
-    """Histograms of the parameters, for each name of a camera in the jobs."""
-    figures = []
-    for name in dict.fromkeys(row["camera"] for row in rows):
-        alike = [row for row in rows if row["camera"] == name]
+    """Histograms of the parameters, for each kind of camera."""
+    figures, kinds = [], of_one_kind(rows)
+    for (name, size), alike in kinds.items():
+        of = f" of {size} px" if len({size for _, size in kinds}) > 1 else ""
         for key, unit in _DRAWN.items():
             values = np.array([row[key] for row in alike if row.get(key) is not None], dtype=float)
             if len(values) >= _FEWEST and np.ptp(values) > 0:
-                figures.append(_histogram(values, f"{name} {key}".strip(), unit))
+                figures.append(_histogram(values, f"{name} {key}".strip() + of, unit))
     return [f'<div class="figures">{"".join(figures)}</div>'] if figures else []
 
 
