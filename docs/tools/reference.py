@@ -172,8 +172,10 @@ def _formats_page() -> str:
         "Four coefficients that may be those of an ordinary lens or of a fisheye, unless the file or "
         "`--distortion` says which; numbers that may be the distortion and are under no known name; two "
         "values of one thing; two cameras without a pose between them; pickles of Python and objects of "
-        "MATLAB's classes; OCamCalib's polynomial, lensfun, OpenPTV and the raw calibration of an Azure "
-        "Kinect, whose models are others.",
+        "MATLAB's classes; several cameras that differ and have no pose between them; what is in mm of a "
+        "sensor or relative to an image whose size is not told (OpenPTV, Pix4D, RealityCapture, Bundler, "
+        "lensfun). A curve of the radius that is no model here, OCamCalib's polynomial or the FOV model, is "
+        "read as the nearest fisheye, and a warning says by how many pixels it differs.",
     ]
     return "\n\n".join(parts) + "\n"
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @options.choice(
     "--to",
     "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt nerfstudio anipose orb-slam vins basalt "
-    "euroc open3d metashape gyroflow",
+    "euroc open3d metashape gyroflow lensfun",
     "Format to write.",
     without="required",
     to="target",
@@ -72,6 +72,20 @@ if TYPE_CHECKING:
     without="as the file says",
     most=1_000_000,
 )
+@options.number(
+    "--focal-length",
+    "MM",
+    "Focal length in mm, for --to lensfun or gyroflow; if --crop-factor is given as well, that on the lens.",
+    without="from --crop-factor",
+    positive=True,
+)
+@options.number(
+    "--crop-factor",
+    "C",
+    "Diagonal of 35 mm film (43.3 mm) by that of the sensor, for --to lensfun or gyroflow.",
+    without="from --focal-length",
+    positive=True,
+)
 @options.summary
 @options.output("FILE|DIR", "Write to this file; to this folder if the format needs several files.")
 def convert(
@@ -83,6 +97,8 @@ def convert(
     force: bool,
     board: options.BoardOptions,
     image_size: tuple[int, int] | None,
+    focal_length: float | None,
+    crop_factor: float | None,
     as_json: bool,
     output: str,
 ) -> None:
@@ -107,10 +123,14 @@ def convert(
       nerfstudio, anipose, orb-slam, vins, basalt, euroc, open3d,
       metashape, gyroflow
                 the files of these programs
+      lensfun   database of one lens, XML
 
     \b
-    Read as well: OpenVINS, OKVIS, SVO, KITTI, BoofCV, ZED, caliscope,
-    freemocap, instant-ngp, PhotonVision, RealSense, Bouguet's toolbox.
+    Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI,
+    Middlebury, MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV,
+    multical, calib.io, EasyMocap, ZED, OAK, Azure Kinect, caliscope,
+    freemocap, instant-ngp, Polycam, PhotonVision, RealSense, Bouguet's
+    toolbox, and as the nearest fisheye OCamCalib and the FOV model.
 
     If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
     differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs
@@ -132,6 +152,8 @@ def convert(
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
       neurocal convert camera.yaml --to dlt -o dlt.csv
+      neurocal convert camera.yaml --to lensfun --force --focal-length 24 \\
+          -o lens.xml
       echo '{"K": [[280, 0, 319], [0, 280, 239], [0, 0, 1]],
           "D": [0.09, 0.005, -0.005, -0.002]}' > front.json
       neurocal convert front.json --distortion fisheye --to neurocal \\
@@ -159,6 +181,11 @@ def convert(
     with repeatable_stdin() if "-" in files else nullcontext():
         found = _read(files, target_board, board.unit, image_size, distortion, what)
     if isinstance(found, CameraSet):
+        if target == "lensfun" and focal_length is crop_factor is None:
+            raise UsageError("--to lensfun needs --focal-length, --crop-factor, or both")
+        if target not in ("lensfun", "gyroflow"):
+            options.note_unused(f"with --to {target}", "focal_length", "crop_factor")
+        found = replace(found, focal_mm=focal_length, crop_factor=crop_factor)
         summary = _write_cameras(found, target, model, force, output)
     elif model is None:
         options.note_unused("on points", "force")

@@ -52,16 +52,23 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return tree
 
 
-def _parse_xml(text: str, source: str) -> Any:
-    if "<!" in text.replace("<!--", ""):  # entities can expand to gigabytes; cameras need none
+def xml_root(text: str, source: str) -> ElementTree.Element:
+    """The root of an XML file without entities, which can expand to gigabytes."""
+    if "<!" in text.replace("<!--", ""):
         raise FormatError("has a DOCTYPE, ENTITY or CDATA section, which is not read; remove it", source)
     try:
-        root = ElementTree.fromstring(text.encode("utf-8"))
+        return ElementTree.fromstring(text.encode("utf-8"))
     except ElementTree.ParseError as error:
         raise FormatError(f"is not valid XML ({error.msg}); correct it", source, error.position[0]) from error
     except (ValueError, LookupError) as error:  # the stated encoding is unknown or not UTF-8
         raise FormatError("is not XML in UTF-8; save it as UTF-8", source) from error
-    if root.tag == "calibration" and root.find("projection") is not None:  # Agisoft's
+
+
+def _parse_xml(text: str, source: str) -> Any:
+    root = xml_root(text, source)
+    if root.tag == "calibration" and (
+        root.find("projection") is not None or root.find("f") is not None
+    ):  # Agisoft's
         return {root.tag: _element_value(root, source, DEEPEST)}
     if root.tag != "opencv_storage":
         raise FormatError(

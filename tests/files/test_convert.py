@@ -34,7 +34,7 @@ from neurocal_cli.files.exchange.camera_set import CameraSet
 from neurocal_cli.files.exchange.reading import FORMATS, read_cameras, read_intrinsics
 
 SIZE = (640, 480)
-READ = {name: target for name, target in FORMATS.items() if name != "dlt"}  # a DLT is written only
+READ = {name: target for name, target in FORMATS.items() if name not in ("dlt", "lensfun")}  # written only
 RIGS = [name for name, target in READ.items() if target.most_cameras > 1]
 HOLDS = {name: target.models for name, target in READ.items()}
 POSES = {

@@ -73,7 +73,7 @@ def numbers(cameras: CameraSet) -> Array:
     return np.nan_to_num(np.concatenate([*pixels, *poses]), nan=-1e9)
 
 
-READ = [name for name in FORMATS if name != "dlt"]
+READ = [name for name in FORMATS if name not in ("dlt", "lensfun")]
 TEXTS = [name for name in READ if name not in ("npz", "matlab", "neurocal")]
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:[eE][-+]?\d+)?(?![\w.])")
 

@@ -456,16 +456,14 @@ FAULTS = {
     f'{{"K": {K}, "D": {D}, "model": "Inverse Brown Conrady"}}': "its distortion model is not known here",
     f'{{"K": {K}, "D": {D}, "lens_model": "FOV"}}': "its distortion model is not known here",
     f'{{"K1": {K}, "D1": {D}, "K2": {K}, "D2": {D}}}': "not their relative pose, R and T",
-    f'{{"a": {{"K": {K}}}, "b": {{"K": {K}}}}}': "holds several cameras (a, b)",
+    f'{{"a": {{"K": {K}}}, "b": {{"K": {K}, "D": {D}}}}}': "holds several cameras (a, b)",
     '{"fl_x": 800, "cx": 1, "cy": 1, "w": 2, "h": 2, "k4": 0.1}': "the coefficient k4 is not known",
-    "#polynomial coefficients for the DIRECT mapping function\n\n5 -1 0 1 2 3\n": "is a camera of OCamCalib",
-    '{"projection_type": "brown", "width": 4000, "height": 3000, "focal_x": 0.85, "focal_y": 0.85, '
-    '"c_x": 0.01, "c_y": 0.02, "k1": 0.1}': "the focal length 0.85 is not in pixels",
     "camera calibration of tuesday\nfocal 800 801\ncentre 320 240\n": "is not a camera file",
     '<calibration created="x"><cameras/></calibration>': "is <calibration> and not OpenCV's",
     '{"CalibrationInformation": {"Cameras": []}}': "is the raw calibration of an Azure Kinect",
     "model_type: SCARAMUZZA\nprojection_parameters: {a: 1}\n": "the model 'SCARAMUZZA' of VINS is not known",
-    "<calibration><projection>fisheye</projection></calibration>": "the projection 'fisheye' of Metashape",
+    "<calibration><projection>spherical</projection><width>9</width><height>9</height><f>9</f>"
+    "</calibration>": "the model 'spherical' of Metashape is not known",
     "[LEFT_CAM_HD]\nfx=1\n[LEFT_CAM_VGA]\nfx=1\n": "convert one with --image-size: 1280 720, 672 376",
 }
 

@@ -74,8 +74,14 @@ def adapt_cameras(
         seen = [part.points.pixels for part in _parts(origin)]
     for camera, points in zip(cameras.cameras, seen, strict=True):
         new, near, loss = _adapted(camera, target, model, force, points)
-        adapted.append(new)
+        squared, moves = _squared(new) if target.square else (new, 0.0)
+        adapted.append(squared)
         losses += [f"{camera.name}: {loss}"] if loss else []
+        if moves > _NO_SKEW:
+            losses.append(
+                f"{camera.name}: {target.program} has square pixels, and those of the camera are not; the "
+                f"mean focal length moves pixels by {moves:.3g} px at most"
+            )
         moved.append(None if near is None else near.over_image)
     changed = any(new is not old for new, old in zip(adapted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
@@ -152,6 +158,16 @@ def _straightened(camera: Camera) -> Camera:
     """Set the angle of the axes to exactly pi/2."""
     a, _, b, u0, v0 = camera.entries
     return replace(camera, intrinsics=Intrinsics(a, b, u0, v0))
+
+
+def _squared(camera: Camera) -> tuple[Camera, float]:
+    """The camera with one focal length for both axes, and how many px this moves the image's corners."""
+    a, _, b, u0, v0 = camera.entries
+    f = float(np.sqrt(a * b))
+    width, height = camera.image_size or (2 * u0, 2 * v0)
+    corner = np.array([max(u0, width - u0), max(v0, height - v0)])
+    moved = float(np.hypot(*(corner * (f / np.array([a, b]) - 1))))
+    return replace(camera, intrinsics=Intrinsics(f, f, u0, v0)), moved
 
 
 def _pixels(near: NearestCamera) -> str:

@@ -20,21 +20,28 @@ COEFFICIENTS = (
     "distcoffs", "distortioncoefficents", "distortionvalues", "opencvdistortion", "d1",
 )  # fmt: skip
 ENTRIES = (
-    ("fx", "flx", "focalx", "fu"),
-    ("fy", "fly", "focaly", "fv"),
-    ("cx", "ppx", "u0", "pu"),
-    ("cy", "ppy", "v0", "pv"),
+    ("fx", "flx", "focalx", "fu", "focallengthx"),
+    ("fy", "fly", "focaly", "fv", "focallengthy"),
+    ("cx", "ppx", "u0", "pu", "principalpointx"),
+    ("cy", "ppy", "v0", "pv", "principalpointy"),
 )
+FOCAL = ("focallength", "focallengths", "focal", "focalpx", "focallengthpx")  # of both axes, or one for both
+CENTRE = ("principalpoint", "principlepoint", "opticalcenter", "princpt", "imagecenter")
 RADIAL = ("radialdistortion", "radial", "radialcoefficients", "radialdistortioncoefficients", "radialcoeffs")
 TANGENTIAL = (
     "tangentialdistortion", "tangential", "tangentialcoefficients", "tangentialdistortioncoefficients",
     "tangentialcoeffs",
 )  # fmt: skip
-WIDTH = ("imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex")
-HEIGHT = ("imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey")
+WIDTH = (
+    "imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex", "resx",
+)  # fmt: skip
+HEIGHT = (
+    "imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey", "resy",
+)  # fmt: skip
 SIZE = (
     "imagesize", "imgsize", "resolution", "size", "dim", "dims", "imageresolution", "imagedimensions",
     "dimensions", "framesize", "calibdimension", "cameraresolution", "imsize", "calibrationresolution",
+    "capturedimagesize",
 )  # fmt: skip
 SHAPE = ("imageshape", "imgshape", "shape")  # NumPy's: height and width
 NAME = ("cameraname",)

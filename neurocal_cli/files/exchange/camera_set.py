@@ -23,6 +23,7 @@ from neurocal_cli.errors import InputError
 if TYPE_CHECKING:
     from neurocal_cli.files.exchange.document import Document
 
+_FILM = float(np.hypot(36.0, 24.0))  # diagonal [mm]
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 
 
@@ -38,6 +39,8 @@ class CameraSet:
     program: str = "OpenCV"  # that wrote the file, for messages
     # Of a ROS file, as it is: rotation (3, 3) into the rectified frame, and projection (3, 4) from there.
     rectified: tuple[Array, Array] | None = None
+    focal_mm: float | None = None  # focal length, if the caller says it
+    crop_factor: float | None = None  # diagonal of a 35 mm film by that of the sensor, likewise
 
     def __post_init__(self) -> None:
         if not self.cameras:
@@ -57,6 +60,24 @@ class CameraSet:
     def has_lengths(self) -> bool:
         """Whether there is any translation, so that the unit matters."""
         return bool(self.relative or self.poses)
+
+    def lens(self) -> tuple[float | None, float | None, float | None]:
+        """Focal length [mm] and crop factor of the first camera, each from the other, and its true length.
+
+        The last is known if both were given: the first is then that which is engraved on the lens.
+        """
+        camera = self.cameras[0]
+        film_px = (
+            _FILM
+            * float(np.sqrt(camera.entries[0] * camera.entries[2]))
+            / np.hypot(*(camera.image_size or (np.nan, np.nan)))
+        )  # focal length [mm] times the crop factor
+        focal, crop = self.focal_mm, self.crop_factor
+        if focal is None and crop is not None:
+            return film_px / crop, crop, None
+        if crop is None and focal is not None:
+            return focal, film_px / focal, None
+        return focal, crop, None if crop is None else film_px / crop
 
     def in_metres(self) -> CameraSet:
         """Convert the translations to metres; raise an InputError if the unit is unknown or not a length."""
@@ -101,6 +122,7 @@ class Format:
     metres: bool = False  # whether lengths are in metres
     needs_size: bool = False  # whether the image size must be known
     rectified: bool = False  # whether it contains the rectification of a camera
+    square: bool = False  # whether its pixels are square
     first_pixel: float = 0.0  # coordinate of the centre of the first pixel
     rig: str = ""  # how the poses of several cameras are stated, for the documentation
 

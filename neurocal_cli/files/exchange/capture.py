@@ -1,4 +1,4 @@
-"""Formats of rigs for motion capture and of stereo cameras: anipose, caliscope, BoofCV and ZED."""
+"""Formats of calibration programs and motion capture: anipose, BoofCV, multical, calib.io and EasyMocap."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, find, numbers
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
     Format,
+    after,
     from_vector,
     inverse,
     mounted,
     to_vector,
 )
 from neurocal_cli.files.exchange.document import Document
-from neurocal_cli.files.exchange.tree_texts import (
-    EIGHT,
-    FIVE,
-    toml_text,
-    under,
-)
+from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.tree_texts import toml_text, under
 from neurocal_cli.files.tree_fields import Field
 
 # anipose, freemocap and caliscope: TOML with a section for each camera, posed from the world to the camera.
@@ -155,41 +154,104 @@ BOOFCV = Format(
     rig="`rightToLeft`",
 )
 
-# Stereolabs' ZED: sections for each camera and resolution; rows of both images agree after stereoRectify with
-# R of the vector (RX, CV, RZ) and T = -(Baseline, TY, TZ), as in Stereolabs' sample for OpenCV.
-_ZED_SIZES = {
-    "2K": (2208, 1242), "FHD": (1920, 1080), "HD": (1280, 720), "VGA": (672, 376),
-    "FHD1200": (1920, 1200), "SVGA": (960, 600), "QHDPLUS": (3200, 1800), "4K": (3840, 2160),
-}  # fmt: skip
-_ZED = CameraKeys(
-    "ZED", ("fx", "fy", "cx", "cy"), (Lens(("",), "plumb_bob", FIVE), Lens(("",), "rational", EIGHT))
+# multical: the pose called a_to_b maps the frame of b to that of a.
+_MULTICAL = CameraKeys(
+    "multical",
+    ("K:matrix",),
+    (Lens(("standard",), "tilted", ("dist",)), Lens(("fisheye",), "fisheye", ("dist",))),
+    model="model",
+    size=("image_size",),
 )
 
 
-def _read_zed(document: Document) -> CameraSet:
-    root = document.root
-    modes = [key.removeprefix("LEFT_CAM_") for key in document.tree if key.startswith("LEFT_CAM_")]
-    fitting = [mode for mode in modes if document.size in (None, _ZED_SIZES.get(mode))]
-    if len(fitting) != 1:
-        sizes = ", ".join("{} {}".format(*_ZED_SIZES[mode]) for mode in modes if mode in _ZED_SIZES)
-        raise InputError(f"holds cameras of several image sizes; convert one with --image-size: {sizes}")
-    (mode,) = fitting
-    cameras = [
-        replace(_ZED.camera(root[f"{side}_CAM_{mode}"], side.lower()), image_size=_ZED_SIZES.get(mode))
-        for side in ("LEFT", "RIGHT")
-    ]
-    stereo = root["STEREO"]
-    r = [stereo.get(f"{key}_{mode}", 0.0).number() for key in ("RX", "CV", "RZ")]
-    t = [stereo["Baseline"].number(), *(stereo.get(key, 0.0).number() for key in ("TY", "TZ"))]
-    pose = Pose(from_vector(np.array(r)), -np.array(t))
-    return mounted(cameras, [Pose(np.eye(3), np.zeros(3)), pose], "ZED", "mm")
+def _read_multical(document: Document) -> CameraSet:
+    cameras = {
+        name: _MULTICAL.camera(part, name) for name, part in document.root["cameras"].entries().items()
+    }
+    poses: dict[str, Pose] = {}
+    stated = document.root["camera_poses"].entries()
+    for _ in stated:
+        for name, entry in stated.items():
+            own, _, other = name.partition("_to_")
+            pose = Pose(entry["R"].array(3, 3), numbers(entry["T"], 3))
+            if not other or other in poses:
+                poses[own] = after(pose, poses[other]) if other else pose
+    return mounted(list(cameras.values()), [poses.get(name) for name in cameras], "multical", "m")
 
 
-ZED = Format(
-    "ZED",
-    ("none", "plumb_bob", "rational"),
-    matches=lambda document: any(str(key).startswith("LEFT_CAM_") for key in document.tree),
-    read=_read_zed,
-    files="SN*.conf of Stereolabs",
-    rig="R of the vector (RX, CV, RZ), T = -(Baseline, TY, TZ)",
+MULTICAL = Format(
+    "multical",
+    _MULTICAL.models,
+    matches=lambda document: {"cameras", "camera_poses"} <= set(document.tree),
+    read=_read_multical,
+    files="calibration.json",
+    most_cameras=99,
+    rig="`camera_poses`, `a_to_b` from b to a",
+)
+
+# Calibrator of calib.io.
+_CALIB_IO = CameraKeys(
+    "calib.io",
+    ("f/val", "fy", "cx/val", "cy/val"),
+    (Lens(("libCalib::CameraModelOpenCV",), "tilted", tuple(f"{name}/val" for name in MODELS["tilted"])),),
+    model="model",
+    size=("imageSize/width", "imageSize/height"),
+)
+
+
+def _read_calib_io(document: Document) -> CameraSet:
+    cameras = []
+    for k, one in enumerate(document.root["Calibration"]["cameras"].items()):
+        model = one["model"]
+        data = model["ptr_wrapper"]["data"]
+        parameters = data["parameters"]
+        fy = parameters["f"]["val"].number() * parameters["ar"]["val"].number()
+        size = data["CameraModelCRT"]["CameraModelBase"]["imageSize"].value
+        word = model.get("polymorphic_name", "libCalib::CameraModelOpenCV").text()
+        tree = {**parameters.value, "fy": fy, "imageSize": size, "model": word}
+        cameras.append(_CALIB_IO.camera(Field(tree, data.source, data.path), f"cam{k}"))
+    return CameraSet(tuple(cameras), program="calib.io")
+
+
+CALIB_IO = Format(
+    "calib.io",
+    _CALIB_IO.models,
+    matches=lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
+    read=_read_calib_io,
+    files="Calibrator's JSON of one camera",
+)
+
+# EasyMocap: intri.yml with K and dist of each name, extri.yml with the poses, both from the world.
+
+
+def easymocap_names(document: Document) -> list[str]:
+    """Names of the cameras of a file of EasyMocap; none if it is another."""
+    names = document.tree.get("names")
+    found = [str(name) for name in names] if isinstance(names, list) else []
+    return found if found and {f"K_{found[0]}", f"T_{found[0]}"} & set(document.tree) else []
+
+
+def _read_easymocap(document: Document) -> CameraSet:
+    names, root = easymocap_names(document), document.root
+    if f"K_{names[0]}" not in root or (len(names) > 1 and f"T_{names[0]}" not in root):
+        raise InputError("is one of the two files of EasyMocap; give intri.yml and extri.yml")
+    cameras, poses = [], []
+    for name in names:
+        part = {key: root[f"{word}_{name}"].value for key, word in (("K", "K"), ("D", "dist"))}
+        keys = LooseKeys(Field(part, root.source), document.distortion or "plumb_bob")
+        cameras.append(keys.camera(name=name))
+        if f"T_{name}" in root:
+            R = matrix_data(root[f"Rot_{name}"], 9).reshape(3, 3)
+            poses.append(Pose(R, matrix_data(root[f"T_{name}"], 3)))
+    return mounted(cameras, poses or [None], "EasyMocap", "m", "world")
+
+
+EASYMOCAP = Format(
+    "EasyMocap",
+    ("none", "plumb_bob"),
+    matches=lambda document: bool(easymocap_names(document)),
+    read=_read_easymocap,
+    files="intri.yml and extri.yml",
+    most_cameras=99,
+    rig="`Rot_`, `T_` from the world to each camera",
 )

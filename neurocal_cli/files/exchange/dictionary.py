@@ -22,8 +22,9 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data
+from neurocal_cli.files.exchange.camera_names import plain
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
@@ -62,7 +63,7 @@ def from_tree(root: Field, document: Document) -> CameraSet:
     """Read one camera or two from a dictionary, or those in it that have poses of their own."""
     if (rig := _posed(root, document)) is not None:
         return rig
-    root = _within(root)
+    root = _within(root, document.notes)
     unit = root.read("unit", Field.text)
     keys = LooseKeys(root, document.distortion, document.notes)
     sides = _sides(keys)
@@ -145,43 +146,72 @@ def _posed(root: Field, document: Document) -> CameraSet | None:
     return mounted(cameras, poses, "OpenCV", root.get("unit").value if isinstance(root.value, dict) else None)
 
 
-def _within(root: Field) -> Field:
+def _within(root: Field, notes: list[str]) -> Field:
     """The mapping that holds the camera: the root, or the only one in it that does, with the other keys."""
+    others: dict[str, Any] = {}
     for _ in range(_DEEPEST):
-        if isinstance(root.value, list) and len(root.value) == 1:
-            root = Field(root.value[0], root.source)
-        if not isinstance(root.value, dict):
+        value = root.value
+        if isinstance(value, dict):
+            root = Field({**others, **_sides_apart(value)}, root.source)
+            keys = LooseKeys(root)
+            if keys.has_camera() or _sides(keys) is not None or any(map(keys.has_camera, "12lr")):
+                break
+        elif not isinstance(value, list):
             raise InputError(UNKNOWN)
-        keys = LooseKeys(root)
-        if keys.has_camera() or _sides(keys) is not None or any(keys.has_camera(side) for side in "12lr"):
+        named = value.items() if isinstance(value, dict) else enumerate(value)
+        parts = {str(name): part for name, part in named if _holds_camera(part)}
+        if not parts:
             break
-        inner = [key for key, value in root.value.items() if isinstance(value, dict) and _holds_camera(value)]
-        listed = [key for key, value in root.value.items() if isinstance(value, list) and len(value) == 1]
-        listed = [
-            key
-            for key in listed
-            if isinstance(root.value[key][0], dict) and _holds_camera(root.value[key][0])
-        ]
-        if len(inner) > 1:
-            names = ", ".join(str(key)[:20] for key in inner)
-            raise InputError(
-                f"holds several cameras ({names}), and their relative poses in no form that is known; save "
-                "the keys of one camera as a file"
-            )
-        if not inner and not listed:
-            break
-        key = (*inner, *listed)[0]
-        below = root.value[key][0] if listed and not inner else root.value[key]
-        others = {name: value for name, value in root.value.items() if name != key and name not in below}
-        root = Field({**others, **below}, root.source)
+        name, part = next(iter(parts.items()))
+        if len(parts) > 1:
+            cameras = [_numbers_of(part) for part in parts.values()]
+            if None in cameras or any(camera != cameras[0] for camera in cameras):
+                names = ", ".join(key[:20] for key in list(parts)[:9])
+                raise InputError(
+                    f"holds several cameras ({names}), and their relative poses in no form that is known; "
+                    "save the keys of one camera as a file"
+                )
+            notes.append(f"{root.source}: holds the same camera {len(parts)} times")
+        if isinstance(value, dict):
+            others |= {key: entry for key, entry in value.items() if str(key) != name}
+        root = Field(part, root.source)
+    if not isinstance(root.value, dict):
+        raise InputError(UNKNOWN)
     return root
 
 
-def _holds_camera(tree: dict[str, Any], depth: int = _DEEPEST) -> bool:
+def _sides_apart(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with the keys of the cameras of two sides, each in a mapping, beside its others."""
+    names = {plain(str(key)): key for key, part in tree.items()}
+    if names.keys().isdisjoint(_TRANSLATIONS):
+        return tree
+    names = {name: key for name, key in names.items() if _holds_camera(tree[key], 0)}
+    for pair in _SIDES:
+        if set(pair) <= set(names):
+            apart = {f"{key}_{side}": value for side in pair for key, value in tree[names[side]].items()}
+            return {**{key: value for key, value in tree.items() if key not in names.values()}, **apart}
+    return tree
+
+
+def _holds_camera(tree: Any, depth: int = _DEEPEST) -> bool:
+    if isinstance(tree, list):
+        return depth > 0 and any(_holds_camera(part, depth - 1) for part in tree if isinstance(part, dict))
+    if not isinstance(tree, dict):
+        return False
     keys = LooseKeys(Field(tree, ""))
     if keys.has_camera() or _sides(keys) is not None:
         return True
-    return depth > 0 and any(isinstance(v, dict) and _holds_camera(v, depth - 1) for v in tree.values())
+    return depth > 0 and any(_holds_camera(part, depth - 1) for part in tree.values())
+
+
+def _numbers_of(tree: Any) -> list[Any] | None:
+    """All that a camera says; None if it cannot be read."""
+    try:
+        camera = LooseKeys(_within(Field(tree, ""), [])).camera()
+    except NeurocalError:
+        return None
+    lens = camera.distortion
+    return [*camera.entries, lens.model, *lens.coefficients.tolist(), camera.image_size]
 
 
 def _sides(keys: LooseKeys) -> tuple[str, str] | None:

@@ -6,6 +6,7 @@ The tree is that of YAML, JSON (also with comments), OpenCV's and Agisoft's XML,
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import re
@@ -32,7 +33,14 @@ _DAMAGED = (
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
-_ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;)", re.MULTILINE)
+_ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
+# A matrix as NumPy prints it, without commas.
+_PRINTED = re.compile(r"\[\[[-+.\deE\s\[\]]+\]\]")
+
+
+def _with_commas(printed: re.Match[str]) -> str:
+    rows = re.findall(r"\[\[?([^\[\]]+)\]", printed[0])
+    return f" [{', '.join('[' + ', '.join(row.split()) + ']' for row in rows)}]"
 
 
 class Document:
@@ -62,6 +70,14 @@ class Document:
         self.notes, self.warnings = notes, warnings
         self.distortion, self.size = distortion, size
 
+    def joined(self, other: Document) -> Document:
+        """The document with the keys of another as well."""
+        both = copy.copy(self)
+        both.source = f"{self.source}, {other.source}"
+        both.__dict__["tree"] = {**self.tree, **other.tree}
+        both.__dict__["root"] = Field(both.tree, both.source)
+        return both
+
     @cached_property
     def is_text(self) -> bool:
         """Whether the bytes may be text."""
@@ -85,6 +101,8 @@ class Document:
         try:
             root = parse_tree(text, self.source)
         except FormatError:
+            if (plain := _PRINTED.sub(_with_commas, text)) != text:
+                return parse_tree(plain, self.source)
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             alike = sum(":" in line or line[0] in "-#{}[]<," for line in lines)
             if lines and not lines[0].startswith(("%YAML", "---")) and 2 * alike < len(lines):

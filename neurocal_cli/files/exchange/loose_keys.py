@@ -24,9 +24,11 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
 from neurocal_cli.files.exchange.camera_names import (
     ALIKE,
+    CENTRE,
     COEFFICIENTS,
     ENTRIES,
     FISHEYE,
+    FOCAL,
     HARMLESS,
     HEIGHT,
     KIND,
@@ -49,6 +51,9 @@ from neurocal_cli.files.exchange.camera_names import (
 from neurocal_cli.files.failures import one_line, value_failures
 from neurocal_cli.files.tree_fields import Field, is_number
 
+# A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
+_LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
+
 
 def _is_numbers(value: Any) -> bool:
     if isinstance(value, dict):
@@ -70,12 +75,20 @@ def _is_matrix(value: Any) -> bool:
     return not isinstance(value, (int, float, str)) and _is_numbers(value) and _count(value) == 9
 
 
+def _is_four(value: Any) -> bool:
+    """Whether this is a list of fx, fy, cx, cy."""
+    return isinstance(value, list) and len(value) == 4 and all(is_number(str(entry)) for entry in value)
+
+
 def _has_entries(value: Any) -> bool:
-    """Whether a mapping has fx, fy, cx and cy under one of their names."""
+    """Whether a mapping has fx, fy, cx and cy under one of their names, or the pairs of them."""
     if not isinstance(value, dict):
         return False
     names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
-    return all(not names.isdisjoint(entry) for entry in ENTRIES)
+    pairs = {plain(str(key)) for key, entry in value.items() if _is_numbers(entry)}
+    return all(not names.isdisjoint(entry) for entry in ENTRIES) or not (
+        pairs.isdisjoint(FOCAL) or pairs.isdisjoint(CENTRE)
+    )
 
 
 class LooseKeys:
@@ -117,7 +130,8 @@ class LooseKeys:
     def has_camera(self, side: str = "") -> bool:
         """Whether there is a camera matrix, or its entries, under their usual names."""
         matrix = any(
-            _is_matrix(self.root.value[key]) or (key != "k" and _has_entries(self.root.value[key]))
+            _is_matrix(self.root.value[key])
+            or (len(key) > 1 and (_has_entries(self.root.value[key]) or _is_four(self.root.value[key])))
             for name in MATRIX
             for form in ((name + side, side + name) if side else (name,))
             for key in self.names.get(form, [])
@@ -191,7 +205,9 @@ class LooseKeys:
             field = self.root
         if field is None:
             field = self.find(
-                [n for n in MATRIX if len(n) > 1 or not side], side, lambda value: value is not None
+                [n for n in MATRIX if len(n) > 1 or not side],
+                side,
+                lambda v: not isinstance(v, dict) or "data" in v,
             )
         if field is None:
             keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
@@ -200,24 +216,18 @@ class LooseKeys:
                 f"{f' (its keys are {one_line(keys)})' if keys else ''}"
             )
         if isinstance(field.value, dict) and _has_entries(field.value):
-            entries = self if field is self.root else LooseKeys(field)
-            values = []
-            for names in ENTRIES:
-                entry = entries.find(names, "", lambda value: not isinstance(value, (dict, list)))
-                assert entry is not None  # `_has_entries`
-                values.append(entry.number())
-            skew = entries.find(("skew", "s"), "", _is_numbers)
-            fx, fy, cx, cy = values
-            K = np.array([[fx, 0.0 if skew is None else skew.number(), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        elif (
-            isinstance(field.value, list)
-            and len(field.value) == 4
-            and plain(field.path).endswith("intrinsics")
-        ):
-            fx, fy, cx, cy = field.array(4)
-            K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            K = (self if field is self.root else LooseKeys(field))._of_entries()
+        elif isinstance(field.value, list) and len(field.value) == 4:
+            K = _matrix(*field.array(4).tolist())
         else:
             K = matrix_data(field, 9).reshape(3, 3)
+            if not K[:2, 2].any() and K[2, :2].all():
+                if isinstance(field.value, list) and isinstance(field.value[0], list):
+                    raise InputError(
+                        f"{field.path} is transposed, as MATLAB writes it; write its columns as rows, and of "
+                        "MATLAB's, whose first pixel is 1, subtract 1 from the principal point"
+                    )
+                K = K.T  # Apple's matrices are by columns
         if not K.any():
             raise InputError(f"{field.path} is 0: the camera is not calibrated; calibrate it first")
         if K[2, 2] != 1:
@@ -228,6 +238,24 @@ class LooseKeys:
             return Intrinsics.from_matrix(K)
         except InputError as error:
             raise InputError(f"{field.path}: {error}; correct it") from error
+
+    def _of_entries(self) -> Array:
+        """Camera matrix of fx, fy, cx, cy and the skew, or of the focal length and the principal point."""
+        found = [self.find(names, "", lambda v: not isinstance(v, (dict, list))) for names in ENTRIES]
+        four = [entry.number() for entry in found if entry is not None]
+        if len(four) < 4:
+            focal, centre = (self.find(names, "", _is_numbers) for names in (FOCAL, CENTRE))
+            assert focal is not None
+            assert centre is not None  # `_has_entries`
+            four = [*(2 * _flat(focal.value))[:2], *_flat(centre.value)]
+            size = self.image_size()
+            if len(four) != 4 or four[0] < (_LEAST_FOCAL if size is None else _LEAST_SHARE * size[0]):
+                raise InputError(
+                    f"{focal.path} is not told to be in pixels; give a file with fx, fy, cx and cy in pixels"
+                )
+        skew = self.find(("skew", "s"), "", _is_numbers)
+        fx, fy, cx, cy = four
+        return _matrix(fx, fy, cx, cy, 0.0 if skew is None else skew.number())
 
     def _stated_model(self, side: str) -> str | None:
         """ROS's name of the distortion model that the file states; None if it states none."""
@@ -328,6 +356,10 @@ class LooseKeys:
             return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
         full = [values.get(name, 0.0) for name in names]
         return np.array(full if any(full[5:]) else full[:5]), True
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
+    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _flat(value: Any) -> list[float]:

@@ -28,6 +28,7 @@ from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vecto
 from neurocal_cli.files.exchange.document import Document, assignments
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
+_INTRINSICS = {"FocalLength", "PrincipalPoint", "RadialDistortion"}  # of cameraIntrinsics
 STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 _HEADER = 128  # bytes
@@ -46,7 +47,7 @@ def matches(document: Document) -> object:
     return (
         document.data.startswith(b"MATLAB 5.0 MAT-file")
         or re.search(r"^\s*fc(_left)?\s*=\s*\[", document.text, re.MULTILINE)
-        or (isinstance(struct, dict) and "IntrinsicMatrix" in struct)
+        or (isinstance(struct, dict) and ("IntrinsicMatrix" in struct or set(struct) >= _INTRINSICS))
     )
 
 
@@ -73,7 +74,7 @@ def read(document: Document) -> CameraSet:
         parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
         cameras = _camera(parts[0]), _camera(parts[1])
         return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
-    if "IntrinsicMatrix" in tree or "K" in tree:
+    if "IntrinsicMatrix" in tree or "K" in tree or set(tree) >= _INTRINSICS:
         return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
     if any(re.fullmatch(r"x_\d+", name) for name in tree):
         raise InputError(
@@ -89,8 +90,12 @@ def read(document: Document) -> CameraSet:
 def _camera(tree: dict[str, Any]) -> Camera:
     if "IntrinsicMatrix" in tree:
         K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
-    else:
+    elif "K" in tree:
         K = _numbers(tree, "K", 9).reshape(3, 3)
+    else:
+        (fx, fy), (cx, cy) = _numbers(tree, "FocalLength", 2), _numbers(tree, "PrincipalPoint", 2)
+        skew = float(_numbers(tree, "Skew", 1)[0]) if "Skew" in tree else 0.0
+        K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
     radial = _numbers(tree, "RadialDistortion")
     tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)

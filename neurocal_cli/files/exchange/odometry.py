@@ -1,4 +1,4 @@
-"""Formats of visual odometry and of its data sets: ORB-SLAM, VINS, EuRoC, Basalt, OKVIS, SVO and KITTI.
+"""Formats of visual odometry and mapping: ORB-SLAM, OpenVSLAM, VINS, EuRoC, Basalt, OKVIS, SVO and DSO.
 
 Where a program states the pose of each camera in a body, the poses between the cameras follow; the pose of a
 single camera becomes its view ``body``. The centre of the first pixel is (0, 0).
@@ -6,7 +6,8 @@ single camera becomes its view ``body``. The centre of the first pixel is (0, 0)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,7 @@ from neurocal_cli.files.exchange.camera_set import (
     to_quaternion,
 )
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.radial_curves import fov
 from neurocal_cli.files.exchange.tree_texts import (
     EIGHT,
     FIVE,
@@ -39,17 +41,17 @@ from neurocal_cli.files.tree_fields import Field
 # ORB-SLAM2 and 3.
 
 
-def _orb(camera: str) -> CameraKeys:
+def _orb(camera: str, model: str = "type", sides: tuple[str, str] = ("width", "height")) -> CameraKeys:
     return CameraKeys(
-        "ORB-SLAM",
+        "ORB-SLAM" if model == "type" else "OpenVSLAM",
         under(camera, "fx", "fy", "cx", "cy"),
         (
-            Lens(("PinHole", "Rectified"), "k1k2p1p2", under(camera, *RADTAN)),
-            Lens(("PinHole", "Rectified"), "plumb_bob", under(camera, *FIVE)),
-            Lens(("KannalaBrandt8",), "fisheye", under(camera, *K4)),
+            Lens(("PinHole", "Rectified", "perspective"), "k1k2p1p2", under(camera, *RADTAN)),
+            Lens(("PinHole", "Rectified", "perspective"), "plumb_bob", under(camera, *FIVE)),
+            Lens(("KannalaBrandt8", "fisheye"), "fisheye", under(camera, *K4)),
         ),
-        model="Camera.type",
-        size=("Camera.width", "Camera.height"),
+        model=f"{re.sub(r'[12]', '', camera)}{model}",
+        size=under(re.sub(r"[12]", "", camera), *sides),
     )
 
 
@@ -60,6 +62,10 @@ def _read_orb(document: Document) -> CameraSet:
             f"{document.source}: Camera.fx to Camera.cy are of the rectified images; LEFT.K, RIGHT.K and the "
             "rest of the original cameras are not read"
         )
+    for start in ("Camera.", "Camera/"):  # OpenVSLAM and stella_vslam
+        if find(root, f"{start}model") is not None:
+            keys = _orb(start, "model", ("cols", "rows"))
+            return CameraSet((keys.camera(root),), program=keys.program)
     first = _orb("Camera1." if "Camera1.fx" in root else "Camera.").camera(root)
     if "Camera2.fx" not in root:
         return CameraSet((first,), program="ORB-SLAM")
@@ -69,7 +75,10 @@ def _read_orb(document: Document) -> CameraSet:
 
 
 def _is_orb(document: Document) -> bool:
-    return "Camera.fx" in document.tree or "Camera1.fx" in document.tree
+    tree = document.tree
+    below = tree.get("Camera")
+    nested = isinstance(below, dict) and {"model", "setup"} <= set(below)
+    return nested or not {"Camera.fx", "Camera1.fx", "Camera.model"}.isdisjoint(tree)
 
 
 ORB_SLAM = Format(
@@ -78,7 +87,7 @@ ORB_SLAM = Format(
     single(_orb("Camera."), lambda tree: yaml_text(tree, "%YAML:1.0\n---\n")),
     _is_orb,
     _read_orb,
-    files="settings of ORB-SLAM2 and 3, YAML",
+    files="settings of ORB-SLAM2 and 3, OpenVSLAM, stella_vslam: YAML",
     most_cameras=1,
     rig="`Stereo.T_c1_c2` from the right to the left camera (read)",
 )
@@ -279,52 +288,72 @@ SVO = Format(
     rig="`T_B_C` from each camera to the body",
 )
 
-# KITTI: cameras of the recording, each posed relative to the first, and rectified ones of the odometry.
-_KITTI = CameraKeys("KITTI", ("K:matrix",), (Lens(("",), "plumb_bob", ("D",)),), size=("S",))
+# rpg_vikit's cameras, also of FAST-LIVO, with d0 to d4 in OpenCV's order.
+_VIKIT = CameraKeys(
+    "vikit",
+    under("cam_", "fx", "fy", "cx", "cy"),
+    (
+        Lens(("Pinhole",), "plumb_bob", under("cam_d", "0", "1", "2", "3", "4")),
+        Lens(("EquidistantCamera",), "fisheye", K4),
+    ),
+    model="cam_model",
+    size=("cam_width", "cam_height"),
+)
 
 
-def _kitti_lines(text: str) -> dict[str, list[float]]:
-    found = {}
-    for line in text.splitlines():
-        key, colon, rest = line.partition(":")
-        try:
-            found[key.strip()] = [float(word) for word in rest.split()] if colon else []
-        except ValueError:  # calib_time
-            continue
-    return found
-
-
-def _read_kitti(document: Document) -> CameraSet:
-    lines = _kitti_lines(document.text)
-    ids = sorted(key[2:] for key in lines if key.startswith("K_"))
-    if not ids:
-        return _rectified_kitti(document, lines)
-    cameras, poses = [], []
-    for k in ids:
-        part = Field({key: lines.get(f"{key}_{k}", []) for key in "SKDRT"}, document.source)
-        cameras.append(_KITTI.camera(part, f"image_{k}"))
-        poses.append(Pose(part["R"].array(9).reshape(3, 3), part["T"].array(3)))
-    return mounted(cameras, poses, "KITTI")
-
-
-def _rectified_kitti(document: Document, lines: Mapping[str, Sequence[float]]) -> CameraSet:
-    cameras, poses = [], []
-    for key in sorted(key for key in lines if key[:1] == "P" and key[1:].isdecimal()):
-        P = Field(list(lines[key]), document.source, key).array(12).reshape(3, 4)
-        cameras.append(
-            _KITTI.camera(Field({"K": P[:, :3].tolist(), "D": [0.0]}, document.source), f"image_{key[1:]}")
+def _read_vikit(document: Document) -> CameraSet:
+    if (scale := document.root.get("scale", 1.0).number()) != 1:
+        document.notes.append(
+            f"{document.source}: the camera is that of the images before the scale {scale:g}"
         )
-        poses.append(Pose(np.eye(3), np.asarray(np.linalg.solve(P[:, :3], P[:, 3]), dtype=float)))
-    return mounted(cameras, poses, "KITTI")
+    return CameraSet((_VIKIT.camera(document.root),), program="vikit")
 
 
-KITTI = Format(
-    "KITTI",
-    _KITTI.models,
-    matches=lambda document: "\nK_0" in document.text[:20_000] or document.text.startswith("P0:"),
-    read=_read_kitti,
-    files="calib_cam_to_cam.txt; calib.txt of the odometry",
-    most_cameras=99,
-    metres=True,
-    rig="`R_`, `T_` from camera 0; `P0` to `P3`",
+VIKIT = Format(
+    "vikit",
+    _VIKIT.models,
+    matches=lambda document: {"cam_model", "cam_fx"} <= set(document.tree),
+    read=_read_vikit,
+    files="camera of rpg_vikit, FAST-LIVO: YAML",
+)
+
+# DSO: a line of the model and its numbers, and a line of the size of the images. A principal point below 1 is
+# relative to it, with the first pixel at 1/2. FOV with omega = 0 is a pinhole.
+_DSO = CameraKeys(
+    "DSO",
+    ("fx", "fy", "cx", "cy"),
+    (
+        Lens(("Pinhole", "FOV"), "none", ()),
+        Lens(("RadTan",), "k1k2p1p2", ("D",)),
+        Lens(("EquiDistant", "KannalaBrandt"), "fisheye", ("D",)),
+    ),
+    model="model",
+    size=("size",),
+)
+_DSO_LINES = re.compile(
+    r"\A(?:(Pinhole|RadTan|EquiDistant|KannalaBrandt|FOV)\s)?((?:\s*[-+.\deE]+){5,8})"
+    r"[ \t]*\n\s*(\d+)[ \t]+(\d+)\s*\n(?:crop|full|none|fillImg|[-+.\d])"
+).match
+
+
+def _read_dso(document: Document) -> CameraSet:
+    found = _DSO_LINES(document.text)
+    assert found is not None  # `matches`
+    (fx, fy, cx, cy, *k), size = map(float, found[2].split()), (int(found[3]), int(found[4]))
+    if cx < 1 and cy < 1:
+        fx, fy, cx, cy = fx * size[0], fy * size[1], cx * size[0] - 0.5, cy * size[1] - 0.5
+    model = found[1] or "FOV"
+    if model == "Pinhole" and any(k):  # DSO reads its fifth number as omega
+        model = "FOV"
+    tree = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "D": k, "model": model, "size": list(size)}
+    camera = _DSO.camera(Field(tree, document.source))
+    return CameraSet((fov(camera, k[0], document) if model == "FOV" else camera,), program="DSO")
+
+
+DSO = Format(
+    "DSO",
+    _DSO.models,
+    matches=lambda document: _DSO_LINES(document.text),
+    read=_read_dso,
+    files="camera.txt of DSO, LDSO, TUM's monocular data",
 )

@@ -1,6 +1,9 @@
-"""Formats of reconstruction from photographs and of video: nerfstudio, Gyroflow, Open3D and Metashape."""
+"""Formats of neural rendering, point clouds and video: nerfstudio, Open3D, Gyroflow and lensfun."""
 
 from __future__ import annotations
+
+import math
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -36,24 +39,32 @@ _NERF = CameraKeys(
     size=("w", "h"),
     first_pixel=0.5,
 )
+_OWN = {"fl_x", "fl_y", "cx", "cy", "w", "h", *FIVE, "k4"}
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def _read_nerf(document: Document) -> CameraSet:
     tree = dict(document.tree)
-    frames = tree.get("frames") or []
-    if any(isinstance(frame, dict) and {"fl_x", "k1"} & set(frame) for frame in frames):
-        raise InputError(
-            "each frame has a camera of its own; write a file for the frames of one camera, with fl_x to cy "
-            "at its top"
-        )
+    frames = [frame for frame in tree.get("frames") or [] if isinstance(frame, dict)]
+    own = [{key: value for key, value in frame.items() if key in _OWN} for frame in frames]
+    if any(own):  # as Polycam writes them
+        if any(one != own[0] for one in own):
+            raise InputError(
+                "each frame has a camera of its own; write a file for the frames of one camera, with fl_x to "
+                "cy at its top"
+            )
+        tree |= own[0]
     if tree.get("is_fisheye") is True:
         tree.setdefault("camera_model", "OPENCV_FISHEYE")
     if "fl_x" not in tree:
         root = Field(tree, document.source)
         half = 0.5 * root["camera_angle_x"].number()
+        if document.size is not None:
+            tree["w"], tree["h"] = document.size
         if "w" not in tree or not 0 < half < np.pi / 2:
-            raise InputError("has camera_angle_x without w, h, or no angle of a camera; add w and h")
+            raise InputError(
+                "has camera_angle_x without w, h, or no angle of a camera; give --image-size W H"
+            )
         tree["fl_x"] = 0.5 * root["w"].number() / float(np.tan(half))
     tree.setdefault("fl_y", tree["fl_x"])
     root = Field(tree, document.source)
@@ -84,7 +95,8 @@ NERFSTUDIO = Format(
     _NERF.models,
     _nerf_text,
     lambda document: (
-        ("fl_x" in document.tree or "camera_angle_x" in document.tree) and "intrinsics" not in document.tree
+        ("fl_x" in document.tree or "camera_angle_x" in document.tree or '"fl_x"' in document.text[:5000])
+        and "intrinsics" not in document.tree
     ),
     _read_nerf,
     files="transforms.json of nerfstudio and instant-ngp",
@@ -127,6 +139,8 @@ def _gyroflow_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         "orig_dimension": dimension,
         "output_dimension": dimension,
         "use_opencv_fisheye": True,
+        "focal_length": cameras.lens()[0],
+        "crop_factor": cameras.lens()[1],
         **_GYROFLOW.tree(camera),
     }
     return {"": json_text(tree)}
@@ -138,9 +152,52 @@ GYROFLOW = Format(
     _gyroflow_text,
     lambda document: "fisheye_params" in document.tree,
     _read_gyroflow,
-    files="lens profile, JSON",
+    files="lens profile, JSON; mm with `--focal-length` or `--crop-factor`",
     most_cameras=1,
     needs_size=True,
+)
+
+# lensfun's poly5 is r (1 + k1 r^2 + k2 r^4), from undistorted to distorted radii in half the shorter side of
+# a sensor, which it derives from the diagonal and the ratio of the sides. The centre is in half that side.
+
+
+def _lensfun_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    focal, crop, true_focal = cameras.lens()
+    if focal is None or crop is None:
+        raise InputError("lensfun finds a lens by its mm; give --focal-length MM, --crop-factor, or both")
+    camera = cameras.cameras[0]
+    width, height = camera.image_size or (0, 0)  # `needs_size`
+    longer, shorter = max(width, height), min(width, height)
+    half = 0.5 * np.hypot(width - 1, height - 1) / np.hypot(longer / shorter, 1)
+    k = [*camera.distortion.coefficients.tolist(), 0.0, 0.0]
+    f, _, _, u0, v0 = camera.entries
+    x, y = (float((c - 0.5 * (side - 1)) / (0.5 * (shorter - 1))) for c, side in ((u0, width), (v0, height)))
+    divisor = math.gcd(longer, shorter)
+    name, real = escape(camera.name), "" if true_focal is None else f' real-focal="{true_focal:.6g}"'
+    body = (
+        f"  <mount>\n    <name>{name}</name>\n  </mount>\n"
+        f"  <camera>\n    <maker>{name}</maker>\n    <model>{name}</model>\n    <mount>{name}</mount>\n"
+        f"    <cropfactor>{crop:.6g}</cropfactor>\n  </camera>\n"
+        f"  <lens>\n    <maker>{name}</maker>\n    <model>{name}</model>\n    <mount>{name}</mount>\n"
+        f"    <cropfactor>{crop:.6g}</cropfactor>\n"
+        f"    <aspect-ratio>{longer // divisor}:{shorter // divisor}</aspect-ratio>\n"
+        f'    <center x="{x:.9g}" y="{y:.9g}"/>\n    <calibration>\n'
+        f'      <distortion model="poly5" focal="{focal:.6g}"{real} k1="{k[0] * (half / f) ** 2:.12g}"'
+        f' k2="{k[1] * (half / f) ** 4:.12g}"/>\n    </calibration>\n  </lens>\n'
+    )
+    return {
+        "": f'<?xml version="1.0" encoding="UTF-8"?>\n<lensdatabase version="1">\n{body}</lensdatabase>\n'
+    }
+
+
+LENSFUN = Format(
+    "lensfun",
+    ("none", "k1", "k1k2"),
+    _lensfun_text,
+    files="database of one lens, XML, written only; with `--focal-length` or `--crop-factor`",
+    most_cameras=1,
+    needs_size=True,
+    square=True,
 )
 
 # Open3D writes matrices by columns.
@@ -205,83 +262,3 @@ def _by_columns(document: Document) -> bool:
         and matrix[8] == 1
         and matrix[6] != 0
     )
-
-
-# Agisoft Metashape: f in pixels, the principal point from the middle of the image, p1 and p2 exchanged.
-
-
-def _read_metashape(document: Document) -> CameraSet:
-    root = document.root["calibration"]
-    kind = root.get("projection", "frame").text()
-    if kind != "frame":
-        raise InputError(
-            f"the projection {kind[:40]!r} of Metashape is not known; calibrate it as frame, or with "
-            "neurocal from the points"
-        )
-    values = {
-        key: 0.0 if key not in root else root[key].number()
-        for key in ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "skew")
-    }
-    for key in ("k4", "p3", "p4"):
-        if values[key]:
-            raise InputError(f"the coefficient {key} of Metashape is not known here; calibrate it without")
-    width, height = root["width"].integer(1), root["height"].integer(1)
-    f = root["f"].number() if "f" in root else root["fy"].number()
-    tree = {
-        "fx": (root["fx"].number() if "fx" in root else f) + values["b1"],
-        "fy": f,
-        "cx": values["cx"] + 0.5 * width if "f" in root else values["cx"],
-        "cy": values["cy"] + 0.5 * height if "f" in root else values["cy"],
-        "skew": values["b2"] + values["skew"],
-        "w": width,
-        "h": height,
-        "k1": values["k1"],
-        "k2": values["k2"],
-        "k3": values["k3"],
-        "p1": values["p2"],
-        "p2": values["p1"],
-    }
-    return CameraSet((_METASHAPE.camera(Field(tree, document.source)),), program="Metashape")
-
-
-def _metashape_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
-    tree = _METASHAPE.tree(cameras.cameras[0])
-    width, height, f = tree["w"], tree["h"], tree["fy"]
-    entries = {
-        "projection": "frame",
-        "width": width,
-        "height": height,
-        "f": f,
-        "cx": tree["cx"] - 0.5 * width,
-        "cy": tree["cy"] - 0.5 * height,
-        "b1": tree["fx"] - f,
-        "b2": tree["skew"],
-        **{key: tree[key] for key in ("k1", "k2", "k3")},
-        "p1": tree["p2"],
-        "p2": tree["p1"],
-    }
-    lines = [f"  <{key}>{value!r}</{key}>".replace("'", "") for key, value in entries.items()]
-    body = "\n".join(lines)
-    return {"": f'<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n{body}\n</calibration>\n'}
-
-
-_METASHAPE = CameraKeys(
-    "Metashape",
-    ("fx", "fy", "cx", "cy"),
-    (Lens(("frame",), "plumb_bob", FIVE),),
-    size=("w", "h"),
-    skew="skew",
-    first_pixel=0.5,
-)
-METASHAPE = Format(
-    "Metashape",
-    _METASHAPE.models,
-    _metashape_text,
-    lambda document: "<calibration" in document.text[:1000] and "calibration" in document.tree,
-    _read_metashape,
-    files="Agisoft calibration, XML",
-    skew=True,
-    most_cameras=1,
-    needs_size=True,
-    first_pixel=0.5,
-)

@@ -14,6 +14,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.files.exchange import (
     capture,
     colmap,
+    datasets,
     dictionary,
     dlt,
     kalibr,
@@ -22,12 +23,15 @@ from neurocal_cli.files.exchange import (
     neurocal,
     odometry,
     photographs,
+    radial_curves,
+    reconstruction,
     ros,
+    sensors,
 )
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, inverse
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.failures import source_of, value_failures
-from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.tree_fields import Field, is_number
 
 # Formats that `convert` writes, by the values of its option ``--to``.
 FORMATS: dict[str, Format] = {
@@ -48,18 +52,29 @@ FORMATS: dict[str, Format] = {
     "basalt": odometry.BASALT,
     "euroc": odometry.EUROC,
     "open3d": photographs.OPEN3D,
-    "metashape": photographs.METASHAPE,
+    "metashape": reconstruction.METASHAPE,
     "gyroflow": photographs.GYROFLOW,
+    "lensfun": photographs.LENSFUN,
 }
 # Formats that are read, the most specific first; the last takes any dictionary of a camera.
 READ: tuple[Format, ...] = (
     neurocal.FORMAT,
+    radial_curves.OCAM,
     matlab.FORMAT,
     colmap.FORMAT,
     mrcal.FORMAT,
     capture.ANIPOSE,
-    capture.ZED,
-    odometry.KITTI,
+    capture.MULTICAL,
+    capture.CALIB_IO,
+    capture.EASYMOCAP,
+    sensors.ZED,
+    sensors.OAK,
+    sensors.KINECT,
+    datasets.KITTI,
+    datasets.MIDDLEBURY,
+    datasets.MVSNET,
+    datasets.KRTD,
+    odometry.DSO,
     odometry.EUROC,
     kalibr.FORMAT,
     capture.BOOFCV,
@@ -68,8 +83,12 @@ READ: tuple[Format, ...] = (
     odometry.BASALT,
     odometry.OKVIS,
     odometry.SVO,
+    odometry.VIKIT,
     photographs.NERFSTUDIO,
-    photographs.METASHAPE,
+    reconstruction.METASHAPE,
+    reconstruction.OPENMVG,
+    reconstruction.ALICEVISION,
+    reconstruction.OPENSFM,
     photographs.GYROFLOW,
     photographs.OPEN3D,
     ros.FORMAT,
@@ -77,72 +96,79 @@ READ: tuple[Format, ...] = (
 )
 _ORIENTATION = [3, 3, 3, 3, 3, 2, 1, 3]  # numbers in the lines of OpenPTV's file
 
-# What is known and cannot be read: how to tell it, what it is, and what to do.
-_REFUSED: tuple[tuple[Callable[[Document], object], str], ...] = (
+# What is known and cannot be read: how it begins, or how to tell it; what it is, and what to do.
+_REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
     (lambda d: not d.data.strip() and d.source != "<stdin>", "is empty; give a camera file"),
     (
         lambda d: "!!python/object" in d.text[:100_000],
         "holds objects of Python, which can run code and are not read; save arrays as lists, array.tolist()",
     ),
     (
-        lambda d: {"cameraData", "boardName"} <= set(d.tree),
-        "is the calibration of an OAK board, of all its sockets; save one camera with DepthAI: "
-        "getCameraIntrinsics and getDistortionCoefficients of its CalibrationHandler",
-    ),
-    (
         lambda d: {"projection", "f", "u0"} <= set(d.tree),
         "is the file of an undistorted panorama; give the camera of the original images",
     ),
+    (b"\x89HDF", "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7"),
     (
-        lambda d: d.data.startswith(b"\x89HDF"),
-        "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7",
-    ),
-    (
-        lambda d: (
-            d.data[:1] == b"\x80" and d.data[1:2] in (b"\2", b"\3", b"\4", b"\5") and d.data.endswith(b".")
-        ),
+        lambda d: re.match(rb"\x80[\2-\5]", d.data) and d.data.endswith(b"."),
         "is a pickle of Python, which can run code and is not read; in Python load it, and save its numbers "
         "by numpy.savez('camera.npz', K=matrix, D=coefficients)",
     ),
+    (b"#ROSBAG", "is a ROS bag; give a camera_info file, as rostopic echo prints it"),
     (
-        lambda d: d.data.startswith(b"#ROSBAG"),
-        "is a ROS bag; give a camera_info file, as rostopic echo prints it",
-    ),
-    (
-        lambda d: d.data.startswith(b"SQLite format 3"),
+        b"SQLite format 3",
         "is a database; of COLMAP, give the folder of a model with cameras.txt or cameras.bin",
     ),
+    (r"Calibration results\s*\n=+", "is a report of Kalibr; give its camchain for the cameras"),
     (
-        lambda d: "polynomial coefficients for the DIRECT mapping" in d.text[:200],
-        "is a camera of OCamCalib, whose polynomial is no model here; calibrate its images as fisheye or "
-        "omnidir",
-    ),
-    (
-        lambda d: re.match(r"Calibration results\s*\n=+", d.text),
-        "is a report of Kalibr; give its camchain for the cameras",
-    ),
-    (
-        lambda d: "CalibrationInformation" in d.tree,
-        "is the raw calibration of an Azure Kinect, of its sensors and not of images; save the intrinsics of "
-        "the mode that you use, as its SDK gives them",
-    ),
-    (
-        lambda d: re.search(r"<document\b", d.text[:300]),
-        "is a project of Metashape; save the calibration itself: Tools, Camera Calibration, Save",
-    ),
-    (
-        lambda d: re.search(r"<lensdatabase\b", d.text[:2000]),
+        r"[^\n]*\n?.*<lensdatabase\b",
         "is a database of lensfun, whose models are relative to the size of the sensor; calibrate its images",
     ),
     (
-        lambda d: (
-            not d.tree
-            and len(d.text) < 2000
-            and [len(line.split()) for line in d.text.splitlines() if line.strip()] == _ORIENTATION
-        ),
-        "is an orientation of OpenPTV, in mm of the sensor; calibrate from its points",
+        lambda d: _numbers_in_lines(d) == _ORIENTATION,
+        "is an orientation of OpenPTV, in mm of the sensor, whose pixels are in another file; calibrate from "
+        "its points",
+    ),
+    (
+        lambda d: _numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
+        "is the distortion of a camera of OpenPTV, in mm of the sensor; calibrate from its points",
+    ),
+    (
+        r"Pix4D camera calibration",
+        "is a camera of Pix4D in mm of the sensor; export it in px, or calibrate its images",
+    ),
+    (
+        r"#\s*Bundle file",
+        "is a model of Bundler, whose image sizes and principal points are not in it; give COLMAP's model",
+    ),
+    (
+        r"NVM_V3",
+        "is a model of VisualSFM, whose image sizes and principal points are not in it; give COLMAP's model",
+    ),
+    (
+        lambda d: "capturingreality.com" in d.text[:2000],
+        "is a camera of RealityCapture, relative to the size of the image; export the cameras as COLMAP's "
+        "model",
+    ),
+    (
+        lambda d: re.search(r"^cam\d_calib:", d.text, re.MULTILINE),
+        "names the files of its cameras, cam0_calib and so on; give these",
     ),
 )
+
+
+def _numbers_in_lines(document: Document) -> list[int]:
+    """How many numbers each line has; none if there are words, or many lines."""
+    lines = [line.split() for line in document.text[:2000].splitlines() if line.strip()]
+    return [len(line) for line in lines] if all(is_number(w) for line in lines for w in line) else []
+
+
+def _is(document: Document, sign: bytes | str | Callable[[Document], object]) -> object:
+    """Whether a document has the sign of a kind of files."""
+    if isinstance(sign, bytes):
+        return document.data.startswith(sign)
+    if isinstance(sign, str):
+        return re.match(rf"\s*{sign}", document.text[:2000], re.DOTALL)
+    return sign(document)
 
 
 def read_cameras(
@@ -233,7 +259,7 @@ def _single(
 def _read(document: Document, whole: bool = True) -> CameraSet:
     with value_failures(document.source):
         for refused, problem in _REFUSED:
-            if refused(document):
+            if _is(document, refused):
                 raise InputError(problem)
         for one in READ:
             if one.matches is None or one.read is None or not one.matches(document):
@@ -258,6 +284,8 @@ def _merged(documents: Sequence[Document]) -> CameraSet | None:
     if len(arrays) == 2:
         matrix = next((k for k, array in enumerate(arrays) if array.shape == (3, 3)), 0)
         tree = {"K": arrays[matrix].tolist(), "D": arrays[1 - matrix].ravel().tolist()}
+    elif all(map(capture.easymocap_names, documents)):
+        return capture.EASYMOCAP.read(first.joined(second)) if capture.EASYMOCAP.read else None
     elif all(map(dictionary.is_part, documents)):
         tree = {**first.tree, **second.tree}
     else:

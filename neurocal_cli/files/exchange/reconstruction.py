@@ -1,0 +1,273 @@
+"""Formats of reconstruction from photographs: Metashape, OpenMVG, AliceVision, OpenSfM and OpenDroneMap.
+
+Their files hold the cameras of a whole project; one camera is read, or the one that all are alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.errors import InputError
+from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format
+from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.tree_texts import FIVE, K4, under
+from neurocal_cli.files.file_storage import xml_root
+from neurocal_cli.files.tree_fields import Field
+
+
+def only(cameras: Iterable[Camera], names: Iterable[str], program: str) -> CameraSet:
+    """The one camera of a project; an InputError names those of several that differ."""
+    found = list(cameras)
+    if not found:
+        raise InputError(f"is a project of {program} without a camera; calibrate it first")
+    alike = {
+        (*one.entries, one.distortion.model, *one.distortion.coefficients, one.image_size) for one in found
+    }
+    if len(alike) > 1:
+        listed = ", ".join(name[:30] for name in names)
+        raise InputError(
+            f"holds several cameras of {program} ({listed}), which have no pose between them; save one as a "
+            "file"
+        )
+    return CameraSet((found[0],), program=program)
+
+
+# Agisoft Metashape: f in pixels, the principal point from the middle of the image, p1 and p2 exchanged. A
+# fisheye has the same polynomial of the angle. Projects hold the same elements for each sensor.
+_BROWN = ("k1", "k2", "p2", "p1", "k3")
+_METASHAPE = CameraKeys(
+    "Metashape",
+    ("fx", "fy", "cx", "cy"),
+    (Lens(("frame",), "plumb_bob", _BROWN), Lens(("fisheye", "equidistant_fisheye"), "fisheye", K4)),
+    model="projection",
+    size=("width", "height"),
+    skew="b2",
+    first_pixel=0.5,
+)
+_OTHERS = {"frame": ("k4", "p3", "p4"), "fisheye": ("p1", "p2", "p3", "p4")}  # not in our models
+
+
+def _metashape_camera(tree: Mapping[str, Any], source: str) -> Camera:
+    root = Field({"projection": "frame", **tree}, source)
+    kind = "frame" if root["projection"].value == "frame" else "fisheye"
+    for key in _OTHERS[kind]:
+        if root.get(key, 0.0).number():
+            raise InputError(
+                f"the coefficient {key} of Metashape's {kind} is not known here; calibrate it without"
+            )
+    width, height = root["width"].integer(1), root["height"].integer(1)
+    f = root["f"].number() if "f" in root else root["fy"].number()
+    middle = (0.5 * width, 0.5 * height) if "f" in root else (0.0, 0.0)  # older versions count from the edge
+    own = {
+        "fx": (root["fx"].number() if "fx" in root else f) + root.get("b1", 0.0).number(),
+        "fy": f,
+        "cx": root.get("cx", 0.0).number() + middle[0],
+        "cy": root.get("cy", 0.0).number() + middle[1],
+        "b2": root.get("b2", 0.0).number() + root.get("skew", 0.0).number(),
+    }
+    zeros = dict.fromkeys((*_BROWN, "k4"), 0.0)
+    plain = {key: value for key, value in root.value.items() if key not in _OTHERS[kind]}
+    return _METASHAPE.camera(Field({**zeros, **plain, **own}, source))
+
+
+def _read_metashape(document: Document) -> CameraSet:
+    if "calibration" in document.tree:
+        tree = document.root["calibration"].value
+        return CameraSet((_metashape_camera(tree, document.source),), program="Metashape")
+    cameras: dict[str, Camera] = {}
+    for sensor in xml_root(document.text, document.source).iter("sensor"):
+        adjusted = [
+            one for one in sensor.findall("calibration") if one.get("class", "adjusted") == "adjusted"
+        ]
+        for found in adjusted[-1:]:
+            size = found.find("resolution")
+            size = sensor.find("resolution") if size is None else size
+            tree = {child.tag: child.text for child in found if child.tag != "resolution"}
+            tree |= {} if size is None else dict(size.attrib)
+            sides = {
+                side: int(tree[side] or 0) for side in ("width", "height") if str(tree.get(side)).isdigit()
+            }
+            kind = found.get("type") or sensor.get("type") or "frame"
+            name = sensor.get("label") or f"sensor {sensor.get('id')}"
+            cameras[name] = _metashape_camera({**tree, **sides, "projection": kind}, document.source)
+    return only(cameras.values(), cameras, "Metashape")
+
+
+def _metashape_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    tree = _METASHAPE.tree(cameras.cameras[0])
+    width, height, f = tree["width"], tree["height"], tree["fy"]
+    kind = tree.pop("projection")
+    entries = {
+        "projection": "frame" if kind == "frame" else "equidistant_fisheye",
+        "width": width,
+        "height": height,
+        "f": f,
+        "cx": tree["cx"] - 0.5 * width,
+        "cy": tree["cy"] - 0.5 * height,
+        "b1": tree["fx"] - f,
+        "b2": tree["b2"],
+        **{key: tree[key] for key in (*K4, "p1", "p2") if key in tree},
+    }
+    lines = [f"  <{key}>{value!r}</{key}>".replace("'", "") for key, value in entries.items()]
+    body = "\n".join(lines)
+    return {"": f'<?xml version="1.0" encoding="UTF-8"?>\n<calibration>\n{body}\n</calibration>\n'}
+
+
+METASHAPE = Format(
+    "Metashape",
+    _METASHAPE.models,
+    _metashape_text,
+    lambda document: (
+        ("<calibration" in document.text[:1000] and "calibration" in document.tree)
+        or ("<document" in document.text[:1000] and "<sensor" in document.text)
+    ),
+    _read_metashape,
+    files="Agisoft calibration, doc.xml of a project, or exported cameras: XML",
+    skew=True,
+    most_cameras=1,
+    needs_size=True,
+    first_pixel=0.5,
+)
+
+# OpenMVG's sfm_data.json. The name of a model stands where it is first used, its number everywhere.
+_OPENMVG = CameraKeys(
+    "OpenMVG",
+    ("focal_length", "focal_length", "principal_point/0", "principal_point/1"),
+    (
+        Lens(("pinhole",), "none", ()),
+        Lens(("pinhole_radial_k1",), "k1", ("disto_k1/0",)),
+        Lens(("pinhole_radial_k3",), "plumb_bob", ("disto_k3/0", "disto_k3/1", "-", "-", "disto_k3/2")),
+        Lens(("pinhole_brown_t2",), "plumb_bob", under("disto_t2/", "0", "1", "3", "4", "2")),
+        Lens(("fisheye",), "fisheye", under("fisheye/", "0", "1", "2", "3")),
+    ),
+    model="model",
+    size=("width", "height"),
+)
+
+
+def _read_openmvg(document: Document) -> CameraSet:
+    names: dict[int, str] = {}
+    cameras: dict[str, Camera] = {}
+    for entry in document.root["intrinsics"].items():
+        value = entry["value"]
+        number = value["polymorphic_id"].integer() & 0x7FFFFFFF
+        names[number] = value.get("polymorphic_name", names.get(number, "")).text()
+        data = value["ptr_wrapper"]["data"]
+        tree = {**data.value, **data.get("value0", {}).value, "model": names[number]}
+        cameras[f"intrinsic {entry['key'].text()}"] = _OPENMVG.camera(Field(tree, data.source, data.path))
+    return only(cameras.values(), cameras, "OpenMVG")
+
+
+OPENMVG = Format(
+    "OpenMVG",
+    _OPENMVG.models,
+    matches=lambda document: {"sfm_data_version", "intrinsics"} <= set(document.tree),
+    read=_read_openmvg,
+    files="sfm_data.json",
+)
+
+# AliceVision and Meshroom: texts in place of numbers, the focal length in mm since version 1.2.2, and the
+# principal point from the middle of the image since 1.2.1.
+_D = "distortionParams/"
+_ALICEVISION = CameraKeys(
+    "AliceVision",
+    ("fx", "fy", "cx", "cy"),
+    (
+        Lens(("none", "pinhole", ""), "none", ()),
+        Lens(("radialk1", "radial1"), "k1", (f"{_D}0",)),
+        Lens(("radialk3", "radial3"), "plumb_bob", (f"{_D}0", f"{_D}1", "-", "-", f"{_D}2")),
+        Lens(("brown",), "plumb_bob", under(_D, "0", "1", "3", "4", "2")),
+        Lens(("fisheye4",), "fisheye", under(_D, "0", "1", "2", "3")),
+    ),
+    model="model",
+)
+
+
+def _read_alicevision(document: Document) -> CameraSet:
+    version = [int(word) for word in document.root["version"].texts()]
+    cameras: dict[str, Camera] = {}
+    for entry in document.root["intrinsics"].items():
+        size = int(entry["width"].number()), int(entry["height"].number())
+        c = [entry["principalPoint"].array(2)[k] + (version >= [1, 2, 1]) * 0.5 * size[k] for k in (0, 1)]
+        if version < [1, 2, 2]:
+            f = entry["pxFocalLength"].value
+            fx, fy = (2 * [Field(f, entry.source, "pxFocalLength").number()] if isinstance(f, str)
+                      else entry["pxFocalLength"].array(2).tolist())  # fmt: skip
+        else:
+            fx = entry["focalLength"].number() / entry["sensorWidth"].number() * size[0]
+            ratio = entry.get("pixelRatio", 1.0).number()
+            fy = fx * ratio if version >= [1, 2, 5] else fx / ratio
+        kind, lens = entry["type"].text(), entry.get("distortionType", "").text()
+        tree = {"fx": fx, "fy": fy, "cx": c[0], "cy": c[1], "model": lens if kind == "pinhole" else kind}
+        camera = _ALICEVISION.camera(Field({**entry.value, **tree}, entry.source, entry.path))
+        cameras[f"intrinsic {entry['intrinsicId'].text()}"] = Camera(
+            camera.intrinsics, camera.distortion, size
+        )
+    return only(cameras.values(), cameras, "AliceVision")
+
+
+ALICEVISION = Format(
+    "AliceVision",
+    _ALICEVISION.models,
+    matches=lambda document: (
+        "version" in document.tree and "intrinsicId" in str(document.tree.get("intrinsics"))[:2000]
+    ),
+    read=_read_alicevision,
+    files="cameras.sfm of Meshroom, JSON",
+)
+
+# OpenSfM and OpenDroneMap: coordinates from the middle of the image, divided by its longer side.
+_ONE = ("focal", "focal", "c_x", "c_y")
+_OPENSFM = CameraKeys(
+    "OpenSfM",
+    ("focal_x", "focal_y", "c_x", "c_y"),
+    (
+        Lens(("perspective",), "k1k2", ("k1", "k2"), _ONE),
+        Lens(("simple_radial",), "k1", ("k1",)),
+        Lens(("radial",), "k1k2", ("k1", "k2")),
+        Lens(("brown",), "plumb_bob", FIVE),
+        Lens(("fisheye",), "fisheye", ("k1", "k2", "-", "-"), _ONE),
+        Lens(("fisheye_opencv",), "fisheye", K4),
+    ),
+    model="projection_type",
+    size=("width", "height"),
+)
+
+
+def _opensfm_parts(document: Document) -> dict[str, Field]:
+    root = Field(document.tree, document.source)
+    return {
+        name: Field({"projection_type": "perspective", "c_x": 0.0, "c_y": 0.0, **part}, root.source, name)
+        for name, part in document.tree.items()
+        if isinstance(part, dict) and {"focal", "focal_x"} & set(part) and {"width", "height"} <= set(part)
+    }
+
+
+def _read_opensfm(document: Document) -> CameraSet:
+    cameras = {}
+    for name, part in (_opensfm_parts(document) or {"": Field(document.tree, document.source)}).items():
+        width, height = (part[side].integer(1) for side in ("width", "height"))
+        longer = max(width, height)
+        tree = {
+            key: longer * part[key].number()
+            + {"c_x": 0.5 * (width - 1), "c_y": 0.5 * (height - 1)}.get(key, 0.0)
+            for key in ("focal", "focal_x", "focal_y", "c_x", "c_y")
+            if key in part
+        }
+        cameras[name] = _OPENSFM.camera(Field({**part.value, **tree}, part.source, part.path))
+    return only(cameras.values(), cameras, "OpenSfM")
+
+
+OPENSFM = Format(
+    "OpenSfM",
+    _OPENSFM.models,
+    matches=lambda document: (
+        _opensfm_parts(document)
+        or ({"projection_type", "width", "height"} <= set(document.tree) and "focal" in str(document.tree))
+    ),
+    read=_read_opensfm,
+    files="cameras.json, reference of a camera model; also of OpenDroneMap",
+)

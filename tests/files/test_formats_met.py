@@ -1,0 +1,605 @@
+"""Cameras in the forms in which programs, data sets and people keep them, each written here anew."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_other_programs import POINT, check, rotated
+
+from neurocal_cli.camera.geometry import Array
+from neurocal_cli.errors import FormatError
+from neurocal_cli.files.exchange.reading import read_cameras
+
+K = [[800.5, 0.0, 321.3], [0.0, 801.25, 238.7], [0.0, 0.0, 1.0]]
+FLAT, COLUMNS = np.ravel(K).tolist(), [entry for column in zip(*K, strict=True) for entry in column]
+E, ROUND = [800.5, 0.0, 801.25, 321.3, 238.7], [800.5, 0.0, 800.5, 321.3, 238.7]
+D5 = [-0.31, 0.12, 0.0011, -0.0007, 0.02]
+D4, D8 = D5[:4], [*D5, 0.03, -0.01, 0.002]
+FOUR = [0.05, -0.012, 0.004, -0.001]
+FISH = ["fisheye", *FOUR]
+S = (640, 480)
+EYE = np.eye(4).tolist()
+TURN, SHIFT = [0.02, -0.1, 0.03], [-60.0, 0.1, 0.2]
+R = np.array([rotated(TURN, axis) for axis in np.eye(3)]).T.tolist()
+NAMED = dict(zip(("k1", "k2", "p1", "p2", "k3"), D5, strict=True))
+FXY = {"fx": 800.5, "fy": 801.25, "cx": 321.3, "cy": 238.7}
+WH = {"width": 640, "height": 480}
+
+
+def lines(head: str, prefix: str, **values: object) -> str:
+    return head + "".join(f"{prefix}{key}: {value}\n" for key, value in values.items())
+
+
+def metashape(kind: str, more: str) -> str:
+    elements = f"<f>801.25</f><cx>1.8</cx><cy>-0.8</cy><b1>-0.75</b1>{more}"
+    return (
+        '<?xml version="1.0"?>\n<document version="1.5.0"><chunk><sensors><sensor id="0" label="A" type="'
+        f'{kind}"><resolution width="640" height="480"/><bands><band label="R"/><band label="G"/></bands>'
+        f'<calibration type="{kind}" class="adjusted"><resolution width="640" height="480"/>{elements}'
+        "</calibration></sensor></sensors><cameras/></chunk></document>"
+    )
+
+
+def openmvg(name: str, **data: object) -> Any:
+    inner = {**WH, "focal_length": 800.5, "principal_point": [321.3, 238.7], **data}
+    value = {"polymorphic_id": 2147483649, "polymorphic_name": name, "ptr_wrapper": {"id": 1, "data": inner}}
+    return {"sfm_data_version": "0.3", "views": [], "intrinsics": [{"key": 0, "value": value}]}
+
+
+def meshroom(version: list[str], **more: object) -> Any:
+    one = {"intrinsicId": "7", "width": "640", "height": "480", "sensorWidth": "36", "locked": "false"}
+    return {"version": version, "views": [], "intrinsics": [{**one, **more}]}
+
+
+def frame(k: int, **more: object) -> Any:
+    return {"file_path": f"{k}.png", "transform_matrix": EYE, **more}
+
+
+FX_LINES = {"fx": 800.5, "fy": 801.25, "cx": 321.3, "cy": 238.7}
+BROWN = dict(zip(("k1", "k2", "p1", "p2"), D4, strict=True))
+KB = dict(zip(("k1", "k2", "k3", "k4"), FOUR, strict=True))
+MATLAB = {
+    "ImageSize": [480, 640],
+    "FocalLength": [800.5, 801.25],
+    "PrincipalPoint": [322.3, 239.7],
+    "Skew": 0,
+    "RadialDistortion": [-0.31, 0.12, 0.02],
+    "TangentialDistortion": [0.0011, -0.0007],
+}
+EEPROM = dict(
+    zip(
+        ("cx", "cy", "fx", "fy", "k1", "k2", "k3", "k4", "k5", "k6"),
+        [0.5, 0.5025, 0.478, 0.6372, *D8[:2], *D8[4:]],
+        strict=True,
+    )
+)
+KINECT = {
+    "CalibrationInformation": {
+        "Cameras": [
+            {
+                "Purpose": "CALIBRATION_CameraPurposePhotoVideo",
+                "SensorWidth": 4096,
+                "SensorHeight": 3072,
+                "Intrinsics": {
+                    "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
+                    "ModelParameters": [*EEPROM.values(), 0, 0, D5[3], D5[2], 1.7],
+                },
+            }
+        ]
+    }
+}
+LIBCALIB = {
+    "f": 800.5,
+    "ar": 801.25 / 800.5,
+    "cx": 321.3,
+    "cy": 238.7,
+    **NAMED,
+    "k4": 0.03,
+    "k5": -0.01,
+    "k6": 0.002,
+}
+# Of each kind: the text or the tree, the entries of its camera, the coefficients, and the size.
+MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
+    "OpenCV in ROS parameters": (
+        {
+            "/**": {
+                "ros__parameters": {
+                    "camera_name": "a",
+                    "image_width": 640,
+                    "image_height": 480,
+                    "camera_matrix": {"rows": 3, "cols": 3, "data": FLAT},
+                    "distortion_model": "plumb_bob",
+                    "distortion_coefficients": {"rows": 1, "cols": 5, "data": D5},
+                }
+            }
+        },
+        E,
+        D5,
+        S,
+    ),
+    "Polycam": (
+        {"frames": [frame(k, fl_x=800.5, fl_y=801.25, cx=321.8, cy=239.2, w=640, h=480) for k in (1, 2)]},
+        E,
+        [],
+        S,
+    ),
+    "instant-ngp's angle": (
+        {"camera_angle_x": 2 * np.arctan(320 / 800.5), "w": 640, "h": 480, "frames": [frame(1)]},
+        [800.5, 0, 800.5, 319.5, 239.5],
+        [],
+        S,
+    ),
+    "OpenVSLAM's fisheye": (
+        lines(
+            "%YAML:1.0\n", "Camera.", setup="monocular", model="fisheye", **FX_LINES, **KB, cols=640, rows=480
+        ),
+        E,
+        FISH,
+        S,
+    ),
+    "stella_vslam": (
+        lines(
+            "Camera:\n", "  ", setup="monocular", model="perspective", **FX_LINES, **NAMED, cols=640, rows=480
+        ),
+        E,
+        D5,
+        S,
+    ),
+    "ORB-SLAM3's fisheye": (
+        lines('%YAML:1.0\nCamera.type: "KannalaBrandt8"\n', "Camera1.", **FX_LINES, **KB)
+        + "Camera.width: 640\nCamera.height: 480\n",
+        E,
+        FISH,
+        S,
+    ),
+    "vikit": (
+        lines(
+            "cam_model: Pinhole\n",
+            "cam_",
+            width=640,
+            height=480,
+            **FX_LINES,
+            d0=-0.31,
+            d1=0.12,
+            d2=0.0011,
+            d3=-0.0007,
+        ),
+        E,
+        D4,
+        S,
+    ),
+    "vikit's fisheye": (
+        lines("cam_model: EquidistantCamera\n", "cam_", width=640, height=480, **FX_LINES)
+        + lines("", "", **KB),
+        E,
+        FISH,
+        S,
+    ),
+    "DSO": (f"RadTan 800.5 801.25 321.3 238.7 {' '.join(map(str, D4))}\n640 480\ncrop\n640 480\n", E, D4, S),
+    "DSO, relative": (
+        "Pinhole 1.25078125 1.669270833333333 0.5028125 0.4983333333333333 0\n640 480\ncrop\n640 480\n",
+        E,
+        [],
+        S,
+    ),
+    "DSO's fisheye": (
+        f"KannalaBrandt 800.5 801.25 321.3 238.7 {' '.join(map(str, FOUR))}\n640 480\nfull\n1 1\n",
+        E,
+        FISH,
+        S,
+    ),
+    "MATLAB's cameraIntrinsics": (MATLAB, E, D5, S),
+    "MATLAB's cameraParameters": (
+        {**MATLAB, "K": [[800.5, 0, 322.3], [0, 801.25, 239.7], [0, 0, 1]]},
+        E,
+        D5,
+        S,
+    ),
+    "a project of Metashape": (
+        metashape("frame", "<k1>-0.31</k1><k2>0.12</k2><k3>0.02</k3><p1>-0.0007</p1><p2>0.0011</p2>"),
+        E,
+        D5,
+        S,
+    ),
+    "Metashape's fisheye": (
+        metashape("fisheye", "<k1>0.05</k1><k2>-0.012</k2><k3>0.004</k3><k4>-0.001</k4>"),
+        E,
+        FISH,
+        S,
+    ),
+    "OpenMVG": (
+        openmvg("pinhole_radial_k3", disto_k3=[-0.31, 0.12, 0.02]),
+        ROUND,
+        [-0.31, 0.12, 0, 0, 0.02],
+        S,
+    ),
+    "OpenMVG, Brown": (
+        openmvg("pinhole_brown_t2", disto_t2=[-0.31, 0.12, 0.02, 0.0011, -0.0007]),
+        ROUND,
+        D5,
+        S,
+    ),
+    "OpenMVG's fisheye": (openmvg("fisheye", fisheye=FOUR), ROUND, FISH, S),
+    "Meshroom": (
+        meshroom(
+            ["1", "2", "6"],
+            type="pinhole",
+            focalLength="45.028125",
+            pixelRatio="1.0009369144284822",
+            principalPoint=["1.3", "-1.3"],
+            distortionType="radialk3",
+            distortionParams=["-0.31", "0.12", "0.02"],
+        ),
+        E,
+        [-0.31, 0.12, 0, 0, 0.02],
+        S,
+    ),
+    "old Meshroom": (
+        meshroom(
+            ["1", "0", "0"],
+            type="fisheye4",
+            pxFocalLength="800.5",
+            principalPoint=["321.3", "238.7"],
+            distortionParams=[str(k) for k in FOUR],
+        ),
+        ROUND,
+        FISH,
+        S,
+    ),
+    "OpenDroneMap": (
+        {
+            "v2 dji 640 480 brown": {
+                "projection_type": "brown",
+                **WH,
+                "focal_x": 800.5 / 640,
+                "focal_y": 801.25 / 640,
+                "c_x": 1.8 / 640,
+                "c_y": -0.8 / 640,
+                **NAMED,
+            }
+        },
+        E,
+        D5,
+        S,
+    ),
+    "OpenSfM": (
+        {"a": {"projection_type": "perspective", **WH, "focal": 800.5 / 640, "k1": -0.31, "k2": 0.12}},
+        [800.5, 0, 800.5, 319.5, 239.5],
+        [-0.31, 0.12],
+        S,
+    ),
+    "OpenSfM's fisheye": (
+        {
+            "projection_type": "fisheye_opencv",
+            **WH,
+            "focal_x": 800.5 / 640,
+            "focal_y": 801.25 / 640,
+            "c_x": 1.8 / 640,
+            "c_y": -0.8 / 640,
+            **KB,
+        },
+        E,
+        FISH,
+        S,
+    ),
+    "Apple's columns": ({"w": 640, "h": 480, "K": COLUMNS, "fps": 60}, E, [], S),
+    "ARKit's rows": ({"intrinsics": FLAT, "projectionMatrix": [1.5] * 16, "time": 1}, E, [], None),
+    "ARCore": (
+        {"focalLength": [800.5, 801.25], "principalPoint": [321.3, 238.7], "imageDimensions": [640, 480]},
+        E,
+        [],
+        S,
+    ),
+    "a focal length alone": (
+        {
+            "focal_length": 800.5,
+            "principal_point": [321.3, 238.7],
+            "image_size": [640, 480],
+            "dist_coeffs": D5,
+        },
+        ROUND,
+        D5,
+        S,
+    ),
+    "four numbers": (
+        {
+            "camera_matrix": list(FXY.values()),
+            "distortion_coeffs": D4,
+            "distortion_model": "radtan",
+            "resolution": [640, 480],
+        },
+        E,
+        D4,
+        S,
+    ),
+    "MVSNet": (
+        "extrinsic\n1 0 0 0.5\n0 1 0 0.2\n0 0 1 3\n0 0 0 1\n\nintrinsic\n800.5 0 321.3\n0 801.25 238.7\n"
+        "0 0 1\n\n425 2.5\n",
+        E,
+        [],
+        None,
+    ),
+    "KWIVER": (
+        "800.5 0 321.3\n0 801.25 238.7\n0 0 1\n\n1 0 0\n0 1 0\n0 0 1\n\n0.1 0.2 30\n\n"
+        f"{' '.join(map(str, D5))}\n",
+        E,
+        D5,
+        None,
+    ),
+    "NDDS": (
+        {
+            "camera_settings": [
+                {"name": "a", "intrinsic_settings": {**FXY, "s": 0}, "captured_image_size": WH}
+            ]
+        },
+        E,
+        [],
+        S,
+    ),
+    "BOP": (
+        {str(k): {"cam_K": FLAT, "cam_t_w2c": [0, 0, 500 + k], "depth_scale": 1} for k in range(3)},
+        E,
+        [],
+        None,
+    ),
+    "Open3D's trajectory": (
+        {
+            "parameters": [
+                {"extrinsic": np.ravel(EYE).tolist(), "intrinsic": {**WH, "intrinsic_matrix": COLUMNS}}
+                for _ in range(2)
+            ]
+        },
+        E,
+        [],
+        S,
+    ),
+    "Spectacular AI": (
+        {
+            "cameras": [
+                {
+                    "focalLengthX": 800.5,
+                    "focalLengthY": 801.25,
+                    "principalPointX": 321.3,
+                    "principalPointY": 238.7,
+                    "model": "pinhole",
+                    "imageWidth": 640,
+                    "imageHeight": 480,
+                }
+            ]
+        },
+        E,
+        [],
+        S,
+    ),
+    "calib.io": (
+        {
+            "Calibration": {
+                "cameras": [
+                    {
+                        "model": {
+                            "polymorphic_name": "libCalib::CameraModelOpenCV",
+                            "ptr_wrapper": {
+                                "data": {
+                                    "parameters": {key: {"val": v} for key, v in LIBCALIB.items()},
+                                    "CameraModelCRT": {"CameraModelBase": {"imageSize": WH}},
+                                }
+                            },
+                        }
+                    }
+                ]
+            }
+        },
+        E,
+        D8,
+        S,
+    ),
+    "printed matrices": (
+        "Camera matrix:\n[[800.5    0.   321.3 ]\n [  0.   801.25 238.7 ]\n [  0.     0.     1.  ]]"
+        "\n"
+        "Distortion coefficients:\n[[-0.31  0.12  0.0011 -0.0007  0.02]]\n",
+        E,
+        D5,
+        None,
+    ),
+    "Azure Kinect": (
+        KINECT,
+        [0.478 * 1920, 0, 0.6372 * 1440, 959.5, 0.5025 * 1440 - 180.5],
+        D8,
+        (1920, 1080),
+    ),
+}
+
+
+def written(content: Any, folder: Path) -> Path:
+    place = folder / "camera"
+    place.write_text(content if isinstance(content, str) else json.dumps(content))
+    return place
+
+
+@pytest.mark.parametrize("kind", MET)
+def test_a_camera_as_it_is_kept_is_read(kind: str, tmp_path: Path) -> None:
+    content, entries, lens, size = MET[kind]
+    found = read_cameras([written(content, tmp_path)], size=(1920, 1080) if kind == "Azure Kinect" else None)
+    check(found.cameras[0], entries, lens)
+    assert found.cameras[0].image_size == size
+
+
+def oak(socket: int, to: int, t: list[float]) -> list[Any]:
+    link = {"rotationMatrix": R, "toCameraSocket": to, "translation": dict(zip("xyz", t, strict=True))}
+    one = {
+        "cameraType": 0,
+        "distortionCoeff": [*D8, *[0.0] * 6],
+        "intrinsicMatrix": K,
+        **WH,
+        "extrinsics": link,
+    }
+    return [socket, one]
+
+
+ONE = {"K": K, "dist": [D5], "image_size": [640, 480], "model": "standard"}
+TURNED = np.array(R) @ POINT + SHIFT
+BACK = np.array(R).T @ (POINT - SHIFT)
+# Of each kind of rig: the tree, the coefficients, and where further cameras see the point of the first.
+RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
+    "two mappings": (
+        {"left": {"K": K, "D": D5}, "right": {"K": K, "D": D5}, "R": R, "T": [[t] for t in SHIFT]},
+        D5,
+        [TURNED],
+    ),
+    "two sides": (
+        {
+            f"{side}_{key}": value
+            for side in ("left", "right")
+            for key, value in (("camera_matrix", K), ("distortion", D5))
+        }
+        | {"R": R, "T": SHIFT},
+        D5,
+        [TURNED],
+    ),
+    "multical": (
+        {
+            "cameras": {"a": ONE, "b": ONE, "c": ONE},
+            "camera_poses": {
+                "c_to_b": {"R": R, "T": SHIFT},
+                "a": {"R": np.eye(3).tolist(), "T": [0, 0, 0]},
+                "b_to_a": {"R": R, "T": SHIFT},
+            },
+        },
+        D5,
+        [TURNED, np.array(R) @ TURNED + SHIFT],
+    ),
+    "OAK": (
+        {"boardName": "x", "cameraData": [oak(2, 1, SHIFT), oak(1, 0, SHIFT), oak(0, -1, [0, 0, 0])]},
+        D8,
+        [BACK, np.array(R).T @ (BACK - SHIFT)],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", RIGS)
+def test_the_cameras_of_a_rig_lie_as_it_says(kind: str, tmp_path: Path) -> None:
+    content, lens, points = RIGS[kind]
+    found = read_cameras([written(content, tmp_path)])
+    for camera in found.cameras:
+        check(camera, E, lens)
+    for pose, point in zip(found.relative, points, strict=True):
+        assert np.abs(pose.to_camera(POINT) - point).max() < 1e-9
+
+
+def test_a_pair_of_middlebury_lies_along_its_baseline(tmp_path: Path) -> None:
+    text = (
+        "cam0=[800.5 0 321.3; 0 800.5 238.7; 0 0 1]\ncam1=[800.5 0 351.3; 0 800.5 238.7; 0 0 1]\ndoffs=30\n"
+    )
+    found = read_cameras([written(f"{text}baseline=193.001\nwidth=640\nheight=480\nndisp=290\n", tmp_path)])
+    for camera, cx in zip(found.cameras, (321.3, 351.3), strict=True):
+        check(camera, [800.5, 0, 800.5, cx, 238.7], [])
+        assert camera.image_size == S
+    assert np.abs(found.relative[0].to_camera(POINT) - (POINT - [193.001, 0, 0])).max() < 1e-12
+
+
+def test_two_files_of_easymocap_are_a_rig(tmp_path: Path) -> None:
+    matrix = "{}: !!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
+    head = '%YAML:1.0\n---\nnames:\n   - "1"\n   - "2"\n'
+    parts = [matrix.format(f"K_{k}", 3, 3, FLAT) + matrix.format(f"dist_{k}", 1, 5, D5) for k in "12"]
+    (tmp_path / "intri.yml").write_text(head + "".join(parts))
+    poses = (np.eye(3).tolist(), [0.0, 0, 0]), (R, SHIFT)
+    parts = [
+        matrix.format(f"Rot_{k}", 3, 3, np.ravel(rotation).tolist()) + matrix.format(f"T_{k}", 3, 1, t)
+        for k, (rotation, t) in zip("12", poses, strict=True)
+    ]
+    (tmp_path / "extri.yml").write_text(head + "".join(parts))
+    found = read_cameras([tmp_path / "extri.yml", tmp_path / "intri.yml"])
+    check(found.cameras[1], E, D5)
+    assert np.abs(found.relative[0].to_camera(POINT) - TURNED).max() < 1e-9
+    with pytest.raises(FormatError, match=r"give intri\.yml and extri\.yml"):
+        read_cameras([tmp_path / "intri.yml"])
+
+
+def test_the_polynomial_of_ocamcalib_becomes_the_nearest_fisheye(tmp_path: Path) -> None:
+    pol, centre, (c, d, e) = [-289.0, 0.0, 1.5e-3, -3.1e-6, 7.2e-9], (391.0, 423.5), (0.998, 0.012, -0.011)
+    rows = [[5, *pol], [2, 400, 200], centre, (c, d, e), (800, 848)]
+    blocks = [
+        "polynomial coefficients for the DIRECT mapping function",
+        "inverse",
+        "center",
+        "affine",
+        "size",
+    ]
+    text = "".join(f"#{b}\n\n{' '.join(map(repr, row))}\n\n" for b, row in zip(blocks, rows, strict=True))
+    notes: list[str] = []
+    warnings: list[str] = []
+    (camera,) = read_cameras([written(text, tmp_path)], notes, warnings).cameras
+    assert "the nearest fisheye moves pixels by" in warnings[0]
+    stated = float(warnings[0].split(" moves pixels by ")[1].split()[0])
+    pixels = np.random.default_rng(1).uniform([0, 0], [847, 799], (500, 2))
+    row, column = pixels[:, 1] - centre[0], pixels[:, 0] - centre[1]
+    x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
+    rays = np.column_stack([y, x, -np.polyval(pol[::-1], np.hypot(x, y))])
+    rays = np.array([rotated([0, 0, np.arctan2(d, c)], ray) for ray in rays])
+    error = np.hypot(*(camera.project(rays)[0] - pixels).T).max()
+    assert error < 1.1 * stated < 2.0
+    assert "turned about its axis by 0.689 degrees" in notes[0]
+
+
+def test_the_fov_of_dso_becomes_the_nearest_fisheye(tmp_path: Path) -> None:
+    warnings: list[str] = []
+    text = "0.535719 0.669567 0.493249 0.500409 0.897966\n1280 1024\ncrop\n640 480\n"
+    (camera,) = read_cameras([written(text, tmp_path)], warnings=warnings).cameras
+    assert "moves pixels by 2.7e-05 px at most" in warnings[0]
+    theta, phi = np.random.default_rng(1).uniform(0.0, [[0.9], [6.28]], (2, 99))
+    rays = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    bent = np.arctan(2 * np.tan(theta) * np.tan(0.897966 / 2)) / 0.897966
+    f, c = np.array([0.535719 * 1280, 0.669567 * 1024]), np.array([0.493249 * 1280, 0.500409 * 1024]) - 0.5
+    expected = f * np.column_stack([np.cos(phi), np.sin(phi)]) * bent[:, None] + c
+    assert np.abs(camera.project(rays)[0] - expected).max() < 1e-4
+
+
+MANY = [{"camera_intrinsic": [[1266.4 + k, 0, 816.2], [0, 1266.4, 491.5], [0, 0, 1]]} for k in range(3)]
+REFUSED: dict[str, tuple[Any, str]] = {
+    "nuScenes": (MANY, "holds several cameras (0, 1, 2)"),
+    "no size": ({"camera_angle_x": 0.69, "frames": [frame(1)]}, "give --image-size W H"),
+    "VINS-Fusion": ('%YAML:1.0\ncam0_calib: "a.yaml"\nbody_T_cam0: 1\n', "names the files of its cameras"),
+    "transposed": ({"camera_matrix": np.array(K).T.tolist()}, "is transposed, as MATLAB writes it"),
+    "mm": (
+        {"focal_length": 35, "principal_point": [320, 240], "image_size": [640, 480]},
+        "not told to be in pixels",
+    ),
+    "Pix4D": ("Pix4D camera calibration file 0\nF 4.7\nPx 3.08\n", "is a camera of Pix4D in mm"),
+    "Bundler": ("# Bundle file v0.3\n1 0\n800 0 0\n", "is a model of Bundler"),
+    "VisualSFM": ("NVM_V3 \n\n1\na.jpg 800 1 0 0 0 0 0 0 0 0\n", "is a model of VisualSFM"),
+    "RealityCapture": (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><a xmlns:xcr="http://www.capturingreality.com/ns"/></x:xmpmeta>',
+        "is a camera of RealityCapture",
+    ),
+    "OpenPTV": ("0.0001 0.0 0.0 0.0 0.0 1.0 0.0\n", "is the distortion of a camera of OpenPTV"),
+    "equirectangular": (
+        lines("Camera:\n", "  ", setup="a", model="equirectangular", fx=1, fy=1, cx=1, cy=1),
+        "the model 'equirectangular' of OpenVSLAM is not known",
+    ),
+    "several of OpenSfM": (
+        {
+            k: {"projection_type": "perspective", **WH, "focal": f, "k1": 0, "k2": 0}
+            for k, f in (("a", 0.8), ("b", 0.9))
+        },
+        "holds several cameras of OpenSfM (a, b)",
+    ),
+    "Kinect": (KINECT, "convert that of one with --image-size: 1280 720"),
+    "p1 of a fisheye": (metashape("fisheye", "<p1>0.1</p1>"), "the coefficient p1 of Metashape's fisheye"),
+    "four of KWIVER": (
+        "800 0 320\n0 801 240\n0 0 1\n1 0 0\n0 1 0\n0 0 1\n0 0 3\n1 2 3 4\n",
+        "may be k1, k2, p1",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_what_cannot_be_read_is_named(kind: str, tmp_path: Path) -> None:
+    content, message = REFUSED[kind]
+    with pytest.raises(FormatError) as caught:
+        read_cameras([written(content, tmp_path)])
+    assert message in str(caught.value)
+    assert str(caught.value).isprintable()
