@@ -207,7 +207,7 @@ class LooseKeys:
             field = self.find(
                 [n for n in MATRIX if len(n) > 1 or not side],
                 side,
-                lambda v: not isinstance(v, dict) or "data" in v,
+                lambda v: not isinstance(v, dict) or not {"data", "rows"}.isdisjoint(v),
             )
         if field is None:
             keys = ", ".join(str(key)[:30] for key in list(self.root.value)[:6])
