@@ -5,7 +5,7 @@ The views have an entry each, or columns in a long file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from neurocal_cli.calibration.calibration import Rejected, Verdict, ViewResult
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, rotation_to_euler
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.key_tables import Keys, record
 from neurocal_cli.files.text_columns import (
     as_fields,
     column_lines,
@@ -28,13 +29,10 @@ from neurocal_cli.files.text_columns import (
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
-    boolean,
     flows,
     indented,
-    mapping,
     number,
     quoted,
-    quoted_words,
     text,
 )
 from neurocal_cli.observations.points import Correspondences
@@ -49,6 +47,7 @@ _SAME = 1e-6
 _REJECTED = ("X", "Y", "Z", "u", "v", "error_px")
 _TARGET = ("X", "Y", "Z", "X_given", "Y_given", "Z_given", "sX", "sY", "sZ")
 _STATED = ("sX_stated", "sY_stated", "sZ_stated")
+_TARGET_KEYS = Keys("flat: boolean, evidence: number, sizes: measures")
 _SHAPES = ("bowl", "saddle", "twist")
 
 
@@ -179,25 +178,12 @@ def _view(entry: Field) -> ViewResult:
     )
 
 
-def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
+VERDICT = record(Verdict, Keys("word: text, reasons: sentences, advice: sentences, measures: measures"))
+
+
+def verdict_lines(verdict: Verdict | None) -> Iterable[str]:
     """Lines of the block ``verdict``; none if there is no verdict."""
-    if verdict is None:
-        return
-    yield "verdict:"
-    yield f"  word: {text(verdict.word)}"
-    yield f"  reasons: {quoted_words(verdict.reasons)}"
-    yield f"  advice: {quoted_words(verdict.advice)}"
-    yield f"  measures: {mapping(**{name: number(value) for name, value in verdict.measures.items()})}"
-
-
-def read_verdict(field: Field) -> Verdict:
-    """Read the block ``verdict`` back."""
-    return Verdict(
-        field["word"].text(),
-        tuple(field["reasons"].texts()),
-        tuple(field["advice"].texts()),
-        {name: measure.number_or_nan() for name, measure in field["measures"].entries().items()},
-    )
+    return [] if verdict is None else VERDICT.lines("verdict", verdict, False)
 
 
 def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
@@ -251,9 +237,7 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     if target is None:
         return
     yield "target:"
-    yield f"  flat: {boolean(target.flat)}"
-    yield f"  evidence: {number(target.evidence)}"
-    yield f"  sizes: {mapping(**{name: number(size) for name, size in target.sizes.items()})}"
+    yield from indented(_TARGET_KEYS.lines(target))
     columns: dict[str, NDArray[Any] | list[str]] = {}
     if target.point is not None:
         columns["point"] = [str(label) for label in target.point]
@@ -282,9 +266,7 @@ def read_target(field: Field) -> Target:
         given=numbers[:, 3:6],
         std=numbers[:, 6:],
         plane=np.array([cell.integer() for cell in columns["plane"].items()], dtype=np.intp),
-        sizes={name: size.number() for name, size in field["sizes"].entries().items()},
-        flat=field["flat"].boolean(),
-        evidence=field["evidence"].number(),
+        **_TARGET_KEYS.read(field),
         point=np.array(columns["point"].texts()) if "point" in columns else None,
         stated=numbers_of(columns, stated).T if stated else None,
         bends=field.read("bends", _read_bends),

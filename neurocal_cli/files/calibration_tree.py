@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from neurocal_cli.adjustment.normal_equations import unit_diagonal
-from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
-from neurocal_cli.camera.distortion import StraightLines, coefficient_names
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import read_rejected, read_target, read_verdict, read_views
-from neurocal_cli.files.calibration_yaml import FORMATS, NETWORK_COUNTS, NETWORK_ERRORS
+from neurocal_cli.files.calibration_blocks import VERDICT, read_rejected, read_target, read_views
+from neurocal_cli.files.calibration_yaml import (
+    CENTRE,
+    FIT,
+    FORMATS,
+    HEAD,
+    NETWORK,
+    OPTIONS,
+    STRAIGHT_LINES,
+)
 from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.file_storage import read_tree
 from neurocal_cli.files.observations_yaml import read_observations
-from neurocal_cli.files.text_columns import read_named, read_numbers
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
 
@@ -43,8 +49,8 @@ def calibration_from_field(root: Field) -> Calibration:
     """Read a whole calibration from a file, or from the part ``left`` or ``right`` of a rig."""
     block = neurocal_block(root)
     views = read_views(block["views"])
-    fit = block["fit"]
-    n_points = fit["n_points"].integer()
+    fit = FIT.read(block["fit"])
+    n_points = fit.pop("n_points")
     points = _points(root, block, set(views), n_points == 0)
     if n_points != len(points):
         root.refuse(
@@ -52,10 +58,10 @@ def calibration_from_field(root: Field) -> Calibration:
             "calibrate again"
         )
     rejected = read_rejected(block.get("rejected"), points.unit)
-    if fit["n_rejected"].integer() != len(rejected):
-        fit["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
-    kind = block["type"].integer()
-    if kind not in (1, 2, 3, 4):
+    if fit.pop("n_rejected") != len(rejected):
+        block["fit"]["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
+    head = HEAD.read(block)
+    if head["type"] not in (1, 2, 3, 4):
         block["type"].fail("1, 2, 3 or 4")
     model, coefficients = distortion_from_field(root)
     names, covariance = covariance_from_field(block, "covariance")
@@ -67,33 +73,23 @@ def calibration_from_field(root: Field) -> Calibration:
         fixed=fixed,
         views=views,
         points=points,
-        type=kind,
-        method=block["method"].text(),
-        trainer=block["trainer"].text(),
-        seed=block["seed"].integer(),
-        converged=block["converged"].boolean(),
-        stop_reason=block["stop_reason"].text(),
-        rmse_px=fit["rmse_px"].number_or_nan(),
-        max_px=fit["max_px"].number_or_nan(),
+        **head,
+        **fit,
         distortion_model=model,
         distortion=coefficients,
         covariance=covariance,
         covariance_names=names,
         given_covariance=given_covariance,
         given_names=given_names,
-        network=block.read("network", _network),
-        straight_lines=block.read("straight_lines", _straight_lines),
+        network=block.read("network", NETWORK.read),
+        straight_lines=block.read("straight_lines", STRAIGHT_LINES.read),
         camera_name=root.get("camera_name", "camera").text(),
         warnings=tuple(block.get("warnings", []).texts()),
         rejected=rejected,
         target=block.read("target", read_target),
-        judgement=block.read("verdict", read_verdict),
-        lens_choice={
-            name: error.number_or_nan() for name, error in block.get("lens_choice", {}).entries().items()
-        },
+        judgement=block.read("verdict", VERDICT.read),
         second_poses=read_views(block.get("second_poses", [])),
-        target_stretched=block.get("target_stretched", 0.0).number(),
-        square_pixels=block.get("square_pixels", False).boolean(),
+        **OPTIONS.read(block),
     )
 
 
@@ -205,44 +201,10 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     return model, coefficients[: len(names)]
 
 
-def _network(field: Field) -> NetworkRecord:
-    numbers: dict[str, Any] = {name: field[name].integer() for name in NETWORK_COUNTS}
-    numbers |= {name: field[name].number_or_nan() for name in NETWORK_ERRORS}
-    return NetworkRecord(
-        W=field["W"].array(3, 3),
-        V=_matrices(field["V"], 3, 4),
-        S1=field["S1"].array(3, 3),
-        S2=_matrices(field["S2"], 4, 4),
-        curve=tuple(field["curve"].array(-1, unknown=True).tolist()),
-        **numbers,
-    )
-
-
-def _matrices(field: Field, *shape: int) -> dict[str, Array]:
-    """Read a matrix for each view; a long file has the names, and the numbers of all matrices as texts."""
-    if "data" in field and "views" in field and all(isinstance(e.value, str) for e in field["data"].items()):
-        names, data = field["views"].texts(), field["data"]
-        numbers = Field(read_numbers(list(data.items())), data.source, data.path)
-        stack = numbers.array(len(names) * shape[0] * shape[1]).reshape(-1, *shape)
-        return dict(zip(names, stack, strict=True))
-    return {view: entry.array(*shape) for view, entry in read_named(field).items()}
-
-
-def _straight_lines(field: Field) -> StraightLines:
-    u, v = field["center"].array(2).tolist()
-    return StraightLines(
-        n_lines=field["n_lines"].integer(),
-        n_points=field["n_points"].integer(),
-        centre=(u, v),
-        rms_before=field["rms_before_px"].number_or_nan(),
-        rms_after=field["rms_after_px"].number_or_nan(),
-    )
-
-
 def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
     observations = block["observations"]
     unit = _unit(block)
-    center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
+    center = CENTRE.read(block)["image_center"]
     points = read_observations(observations, unit, image_size(root), center, none)
     if strange := set() if points.view is None else set(points.view_names) - views:
         root.refuse(

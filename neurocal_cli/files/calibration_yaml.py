@@ -16,7 +16,7 @@ import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration.calibration import Calibration, NetworkRecord
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import StraightLines, coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.files.calibration_blocks import (
@@ -28,30 +28,69 @@ from neurocal_cli.files.calibration_blocks import (
     view_lines,
 )
 from neurocal_cli.files.camera_tree import camera_info_lines
+from neurocal_cli.files.key_tables import Keys, Kind, record
 from neurocal_cli.files.observations_yaml import observation_lines
-from neurocal_cli.files.text_columns import column_lines, named_lines
-from neurocal_cli.files.yaml_text import (
-    block,
-    boolean,
-    flow,
-    flows,
-    list_lines,
-    mapping,
-    number,
-    quoted,
-    text,
-    words,
-)
+from neurocal_cli.files.text_columns import column_lines, named_lines, read_named, read_numbers
+from neurocal_cli.files.tree_fields import Field
+from neurocal_cli.files.yaml_text import block, flow, flows, mapping, number, text, words
 
 FORMATS = (1, 2)  # of the neurocal block: tables by rows; tables by columns, in long files
 
 # OpenCV 4 opens no YAML file without these two lines; 1.1 is the version that PyYAML and ROS read.
 HEADER = ("%YAML 1.1", "---")
 
-NETWORK_COUNTS = ("starts", "agreed", "iterations", "refine_iterations")
-NETWORK_ERRORS = ("loss", "rmse_before", "rmse_after")
 _MOST_VIEWS = 100
 _MOST_POINTS = 5000
+
+
+def _matrices(*shape: int) -> Kind:
+    """A matrix for each view; a long file has the names, and the numbers of all matrices as texts."""
+
+    def read(field: Field) -> dict[str, Array]:
+        texts = field["data"].items() if "data" in field and "views" in field else []
+        if (data := list(texts)) and all(isinstance(entry.value, str) for entry in data):
+            names = field["views"].texts()
+            numbers = Field(read_numbers(data), field.source, f"{field.path}.data")
+            stack = numbers.array(len(names) * shape[0] * shape[1]).reshape(-1, *shape)
+            return dict(zip(names, stack, strict=True))
+        return {view: entry.array(*shape) for view, entry in read_named(field).items()}
+
+    def lines(name: str, matrices: Mapping[str, Array], long: bool) -> list[str]:
+        stack = np.array(list(matrices.values()))
+        if not long:
+            return list(named_lines(name, matrices, flows(stack)))
+        return block(name, column_lines({"views": list(matrices), "data": stack.ravel()}))
+
+    return Kind(read, lines)
+
+
+HEAD = Keys(
+    "type: integer, method: text, trainer: text, seed: integer, converged: boolean, stop_reason: text"
+)
+# lens_choice is in px, of data left out; target_stretched is a probability.
+OPTIONS = Keys("lens_choice?: measures, square_pixels?: boolean, target_stretched?: number")
+FIT = Keys(
+    "n_points: integer, n_rejected: integer, rmse_px: measure, max_px: measure",
+    n_points=lambda cal: len(cal.points),
+)
+WARNINGS = Keys("warnings: lines")
+NETWORK = record(
+    NetworkRecord,
+    Keys(
+        "V: hidden, W: 3x3, S1: 3x3, S2: world, starts: integer, agreed: integer, iterations: integer,"
+        "refine_iterations: integer, loss: measure, rmse_before: measure, rmse_after: measure, curve: curve",
+        {"hidden": _matrices(3, 4), "world": _matrices(4, 4)},
+    ),
+)
+STRAIGHT_LINES = record(
+    StraightLines,
+    Keys(
+        "n_lines: integer, n_points: integer, center=centre: pair, rms_before_px=rms_before: measure,"
+        "rms_after_px=rms_after: measure"
+    ),
+    inline=True,
+)
+CENTRE = Keys("image_center?: pair")
 
 
 def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
@@ -73,40 +112,20 @@ def _block_lines(cal: Calibration, long: bool) -> Iterator[str]:
     """Lines of the block ``neurocal``."""
     yield f"format: {FORMATS[long]}"
     yield f"version: {text(__version__)}"
-    yield f"type: {cal.type}"
-    yield f"method: {text(cal.method)}"
-    yield f"trainer: {text(cal.trainer)}"
-    yield f"seed: {cal.seed}"
-    yield f"converged: {boolean(cal.converged)}"
-    yield f"stop_reason: {text(str.__str__(cal.stop_reason))}"
+    yield from HEAD.lines(cal)
     yield f"unit: {text(cal.unit)}"
     yield f"distortion: {text(cal.distortion_model)}"
-    if cal.lens_choice:  # rms error on data left out [px]
-        yield f"lens_choice: {mapping(**{name: number(error) for name, error in cal.lens_choice.items()})}"
-    if cal.square_pixels:
-        yield "square_pixels: true"
-    if cal.target_stretched:  # probability
-        yield f"target_stretched: {number(cal.target_stretched)}"
-    if cal.points.image_center is not None:
-        yield f"image_center: {flow(np.array(cal.points.image_center))}"
+    yield from OPTIONS.lines(cal)
+    yield from CENTRE.lines(cal.points)
     yield from _parameter_lines(cal)
     yield from view_lines(cal.views, cal.K, long)
     yield from second_pose_lines(cal.second_poses, cal.K)
-    if cal.network is None:
-        yield "network: null"
-    else:
-        yield from block("network", _network_lines(cal.network, long))
+    yield from ["network: null"] if cal.network is None else NETWORK.lines("network", cal.network, long)
     yield from verdict_lines(cal.verdict)
     yield from rejected_lines(cal.rejected, long)
     yield from target_lines(cal.target, long)
-    if (straight := cal.straight_lines) is not None:
-        yield "straight_lines: " + mapping(
-            n_lines=str(straight.n_lines),
-            n_points=str(straight.n_points),
-            center=flow(np.array(straight.centre)),
-            rms_before_px=number(straight.rms_before),
-            rms_after_px=number(straight.rms_after),
-        )
+    if cal.straight_lines is not None:
+        yield from STRAIGHT_LINES.lines("straight_lines", cal.straight_lines, long)
     yield from observation_lines(cal.points, long)
 
 
@@ -127,30 +146,5 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
     if cal.given_names:
         given = mapping(names=words(cal.given_names), data=flow(cal.given_covariance))
         yield f"given_covariance: {given}"
-    yield "fit: " + mapping(
-        n_points=str(len(cal.points)),
-        n_rejected=str(cal.n_rejected),
-        rmse_px=number(cal.rmse_px),
-        max_px=number(cal.max_px),
-    )
-    yield from list_lines("warnings", map(quoted, cal.warnings))
-
-
-def _network_lines(network: NetworkRecord, long: bool) -> Iterator[str]:
-    yield from _matrix_lines("V", network.V, long)
-    yield f"W: {flow(network.W)}"
-    yield f"S1: {flow(network.S1)}"
-    yield from _matrix_lines("S2", network.S2, long)
-    for name in NETWORK_COUNTS:
-        yield f"{name}: {int(getattr(network, name))}"
-    for name in NETWORK_ERRORS:
-        yield f"{name}: {number(getattr(network, name))}"
-    yield f"curve: {flow(np.array(network.curve, dtype=float))}"
-
-
-def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> list[str]:
-    stack = np.array(list(matrices.values()))
-    if not long:
-        return list(named_lines(name, matrices, flows(stack)))
-    columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
-    return block(name, column_lines(columns))
+    yield f"fit: {FIT.flow(cal)}"
+    yield from WARNINGS.lines(cal)

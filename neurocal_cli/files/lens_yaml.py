@@ -17,21 +17,11 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.files.calibration_blocks import read_target, target_lines
 from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.key_tables import Keys, Kind, inline, record
 from neurocal_cli.files.text_columns import table_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import (
-    block,
-    boolean,
-    flow,
-    list_lines,
-    mapping,
-    number,
-    quoted,
-    read_yaml,
-    text,
-    words,
-)
+from neurocal_cli.files.yaml_text import block, flow, indented, list_lines, number, quoted, read_yaml, text
 
 _FORMAT = 2
 _BLOCK = "neurocal_lens"
@@ -71,122 +61,24 @@ def lens_from_field(root: Field) -> ZoomLens:
 
 
 def _lines(lens: ZoomLens) -> Iterator[str]:
-    yield from _record_lines(lens)
+    yield f"format: {_FORMAT}"
+    yield f"version: {text(__version__)}"
+    yield from _HEAD.lines(lens)
     columns = dict(zip(lens.controls, lens.settings.T, strict=True))
     columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
     yield from block("settings", table_lines(columns, long=False, indent=2))
     yield "members:"
     for member in lens.members:
         yield f"  - scale: {member.nets.scale}"
-        yield f"    constants: {_constants(member.constants)}"
+        yield from indented(_CONSTANTS.lines("constants", member.constants, False), 4)
         yield "    networks:"
         for name, net in zip(lens.names, member.nets.nets, strict=True):
-            yield f"      {name}:"
-            yield f"        hidden: [{net.topology.own}, {net.topology.hidden}]"
-            for key in ("centre", "spread", "scatter"):
-                yield f"        {key}: {number(getattr(net, key))}"
-            yield f"        precision: {flow(net.precision)}"
-            yield f"        weights: {flow(net.weights)}"
+            yield from indented(block(name, _NET.lines(net)), 6)
     for name, table in (("tables", lens.tables), ("static", lens.static)):
-        yield f"{name}:"
-        yield f"  constants: {_constants(table.constants)}"
-        yield f"  local: {flow(table.local)}"
-        upper = np.triu_indices(table.normal.H.shape[1])
-        yield f"  H: {flow(table.normal.H[:, upper[0], upper[1]])}"
-        yield f"  g: {flow(table.normal.g)}"
-        yield f"  cost: {flow(table.normal.cost)}"
+        yield from block(name, _TABLE.lines(table))
     yield from target_lines(lens.target, long=False)
     if lens.target_coupling is not None:
         yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
-
-
-def _record_lines(lens: ZoomLens) -> Iterator[str]:
-    width, height = lens.image_size or (0, 0)
-    yield f"format: {_FORMAT}"
-    yield f"version: {text(__version__)}"
-    yield f"controls: {words(lens.controls)}"
-    yield f"parameters: {words(lens.names)}"
-    yield f"distortion: {text(lens.model)}"
-    yield f"camera: {'known' if lens.known else 'still' if lens.still else 'moving'}"
-    yield f"skew: {boolean(lens.free_theta)}"
-    yield f"training: {text(lens.training)}"
-    yield f"seed: {lens.seed}"
-    yield f"converged: {boolean(lens.converged)}"
-    yield f"unit: {text(lens.unit)}"
-    yield f"image_width: {width}"
-    yield f"image_height: {height}"
-    yield "fit: " + mapping(
-        n_points=str(int(lens.counts.sum())),
-        rmse_px=number(lens.rmse_px if not lens.known else np.nan),
-        left_out_px=number(lens.left_out_px),
-        free_pose_px=number(lens.free_pose_px),
-        variance=number(lens.variance),
-    )
-    yield f"scatter: {flow(lens.scatter)}"
-    rejected = [
-        mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason)) for bad in lens.rejected
-    ]
-    yield from list_lines("rejected", rejected)
-    yield from list_lines("warnings", map(quoted, lens.warnings))
-
-
-def _constants(constants: Constants) -> str:
-    return mapping(theta=number(constants.theta), R=flow(constants.R), t=flow(constants.t))
-
-
-def _lens(block: Field) -> ZoomLens:
-    if block["format"].integer() != _FORMAT:
-        block.refuse(
-            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again"
-        )
-    controls = tuple(block["controls"].texts())
-    if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
-        block["controls"].fail("zoom, focus or both")
-    camera = block["camera"].text()
-    if camera not in ("known", "still", "moving"):
-        block["camera"].fail("known, still or moving")
-    names, model = _parameter_names(block, camera)
-    settings, counts, rmse = _settings(block["settings"], len(controls))
-    L, S = len(names), len(settings)
-    members = tuple(_member(field, names, len(controls)) for field in block["members"].items())
-    if not members:
-        block["members"].fail("a list of at least one lens")
-    width, height = block["image_width"].integer(), block["image_height"].integer()
-    fit = block["fit"]
-    Q = {"known": 0, "still": 6, "moving": 1}[camera]
-    coupling = block.read("target_coupling", lambda field: field.array(S, -1))
-    if coupling is not None and coupling.shape[1] % (L + Q):
-        block["target_coupling"].fail(f"rows of a multiple of {L + Q} numbers")
-    return ZoomLens(
-        controls=controls,
-        settings=settings,
-        names=names,
-        model=model,
-        still=camera == "still",
-        known=camera == "known",
-        members=members,
-        tables=_table(block["tables"], S, L, Q),
-        static=_table(block["static"], S, L, Q),
-        variance=_positive(fit["variance"]),
-        scatter=block["scatter"].array(L),
-        free_theta=block["skew"].boolean(),
-        counts=counts,
-        rmse=rmse,
-        rejected=tuple(
-            RejectedSetting(tuple(bad["setting"].array(len(controls)).tolist()), bad["reason"].text())
-            for bad in block["rejected"].items()
-        ),
-        left_out_px=fit["left_out_px"].number_or_nan(),
-        free_pose_px=fit.get("free_pose_px").number_or_nan(),
-        training=block["training"].text(),
-        seed=block["seed"].integer(),
-        converged=block["converged"].boolean(),
-        image_size=(width, height) if width and height else None,
-        unit=block["unit"].text(),
-        warnings=tuple(block["warnings"].texts()),
-        target=block.read("target", read_target),
-        target_coupling=None if coupling is None else coupling.reshape(S, L + Q, -1),
-    )
 
 
 def _positive(field: Field) -> float:
@@ -196,17 +88,112 @@ def _positive(field: Field) -> float:
     return value
 
 
-def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
-    """Read and check the names of the local parameters; returns the distortion model, too."""
-    model = block["distortion"].text()
+def _upper(H: Array) -> Array:
+    rows, cols = np.triu_indices(H.shape[1])
+    return H[:, rows, cols]
+
+
+_positive_number = {"positive": inline(_positive, number)}
+_CONSTANTS = record(Constants, Keys("theta: number, R: 3x3, t: 2"), inline=True)
+_NET = Keys(
+    "hidden: units, centre: number, spread: positive, scatter: number, precision: n, weights: n",
+    {"units": inline(lambda field: field.array(2), str), **_positive_number},
+    hidden=lambda net: [net.topology.own, net.topology.hidden],
+)
+_TABLE = Keys(
+    "constants: constants, local: nxn, H: nxn, g: nxn, cost: n",
+    {"constants": _CONSTANTS},
+    H=lambda table: _upper(table.normal.H),
+    g=lambda table: table.normal.g,
+    cost=lambda table: table.normal.cost,
+)
+_FIT = Keys(
+    "n_points: integer, rmse_px: measure, left_out_px: measure, free_pose_px?: measure, variance: positive",
+    _positive_number,
+    n_points=lambda lens: lens.counts.sum(),
+    rmse_px=lambda lens: np.nan if lens.known else lens.rmse_px,
+)
+_REJECTED = Keys(
+    "setting: setting, reason: quoted",
+    {
+        "setting": inline(lambda f: tuple(f.array(-1).tolist()), lambda setting: flow(np.array(setting))),
+        "quoted": inline(Field.text, quoted),
+    },
+)
+_HEAD = Keys(
+    "controls: names, parameters=names: names, distortion=model: text, camera: text,"
+    "skew=free_theta: boolean,"
+    "training: text, seed: integer, converged: boolean, unit: text, image_width: integer,"
+    "image_height: integer, fit: fit, scatter: n, rejected: rejected, warnings: lines",
+    {
+        "fit": record(dict, _FIT, inline=True),
+        "rejected": Kind(
+            lambda field: tuple(RejectedSetting(**_REJECTED.read(entry)) for entry in field.items()),
+            lambda key, rejected, _: list_lines(key, map(_REJECTED.flow, rejected)),
+        ),
+    },
+    camera=lambda lens: "known" if lens.known else "still" if lens.still else "moving",
+    image_width=lambda lens: (lens.image_size or (0, 0))[0],
+    image_height=lambda lens: (lens.image_size or (0, 0))[1],
+    fit=lambda lens: lens,
+)
+
+
+def _lens(block: Field) -> ZoomLens:
+    if block["format"].integer() != _FORMAT:
+        block.refuse(
+            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again"
+        )
+    head = _HEAD.read(block)
+    controls, names, model = (head[key] for key in ("controls", "names", "model"))
+    if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
+        block["controls"].fail("zoom, focus or both")
+    camera, fit = head.pop("camera"), head.pop("fit")
+    if camera not in ("known", "still", "moving"):
+        block["camera"].fail("known, still or moving")
+    _check_names(block, camera, names, model)
+    settings, counts, rmse = _settings(block["settings"], len(controls))
+    L, S = len(names), len(settings)
+    if head["scatter"].shape != (L,):
+        block["scatter"].fail(f"{L} finite numbers")
+    for bad, field in zip(head["rejected"], block["rejected"].items(), strict=True):
+        if len(bad.setting) != len(controls):
+            field["setting"].fail(f"{len(controls)} finite numbers")
+    members = tuple(_member(field, names, len(controls)) for field in block["members"].items())
+    if not members:
+        block["members"].fail("a list of at least one lens")
+    size = head.pop("image_width"), head.pop("image_height")
+    Q = {"known": 0, "still": 6, "moving": 1}[camera]
+    coupling = block.read("target_coupling", lambda field: field.array(S, -1))
+    if coupling is not None and coupling.shape[1] % (L + Q):
+        block["target_coupling"].fail(f"rows of a multiple of {L + Q} numbers")
+    return ZoomLens(
+        **head,
+        settings=settings,
+        still=camera == "still",
+        known=camera == "known",
+        members=members,
+        tables=_table(block["tables"], S, L, Q),
+        static=_table(block["static"], S, L, Q),
+        variance=fit["variance"],
+        counts=counts,
+        rmse=rmse,
+        left_out_px=fit["left_out_px"],
+        free_pose_px=np.nan if fit["free_pose_px"] is None else fit["free_pose_px"],
+        image_size=size if all(size) else None,
+        target=block.read("target", read_target),
+        target_coupling=None if coupling is None else coupling.reshape(S, L + Q, -1),
+    )
+
+
+def _check_names(block: Field, camera: str, names: tuple[str, ...], model: str) -> None:
+    """Check the distortion model and the names of the local parameters."""
     with value_failures(block.source, f"{block.path}.distortion: "):
         coefficients = coefficient_names(model)
-    names = tuple(block["parameters"].texts())
     t_z = ("t_z",) if camera == "still" or (camera == "known" and "t_z" in names) else ()
     expected = (*_CAMERA, *t_z, *coefficients)
     if names != expected:
         block["parameters"].fail(f"the list {', '.join(expected)}")
-    return names, model
 
 
 def _settings(field: Field, D: int) -> tuple[Array, NDArray[np.int64], Array]:
@@ -222,33 +209,27 @@ def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
     if scale not in SCALES:
         field["scale"].fail(f"one of {', '.join(SCALES)}")
     nets = []
-    for net in (field["networks"][name] for name in names):
-        hidden = net["hidden"].array(2)
+    for field_of_net in (field["networks"][name] for name in names):
+        net = _NET.read(field_of_net)
+        hidden = net.pop("hidden")
         if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
-            net["hidden"].fail("two numbers of units")
+            field_of_net["hidden"].fail("two numbers of units")
         topology = Topology(D, int(hidden[0]), int(hidden[1]))
-        parameters = ParameterNet(
-            topology,
-            net["weights"].array(topology.n_weights),
-            net["precision"].array(topology.n_groups),
-            net["centre"].number(),
-            _positive(net["spread"]),
-            net["scatter"].number(),
-        )
-        nets.append(parameters)
-    return Member(LensNets(scale, tuple(nets)), _read_constants(field["constants"]))
-
-
-def _read_constants(field: Field) -> Constants:
-    return Constants(field["theta"].number(), field["R"].array(3, 3), field["t"].array(2))
+        for key, count in (("weights", topology.n_weights), ("precision", topology.n_groups)):
+            if len(net[key]) != count:
+                field_of_net[key].fail(f"{count} finite numbers")
+        nets.append(ParameterNet(topology, **net))
+    return Member(LensNets(scale, tuple(nets)), _CONSTANTS.read(field["constants"]))
 
 
 def _table(field: Field, S: int, L: int, Q: int) -> Tables:
     size = L + Q
     upper = np.triu_indices(size)
-    flat = field["H"].array(S, len(upper[0]))
+    found = _TABLE.read(field)
+    for key, shape in {"H": (S, len(upper[0])), "g": (S, size), "cost": (S,), "local": (S, L)}.items():
+        if found[key].shape != shape:
+            field[key].fail(f"{' x '.join(map(str, shape))} finite numbers")
     H = np.zeros((S, size, size))
-    H[:, upper[0], upper[1]] = flat
-    H[:, upper[1], upper[0]] = flat
-    normal = Normal(H, field["g"].array(S, size), field["cost"].array(S), True)
-    return Tables(field["local"].array(S, L), _read_constants(field["constants"]), normal)
+    H[:, upper[0], upper[1]] = found["H"]
+    H[:, upper[1], upper[0]] = found["H"]
+    return Tables(found["local"], found["constants"], Normal(H, found["g"], found["cost"], True))

@@ -17,11 +17,12 @@ import numpy as np
 from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import read_verdict, verdict_lines
+from neurocal_cli.files.calibration_blocks import VERDICT, verdict_lines
 from neurocal_cli.files.calibration_tree import calibration_from_field
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.files.file_storage import read_tree
-from neurocal_cli.files.stereo_yaml import stereo_from_field, stereo_lines
+from neurocal_cli.files.key_tables import Keys
+from neurocal_cli.files.stereo_yaml import RESULT, stereo_from_field, stereo_lines
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.yaml_text import (
     block,
@@ -37,6 +38,10 @@ from neurocal_cli.files.yaml_text import (
 
 FORMAT = 1  # of the block rig; to be raised if older readers cannot read a change
 _STDS = (*POSE_NAMES, "baseline")
+_LEFT_OUT = Keys(
+    "left_out: triples of texts",
+    left_out=lambda rig: [(*view, why) for view, why in rig.left_out.items()],
+)
 
 
 def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
@@ -85,18 +90,14 @@ def _rig_lines(rig: Rig) -> Iterator[str]:
     yield f"covariance: {flow(rig.covariance)}"
     frames = (quoted_words(word for pair in views.items() for word in pair) for views in rig.frames.values())
     yield from list_lines("frames", frames)
-    yield from list_lines("left_out", (quoted_words((*view, why)) for view, why in rig.left_out.items()))
+    yield from _LEFT_OUT.lines(rig)
     if rig.delays:
         delays = {
             name: mapping(value=number(value), std=number(std)) for name, (value, std) in rig.delays.items()
         }
         yield from block("delays", (f"{quoted_key(name)}: {entry}" for name, entry in delays.items()))
         yield f"timed: {boolean(rig.timed)}"
-    yield f"rmse_px: {number(rig.rmse_px)}"
-    yield f"max_px: {number(rig.max_px)}"
-    yield f"converged: {boolean(rig.converged)}"
-    yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
-    yield f"iterations: {rig.iterations}"
+    yield from RESULT.lines(rig)
     yield from list_lines("warnings", map(quoted, rig.warnings))
     yield from verdict_lines(rig.verdict)
 
@@ -165,21 +166,10 @@ def rig_from_field(root: Field) -> Rig:
         stds,
         own["covariance"].array(n, n, unknown=True),
         frames,
-        {(words[0], words[1]): words[2] for words in map(_three, own["left_out"].items())},
+        {(camera, view): why for camera, view, why in _LEFT_OUT.read(own)["left_out"]},
         {name: (one["value"].number(), one["std"].number_or_nan()) for name, one in delays.items()},
         own["timed"].boolean() if "timed" in own else False,
-        rmse_px=own["rmse_px"].number_or_nan(),
-        max_px=own["max_px"].number_or_nan(),
-        converged=own["converged"].boolean(),
-        stop_reason=own["stop_reason"].text(),
-        iterations=own["iterations"].integer(),
+        **RESULT.read(own),
         warnings=tuple(own["warnings"].texts()),
-        judgement=own.read("verdict", read_verdict),
+        judgement=own.read("verdict", VERDICT.read),
     )
-
-
-def _three(entry: Field) -> list[str]:
-    words = entry.texts()
-    if len(words) != 3:
-        entry.fail("a list of 3 texts")
-    return words

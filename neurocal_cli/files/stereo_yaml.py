@@ -6,9 +6,10 @@ of the rectified pair. ``stereo`` has the rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,28 +18,31 @@ from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import Array, euler_to_rotation
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.files.calibration_blocks import POSE_GROUPS, read_verdict, verdict_lines
+from neurocal_cli.files.calibration_blocks import POSE_GROUPS, VERDICT, verdict_lines
 from neurocal_cli.files.calibration_tree import calibration_from_field
 from neurocal_cli.files.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.files.exchange.camera_set import METRES
 from neurocal_cli.files.file_storage import read_tree
+from neurocal_cli.files.key_tables import Keys
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import (
-    block,
-    boolean,
-    flow,
-    list_lines,
-    mapping,
-    number,
-    quoted,
-    quoted_words,
-    text,
-    words,
-)
+from neurocal_cli.files.yaml_text import block, boolean, flow, mapping, number, text, words
 
 FORMAT = 1  # of the stereo block; to be raised if older readers cannot read a change
 # E, F and baseline follow from R, t and the cameras; a larger relative difference means that one was edited.
 _SAME = 1e-6
+
+_MATRICES = Keys(
+    "R: 3x3, t: 3, E: 3x3, F: 3x3, baseline: number, baseline_std: measure",
+    baseline_std=lambda rig: rig.std["baseline"],
+)
+RESULT = Keys(  # of every rig
+    "rmse_px: measure, max_px: measure, converged: boolean, stop_reason: text, iterations: integer"
+)
+_RECTIFICATION = Keys("R1: nxn, R2: nxn, P1: nxn, P2: nxn, Q: nxn")
+_REST = Keys(
+    "pairs: pairs of texts, left_out: triples of texts, warnings: lines",
+    left_out=lambda rig: [(*pair, why) for pair, why in rig.left_out.items()],
+)
 
 
 def format_stereo_rig(rig: StereoRig, alpha: float | None = None, by_rows: bool = False) -> str:
@@ -76,30 +80,19 @@ def format_ros_pair(rig: StereoRig, alpha: float | None = None) -> tuple[str, st
 def _stereo_lines(rig: StereoRig, rectified: Rectification | None) -> Iterator[str]:
     yield f"format: {FORMAT}"
     yield f"unit: {text(rig.unit)}"
-    for key, matrix in (("R", rig.R), ("t", rig.t), ("E", rig.E), ("F", rig.F)):
-        yield f"{key}: {flow(matrix)}"
-    yield f"baseline: {number(rig.baseline)}"
-    yield f"baseline_std: {number(rig.std['baseline'])}"
+    yield from _MATRICES.lines(rig)
     values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
     for group, members in POSE_GROUPS:
         entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
         yield f"{group}: {mapping(**entries)}"
     yield f"covariance: {mapping(names=words(POSE_NAMES), data=flow(rig.covariance))}"
-    yield f"rmse_px: {number(rig.rmse_px)}"
-    yield f"max_px: {number(rig.max_px)}"
-    yield f"converged: {boolean(rig.converged)}"
-    yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
-    yield f"iterations: {rig.iterations}"
+    yield from RESULT.lines(rig)
     if rig.delay is not None:
         value, std = rig.delay
         yield f"delay: {mapping(value=number(value), std=number(std), timed=boolean(rig.timed))}"
     if rectified is not None:
-        matrices = {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
-        yield from block("rectification", (f"{key}: {flow(matrix)}" for key, matrix in matrices.items()))
-    yield from list_lines("pairs", map(quoted_words, rig.pairs))
-    left_out = (quoted_words((*pair, reason)) for pair, reason in rig.left_out.items())
-    yield from list_lines("left_out", left_out)
-    yield from list_lines("warnings", map(quoted, rig.warnings))
+        yield from block("rectification", _RECTIFICATION.lines(rectified))
+    yield from _REST.lines(rig)
     yield from verdict_lines(rig.verdict)
 
 
@@ -136,24 +129,21 @@ def stereo_from_field(root: Field) -> StereoRig:
     except InputError as error:
         raise FormatError(f"stereo: {error}; correct it", root.source) from error
     std = {name: block[group][name]["std"].number_or_nan() for group, names in POSE_GROUPS for name in names}
+    matrices, rest = _MATRICES.read(block), _REST.read(block)
     rig = StereoRig(
         left,
         right,
         pose,
-        std | {"baseline": block["baseline_std"].number_or_nan()},
+        std | {"baseline": matrices["baseline_std"]},
         block["covariance"]["data"].array(6, 6, unknown=True),
-        tuple((a, b) for a, b in (_names(entry, 2) for entry in block["pairs"].items())),
-        {(a, b): why for a, b, why in (_names(entry, 3) for entry in block["left_out"].items())},
+        tuple(rest["pairs"]),
+        {(a, b): why for a, b, why in rest["left_out"]},
         *_delay(block),
-        rmse_px=block["rmse_px"].number_or_nan(),
-        max_px=block["max_px"].number_or_nan(),
-        converged=block["converged"].boolean(),
-        stop_reason=block["stop_reason"].text(),
-        iterations=block["iterations"].integer(),
-        warnings=tuple(block["warnings"].texts()),
-        judgement=block.read("verdict", read_verdict),
+        warnings=rest["warnings"],
+        **RESULT.read(block),
+        judgement=block.read("verdict", VERDICT.read),
     )
-    _check_consistent(rig, block)
+    _check_consistent(rig, block, matrices)
     return rig
 
 
@@ -165,20 +155,13 @@ def _delay(block: Field) -> tuple[tuple[float, float] | None, bool]:
     return (own["value"].number(), own["std"].number_or_nan()), own["timed"].boolean()
 
 
-def _names(entry: Field, count: int) -> tuple[str, ...]:
-    names = tuple(entry.texts())
-    if len(names) != count:
-        entry.fail(f"a list of {count} texts")
-    return names
-
-
-def _check_consistent(rig: StereoRig, block: Field) -> None:
+def _check_consistent(rig: StereoRig, block: Field, matrices: Mapping[str, Any]) -> None:
     """Refuse a file with contradicting values, of which one was edited."""
     values = [block[g][n]["value"].number() for g, names in POSE_GROUPS for n in names]
     stated = (
-        ("E", block["E"].array(3, 3), rig.E),
-        ("F", block["F"].array(3, 3), rig.F),
-        ("baseline", np.array([block["baseline"].number()]), np.array([rig.baseline])),
+        ("E", matrices["E"], rig.E),
+        ("F", matrices["F"], rig.F),
+        ("baseline", np.array([matrices["baseline"]]), np.array([rig.baseline])),
         ("rotation", euler_to_rotation(*values[:3]), rig.R),
         ("translation", np.array(values[3:]), rig.t),
     )

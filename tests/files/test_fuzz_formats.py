@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from support.distorted import LENSES
 from support.slow_cases import slow_but
+from test_formats_met import MET, RIGS
 from test_fuzz import damaged
 from test_other_programs import DIALECTS
 
@@ -128,6 +130,8 @@ def answered(files: dict[str, bytes], folder: Path) -> None:
 def test_damaged_files_of_all_formats_are_read_or_refused(share: float, tmp_path: Path) -> None:
     given = [contents(target, cameras) for target in READ for _, cameras in sets(target)]
     given += [{"": text.encode()} for text in DIALECTS]
+    kept = [*(content for content, *_ in MET.values()), *(content for content, *_ in RIGS.values())]
+    given += [{"": (one if isinstance(one, str) else json.dumps(one)).encode()} for one in kept]
     for trial in range(int(share * COUNT)):
         rng = np.random.default_rng([trial, 45])
         files = dict(given[int(rng.integers(len(given)))])

@@ -214,8 +214,8 @@ def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
     if len(rows) != 1:
         raise FormatError("holds several rigs; give a model with one", source)
     line, words = rows[0]
-    poses, rest = {int(words[3]): Pose(np.eye(3), np.zeros(3))}, words[4:]
     try:
+        poses, rest = {int(words[3]): Pose(np.eye(3), np.zeros(3))}, words[4:]
         while rest:
             if rest[0] != "CAMERA" or rest[2] != "1":
                 raise FormatError("a sensor is no camera, or has no pose", source, line)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from typing import Any
 
 from neurocal_cli.camera.camera import Camera
@@ -39,7 +40,9 @@ def read(document: Document) -> CameraSet:
     """Read a camera model."""
     text, source = document.text, document.source
     try:
-        tree: Any = ast.literal_eval(text.strip())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's of odd numbers
+            tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
         raise FormatError("is not a camera model of mrcal; write it again", source) from error
     root = Field(tree, source)

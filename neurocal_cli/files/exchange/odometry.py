@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens, find, transform
 from neurocal_cli.files.exchange.camera_set import (
     CameraSet,
@@ -339,7 +340,10 @@ _DSO_LINES = re.compile(
 def _read_dso(document: Document) -> CameraSet:
     found = _DSO_LINES(document.text)
     assert found is not None  # `matches`
-    (fx, fy, cx, cy, *k), size = map(float, found[2].split()), (int(found[3]), int(found[4]))
+    values = Field(found[2].split(), document.source, "the first line").array(-1)
+    if len(values) < 5:
+        raise InputError("its first line must have fx, fy, cx, cy and the distortion; correct it")
+    (fx, fy, cx, cy, *k), size = values.tolist(), (int(found[3]), int(found[4]))
     if cx < 1 and cy < 1:
         fx, fy, cx, cy = fx * size[0], fy * size[1], cx * size[0] - 0.5, cy * size[1] - 0.5
     model = found[1] or "FOV"
