@@ -46,7 +46,12 @@ def matrix_data(field: Field, length: int) -> Array:
     if isinstance(field.value, dict) and "rows" not in field and "data" in field:
         return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
-        data = field["data"].array(-1)
+        nested = (
+            field["data"].value
+            and isinstance(field["data"].value, list)
+            and type(field["data"].value[0]) is list
+        )
+        data = matrix_data(field["data"], -1) if nested else field["data"].array(-1)
         rows, cols = field["rows"].integer(), field["cols"].integer()
         head = str(field["dt"].value)[:-1] if "dt" in field else ""
         channels = int(head) if head.isdigit() else 1  # dt: "2f" has two

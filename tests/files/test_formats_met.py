@@ -405,6 +405,22 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
         D5,
         None,
     ),
+    "coefficients beside the entries": ({"intrinsics": {**FXY, **NAMED, **WH}}, E, D5, S),
+    "sections": (lines("[Intrinsics]\n", "", **FXY, **NAMED, **WH).replace(": ", "="), E, D5, S),
+    "Unity": (
+        {"focalLength": {"x": 800.5, "y": 801.25}, "principalPoint": {"x": 321.3, "y": 238.7}}
+        | {"resolution": {"x": 640, "y": 480}},
+        E,
+        [],
+        S,
+    ),
+    "rows in data": (
+        {"camera_matrix": {"rows": 3, "cols": 3, "data": K}, "dist": {"rows": 1, "cols": 5, "data": [D5]}},
+        E,
+        D5,
+        None,
+    ),
+    "DROID-SLAM": (f"800.5 801.25 321.3 238.7 {' '.join(map(str, D5))}\n", E, D5, None),
     "Azure Kinect": (
         KINECT,
         [0.478 * 1920, 0, 0.6372 * 1440, 959.5, 0.5025 * 1440 - 180.5],
@@ -457,6 +473,16 @@ RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
             for key, value in (("camera_matrix", K), ("distortion", D5))
         }
         | {"R": R, "T": SHIFT},
+        D5,
+        [TURNED],
+    ),
+    "a mapping of the pose": (
+        {"cam1": {"K": K, "D": D5}, "cam2": {"K": K, "D": D5}, "stereo": {"R": R, "T": SHIFT}},
+        D5,
+        [TURNED],
+    ),
+    "entries of two sides": (
+        {f"{side}_intrinsics": {**FXY, **NAMED} for side in ("left", "right")} | {"R": R, "T": SHIFT},
         D5,
         [TURNED],
     ),
@@ -567,6 +593,14 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "mm": (
         {"focal_length": 35, "principal_point": [320, 240], "image_size": [640, 480]},
         "not told to be in pixels",
+    ),
+    "two sizes": (
+        {"K": K, "image_size": [640, 480], **WH, "width": 1280},
+        "image_size and width, height differ",
+    ),
+    "HALCON": (
+        '# CAMERA\nParGroup: Cam1: "Internal"\n\nFocus:foc: 0.008;\n',
+        "is a camera of HALCON in metres",
     ),
     "Pix4D": ("Pix4D camera calibration file 0\nF 4.7\nPx 3.08\n", "is a camera of Pix4D in mm"),
     "Bundler": ("# Bundle file v0.3\n1 0\n800 0 0\n", "is a model of Bundler"),

@@ -9,7 +9,7 @@ MATRIX = (
     "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
     "cameraintrinsic", "intrinsic", "camintrinsics", "cammatrix", "cammtx", "cameramtx", "kmatrix", "kmat",
     "matrix", "intrinsicmat", "intrinsicparameters", "calibrationmatrix", "intrinsicparams", "camerak",
-    "cameramat", "kk", "m1", "cm", "intrinsicmtx", "camk",
+    "cameramat", "kk", "m1", "cm", "intrinsicmtx", "camk", "camintr",
 )  # fmt: skip
 COEFFICIENTS = (
     "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "distortioncoeffs",

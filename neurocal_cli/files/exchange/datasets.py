@@ -1,4 +1,4 @@
-"""Formats of data sets: KITTI, Middlebury, MVSNet, and matrices one below the other."""
+"""Formats of data sets: KITTI, Middlebury, MVSNet, KWIVER and DROID-SLAM."""
 
 from __future__ import annotations
 
@@ -137,4 +137,33 @@ def _read_krtd(document: Document) -> CameraSet:
 
 KRTD = Format(
     "KWIVER", ("none", "plumb_bob", "rational"), matches=_krtd_rows, read=_read_krtd, files=".krtd of KWIVER"
+)
+
+# DROID-SLAM and DPVO: one line of fx, fy, cx, cy and perhaps OpenCV's coefficients.
+
+
+def _one_line(document: Document) -> list[float]:
+    words = document.text[:1000].split()
+    if (
+        document.text[:1000].strip().count("\n")
+        or not all(map(is_number, words))
+        or len(words) not in (4, 8, 9)
+    ):
+        return []
+    values = [float(word) for word in words]
+    return values if min(values[:4]) > 1 and 0.2 < values[0] / values[1] < 5 else []
+
+
+def _read_one_line(document: Document) -> CameraSet:
+    fx, fy, cx, cy, *k = _one_line(document)
+    lens = Distortion(*from_ros("plumb_bob", np.array(k)))
+    return CameraSet((Camera(Intrinsics(fx, fy, cx, cy), lens),), program="DROID-SLAM")
+
+
+DROID = Format(
+    "DROID-SLAM",
+    ("none", "plumb_bob"),
+    matches=_one_line,
+    read=_read_one_line,
+    files="fx fy cx cy k1 k2 p1 p2 k3",
 )

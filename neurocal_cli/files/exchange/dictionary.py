@@ -41,8 +41,8 @@ _SIDES = (
     ("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"), ("cam0", "cam1"), ("cam1", "cam2"),
     ("camera0", "camera1"), ("camera1", "camera2"), ("cameraleft", "cameraright"),
 )  # fmt: skip
-_ROTATIONS = ("r", "rstereo", "stereor", "rotation", "rotationmatrix")
-_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector")
+_ROTATIONS = ("r", "rstereo", "stereor", "rotation", "rotationmatrix", "rot")
+_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector", "trans")
 
 
 def is_part(document: Document) -> bool:
@@ -182,6 +182,9 @@ def _within(root: Field, notes: list[str]) -> Field:
 
 def _sides_apart(tree: dict[str, Any]) -> dict[str, Any]:
     """The tree with the keys of the cameras of two sides, each in a mapping, beside its others."""
+    for part in tree.values():  # R and T may be in a mapping as well
+        if isinstance(part, dict) and {plain(str(key)) for key in part} & {"r", "t"} == {"r", "t"}:
+            tree = {**part, **tree}
     names = {plain(str(key)): key for key, part in tree.items()}
     if names.keys().isdisjoint(_TRANSLATIONS):
         return tree

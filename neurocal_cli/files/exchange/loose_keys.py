@@ -57,7 +57,7 @@ _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
 
 def _is_numbers(value: Any) -> bool:
     if isinstance(value, dict):
-        return "data" in value
+        return "data" in value or (value.keys() == {"x", "y"} and all(map(_is_numbers, value.values())))
     if isinstance(value, (list, tuple)):
         return bool(value) and all(map(_is_numbers, value))
     if isinstance(value, str):
@@ -140,6 +140,19 @@ class LooseKeys:
 
     def camera(self, side: str = "", name: str = "camera") -> Camera:
         """Read the camera, or that of one side."""
+        inside = self.find(MATRIX, side, _has_entries)
+        if (
+            inside is not None and inside is not self.root
+        ):  # it may hold the coefficients and the size as well
+            own = {f"{key}_{side}" if side else key: value for key, value in inside.value.items()}
+            if not own.keys() <= self.root.value.keys():
+                root = Field({**self.root.value, **own}, self.root.source)
+                merged = LooseKeys(root, self.distortion, self.notes)
+                camera = merged.camera(side, name)
+                self.read |= merged.read
+                self.coefficients_read |= merged.coefficients_read
+                merged.refuse_unread()
+                return camera
         intrinsics = self._intrinsics(side)
         distortion = self._distortion(side)
         stated = self.find(NAME, side, lambda value: isinstance(value, (str, int)))
@@ -154,16 +167,21 @@ class LooseKeys:
             next((field for s in sides if (field := self.find(names, s)) is not None), None)
             for names in (WIDTH, HEIGHT)
         )
+        field = next((f for s in sides if (f := self.find(SIZE, s)) is not None), None)
         if width is not None and height is not None:
             size = width.integer(), height.integer()
+            if field is not None and sorted(map(int, filter(np.isfinite, _flat(field.value)))) not in (
+                [],
+                sorted(size),
+            ):
+                self.root.refuse(f"{field.path} and {width.path}, {height.path} differ; remove one")
         else:
             turned = False
-            field = next((f for s in sides if (f := self.find(SIZE, s)) is not None), None)
             if field is None:
                 turned, field = True, self.find(SHAPE)
             if field is None:
                 return None
-            if isinstance(field.value, dict) and "data" not in field.value:
+            if isinstance(field.value, dict) and not _is_numbers(field.value):
                 return LooseKeys(field).image_size()
             if isinstance(field.value, str):
                 numbers: list[float] = [int(n) for n in re.findall(r"\d+", field.value)]
@@ -365,7 +383,7 @@ def _matrix(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Ar
 def _flat(value: Any) -> list[float]:
     """The numbers in nested lists, or in a matrix."""
     if isinstance(value, dict):
-        return _flat(value.get("data", []))
+        return _flat(value["data"] if "data" in value else [value.get("x", []), value.get("y", [])])
     if isinstance(value, (list, tuple)):
         return [number for entry in value for number in _flat(entry)]
     return [float(value)] if _is_numbers(value) else [float("nan")]

@@ -74,6 +74,7 @@ READ: tuple[Format, ...] = (
     datasets.MIDDLEBURY,
     datasets.MVSNET,
     datasets.KRTD,
+    datasets.DROID,
     odometry.DSO,
     odometry.EUROC,
     kalibr.FORMAT,
@@ -131,6 +132,11 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
     (
         lambda d: _numbers_in_lines(d) == [7] and not d.data.startswith(b"\x93"),
         "is the distortion of a camera of OpenPTV, in mm of the sensor; calibrate from its points",
+    ),
+    (
+        lambda d: re.search(r"^ParGroup:", d.text[:2000], re.MULTILINE),
+        "is a camera of HALCON in metres of the sensor; export its camera matrix in px, or calibrate its "
+        "images",
     ),
     (
         r"Pix4D camera calibration",
