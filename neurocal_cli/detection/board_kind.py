@@ -1,8 +1,8 @@
 """Find the board that images show, of any kind and size.
 
 Each image is searched for a chessboard, and if there is none for markers and for circles. Once one of these
-is seen, it is looked for first. A chessboard whose squares are not of one colour may have markers in them.
-The kind is that of most images, and these tell its size.
+is seen, it is looked for first. Squares that are not of one colour have markers in them, and are no
+chessboard. The kind is that of most images, and these tell its size.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class _Seen:
     """What images show."""
 
     squares: list[SeenBoard] = field(default_factory=list)
+    patterned: list[SeenBoard] = field(default_factory=list)
     marked: list[tuple[SeenMarkers, ...]] = field(default_factory=list)
     circles: list[SeenCircles] = field(default_factory=list)
 
@@ -53,8 +54,8 @@ class _Seen:
         if others and (board is None or not board.plain) and not self.marked and self._add_marked(image):
             return True
         if board is not None:
-            self.squares.append(board)
-            return True
+            (self.squares if board.plain else self.patterned).append(board)
+            return board.plain
         return others and not self.circles and self._add_circles(image)
 
     def _add_marked(self, image: NDArray[np.generic]) -> bool:
@@ -90,6 +91,11 @@ def found_board(images: Iterable[NDArray[np.generic]]) -> FoundBoard:
                 return found
         if sum(one.whole for one in seen.circles) >= _ENOUGH and seen.kind is seen.circles:
             break
+    if not seen.kind and seen.patterned:
+        raise NoBoardError(
+            "the squares of the board have patterns in them, but no markers can be read; show them sharper, "
+            "or describe the board by --board, for example charuco:8x6:28:21"
+        )
     if not seen.kind:
         raise NoBoardError(
             "no image shows a chessboard, markers or circles; show the whole board, sharp and evenly lit"
