@@ -31,6 +31,13 @@ _ENDINGS = (".svg", ".pdf", ".png")
 @options.number(
     "--dpi", "N", "Resolution of a PNG in pixels per inch.", without="300", default=300, positive=True
 )
+@options.count(
+    "--boards",
+    "N",
+    "Number of boards with markers for one rig, whose markers all differ: BOARD_1.pdf to BOARD_N.pdf.",
+    without="1",
+    default=1,
+)
 @options.output(
     "BOARD.pdf",
     "Write the target to this .pdf, .svg or .png file, and the board file beside it.",
@@ -41,6 +48,7 @@ def board(
     board: options.BoardOptions,
     paper: str,
     dpi: float,
+    boards: int,
     output: str,
     as_json: bool,
 ) -> None:
@@ -55,7 +63,7 @@ def board(
     if 100 mm on them are not 100 mm, correct `square` in the board file.
 
     The board file is written beside the target, with the ending .yaml, unless the board came from one. Give
-    it to neurocal detect --board.
+    it to neurocal detect --board. Several boards of a rig have a file each.
 
     \b
     Examples:
@@ -65,6 +73,7 @@ def board(
           --dpi 150 -o letter.png
       neurocal board --board target.yaml --json -o again.pdf
       neurocal board --board charuco:8x6:28:21 -o charuco.pdf
+      neurocal board --board charuco:6x5:30:22 --boards 3 -o rig.pdf
       neurocal board --board aprilgrid:6x6:20:0.3 -o tags.svg
       neurocal board --board asymmetric_circles:4x11:20 --paper A3 -o circles.pdf
     """  # noqa: D301 - as in the group
@@ -73,26 +82,40 @@ def board(
         raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
     if ending != ".png":
         options.note_unused(f"on a {ending} file, which has no pixels", "dpi")
-    beside = None if board.is_file else os.path.splitext(output)[0] + ".yaml"
-    preparation.check_outputs((output, beside), (board.file,))
-    from neurocal_cli.observations.marked_cells import to_print
+    stem, outputs = os.path.splitext(output)[0], [output]
+    if boards > 1:
+        outputs = [f"{stem}_{k}{ending}" for k in range(1, boards + 1)]
+    beside = [
+        None if board.is_file and boards == 1 else f"{os.path.splitext(one)[0]}.yaml" for one in outputs
+    ]
+    preparation.check_outputs((*outputs, *beside), (board.file,))
+    from neurocal_cli.observations.marked_cells import numbered_apart, to_print
     from neurocal_cli.observations.printed_sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
     target = board.read() or default_board(size)
-    target = replace(target, planes=tuple(map(to_print, target.planes)))
-    sheet = on_paper(target, size)
+    if boards > 1 and any(plane.markers is None for plane in target.planes):
+        raise UsageError("--boards is for boards with markers, whose numbers tell them apart")
+    several = (target,) if boards == 1 else numbered_apart(target, boards)
+    targets = [replace(one, planes=tuple(map(to_print, one.planes))) for one in several]
+    sheets = [on_paper(one, size) for one in targets]
+    for path, sheet in zip(outputs, sheets, strict=True):
+        _draw(path, sheet, dpi)
+    from neurocal_cli.files.board_yaml import write_board
+
+    for one, sheet, file in zip(targets, sheets, beside, strict=True):
+        if file is not None:
+            write_board(one, file)
+        _report(one, sheet, file, as_json)
+
+
+def _draw(path: str, sheet: Sheet, dpi: float) -> None:
     from neurocal_cli.files.board_pictures import board_pdf, board_png, board_svg
 
-    if ending == ".png":
-        write_whole(output, board_png(sheet, dpi))
+    if path.lower().endswith(".png"):
+        write_whole(path, board_png(sheet, dpi))
     else:
-        write_whole(output, board_svg(sheet) if ending == ".svg" else board_pdf(sheet))
-    if beside is not None:
-        from neurocal_cli.files.board_yaml import write_board
-
-        write_board(target, beside)
-    _report(target, sheet, beside, as_json)
+        write_whole(path, board_svg(sheet) if path.lower().endswith(".svg") else board_pdf(sheet))
 
 
 def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:

@@ -181,14 +181,15 @@ def detect(
     outcomes, target = of_one_size(outcomes), wanted.board
     assert target is not None
     _report(outcomes, target, as_json)
-    from neurocal_cli.files.board_yaml import format_board
+    from neurocal_cli.files.board_yaml import board_line, format_board
     from neurocal_cli.files.points_csv import format_points
     from neurocal_cli.observations.points import Correspondences
     from neurocal_cli.observations.separate_boards import of_one_board
 
     if save_board is not None:
         write_whole(save_board, format_board(target))
-    found = Correspondences.from_detections(detections(outcomes), target.unit, target.distances)
+    told = target.unit, target.distances, board_line(target) if board_name is None else ""
+    found = Correspondences.from_detections(detections(outcomes), *told)
     if board_name is not None:
         found = of_one_board(found, board_name)
     text = format_points(found)

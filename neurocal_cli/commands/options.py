@@ -350,9 +350,10 @@ def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
         path(
             "--board",
             "BOARD.yaml",
-            "Board file, of neurocal or Kalibr, or a board in short: chessboard:COLSxROWS:SQUARE, "
-            "charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], "
-            "circles:COLSxROWS:DISTANCE[:DIAMETER], asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
+            "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
+            "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
+            "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
+            "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
             "and ROWS count squares, tags or circles; of a chessboard, inner vertices.",
             to="file",
         ),

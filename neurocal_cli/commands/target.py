@@ -17,8 +17,9 @@ from neurocal_cli.errors import InputError
 @options.path(
     "--board",
     "BOARD.yaml",
-    "The board that was detected, in a file or in short as for detect. Only a chessboard without markers is "
-    "told from the points.",
+    "The board that was detected, in a file or in short as for detect, if the points do not tell it, as "
+    "those "
+    "of other programs.",
     to="file",
 )
 @plot_option("the heights of the board's points and their shifts")
@@ -62,13 +63,21 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
 
         write_plot(plot, draw_target, calibration.target, calibration.unit)
     known = calibration.target, calibration.unit, calibration.points.distances
-    if file is None:
+    described = None
+    if file is not None:
+        from neurocal_cli.files.board_kinds import short_board
+
+        described = short_board(file, calibration.unit) or read_board(file)
+    elif calibration.points.board:
+        from neurocal_cli.files.board_yaml import parse_board
+
+        described = parse_board(calibration.points.board, f"{camera}: observations.board")
+    if described is None:
         board = board_of(*known)
     else:
-        from neurocal_cli.files.board_kinds import short_board
         from neurocal_cli.observations.found_planes import with_found_points
 
-        board = with_found_points(short_board(file, calibration.unit) or read_board(file), *known)
+        board = with_found_points(described, *known)
     write_board(board, output)
     if as_json:
         print_summary(target_json(calibration.target, calibration.unit) or {})

@@ -15,12 +15,12 @@ from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.locate import locate_circles, measure_located
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.grey import grey_image
+from neurocal_cli.detection.grey import grey_image, negative
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Identified, Located, identify
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.locate import locate
-from neurocal_cli.detection.measuring import Points, measure
+from neurocal_cli.detection.measuring import Points, linearised, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane
@@ -133,6 +133,9 @@ def detect_points(
         The image has another shape or type, or pixels that are not finite.
     """
     image = grey_image(image)
+    if is_inverted(board):
+        # The response is that of the light, not of its negative.
+        image, gamma = negative(image if gamma is None else linearised(image, gamma)), None
     identified = _identified(image, board, grids)
     located = identified.located
     measured = tuple(_named(one, _sound(_measured(image, one, points, gamma))) for one in located)
@@ -161,6 +164,11 @@ def detect_points(
         measured,
         identified.notes,
     )
+
+
+def is_inverted(board: Board) -> bool:
+    """Whether light and dark are exchanged on a board with markers."""
+    return any(plane.markers is not None and plane.markers.inverted for plane in board.planes)
 
 
 def grids_in(image: NDArray[np.generic], board: Board) -> list[Grid]:

@@ -51,3 +51,9 @@ def grey_image(image: NDArray[Any]) -> NDArray[Any]:
     if not colours:
         return image
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), _TO_GREY[colours]))
+
+
+def negative(image: NDArray[Any]) -> NDArray[Any]:
+    """Exchange light and dark in a grey image."""
+    brightest = np.iinfo(image.dtype).max if image.dtype.kind == "u" else image.max()
+    return np.asarray(brightest - image)

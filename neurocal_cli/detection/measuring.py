@@ -77,7 +77,7 @@ def measure(
     effect of the response on the edges is estimated. `ink` are the markers on a board, if it has any. Points
     whose fits are rejected are left out.
     """
-    light = image if gamma is None else _linear(image, gamma)
+    light = image if gamma is None else linearised(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
     grid_image = GridImage(light, grid, floor)
@@ -100,7 +100,7 @@ def measure(
     return inner.only(fitted.good).joined_with(outer.only(fitted_rim.good))
 
 
-def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
+def linearised(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
     """Linearise the image, keeping its full scale."""
     if np.issubdtype(image.dtype, np.integer):
         full = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]

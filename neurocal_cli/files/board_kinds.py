@@ -18,8 +18,8 @@ from neurocal_cli.observations.markers import Markers
 # Keys of each kind beside the name and the axes, those that are required first; `chessboard` has its own.
 KIND_KEYS = {
     "chessboard": ("squares", "square", "cols", "rows"),
-    "charuco": ("squares", "square", "marker", "dictionary", "legacy", "first_id"),
-    "aprilgrid": ("tags", "tag", "spacing", "family", "first_id", "border"),
+    "charuco": ("squares", "square", "marker", "dictionary", "legacy", "first_id", "inverted"),
+    "aprilgrid": ("tags", "tag", "spacing", "family", "first_id", "border", "inverted"),
     "circles": ("circles", "distance", "diameter"),
     "asymmetric_circles": ("circles", "distance", "diameter"),
 }
@@ -54,7 +54,8 @@ def read_plane(field: Field, kind: str, name: str, place: dict[str, Any]) -> Pla
     if kind == "aprilgrid":
         cols, rows = pair("tags")
         tag, family = field["tag"].number(), field.get("family", "tag36h11").text()
-        markers = Markers(tag, family, None, field.get("first_id", 0).integer(0))
+        first, inverted = field.get("first_id", 0).integer(0), field.get("inverted", False).boolean()
+        markers = Markers(tag, family, None, first, inverted)
         spacing, border = field["spacing"].number(), field.get("border", 2).integer(1)
         return TagPlane(
             name, 2 * cols, 2 * rows, tag, markers=markers, spacing=spacing, border=border, **place
@@ -79,6 +80,7 @@ def read_plane(field: Field, kind: str, name: str, place: dict[str, Any]) -> Pla
             field.get("dictionary", "").text() if "dictionary" in field else "",
             None if legacy.value == "auto" else legacy.value,
             field.get("first_id", 0).integer(0),
+            field.get("inverted", False).boolean(),
         )
     return Plane(name, cols - 1, rows - 1, field["square"].number(), markers=found, **place)
 
@@ -86,6 +88,7 @@ def read_plane(field: Field, kind: str, name: str, place: dict[str, Any]) -> Pla
 def kind_entries(plane: Plane) -> dict[str, str]:
     """Keys of a plane's kind, for a file; nothing for a chessboard, whose keys are the file's own."""
     markers = plane.markers
+    inverted = {"inverted": "true"} if markers is not None and markers.inverted else {}
     if isinstance(plane, TagPlane) and markers is not None:
         family = markers.dictionary.removeprefix("DICT_APRILTAG_")
         known = f"tag{family}" if family != markers.dictionary else markers.dictionary
@@ -97,6 +100,7 @@ def kind_entries(plane: Plane) -> dict[str, str]:
             "family": text(known or "tag36h11"),
             "first_id": str(markers.first_id),
             "border": str(plane.border),
+            **inverted,
         }
     if isinstance(plane, CirclePlane):
         entries = {
@@ -116,6 +120,7 @@ def kind_entries(plane: Plane) -> dict[str, str]:
         **({"dictionary": text(markers.dictionary)} if markers.dictionary else {}),
         "legacy": legacy,
         "first_id": str(markers.first_id),
+        **inverted,
     }
 
 

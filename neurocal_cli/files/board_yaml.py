@@ -13,9 +13,12 @@ import numpy as np
 
 from neurocal_cli.files.board_kinds import KIND_KEYS, is_kalibr, kalibr_plane, kind_entries, read_plane
 from neurocal_cli.files.failures import value_failures
+from neurocal_cli.files.file_storage import parse_tree
+from neurocal_cli.files.other_boards import other_board
+from neurocal_cli.files.reading import read_text
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.files.writing import write_whole
-from neurocal_cli.files.yaml_text import flow, mapping, number, parse_yaml, quoted, read_yaml, text
+from neurocal_cli.files.yaml_text import flow, mapping, number, parse_yaml, quoted, text
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.distances import Distance
 
@@ -30,14 +33,19 @@ def read_board(path: str | Path) -> Board:
     Parameters
     ----------
     path : str or Path
-        ``-`` is stdin.
+        A board file, or one of another program, in YAML, JSON, XML or TOML; ``-`` is stdin.
 
     Raises
     ------
     FormatError
         The file cannot be read or is not a board; the message names the file and the key.
     """
-    return _board(read_yaml(path))
+    content, source = read_text(path, "a board file")
+    if str(path).lower().endswith(".toml"):
+        from neurocal_cli.files.exchange.document import sections
+
+        return _board(Field(sections(content, source), source))
+    return _board(parse_tree(content, source))
 
 
 def parse_board(content: str, source: str = "board") -> Board:
@@ -54,11 +62,7 @@ def format_board(board: Board) -> str:
     """Text of a board file."""
     lines = [f"unit: {text(board.unit)}", "planes:"]
     for plane in board.planes:
-        entries = {"name": text(plane.name)} if plane.name else {}
-        own = kind_entries(plane)
-        counts = {key: str(getattr(plane, key)) for key in _COUNTS}
-        entries |= own or {**counts, "square": number(plane.square)}
-        entries |= {key: flow(np.array(getattr(plane, key))) for key in _VECTORS}
+        entries = _entries(plane)
         if not plane.measured:
             lines.append(f"  - {mapping(**entries)}")
             continue
@@ -74,10 +78,33 @@ def format_board(board: Board) -> str:
     return "\n".join([*lines, ""])
 
 
+def board_line(board: Board) -> str:
+    """Text of a board file on one line, without measured points; empty for plain chessboards."""
+    if not any(map(kind_entries, board.planes)):
+        return ""
+    planes = ", ".join(mapping(**_entries(plane)) for plane in board.planes)
+    return mapping(unit=text(board.unit), planes=f"[{planes}]")
+
+
+def _entries(plane: Plane) -> dict[str, str]:
+    """Keys of a plane in a file, without its measured points."""
+    counts = {key: str(getattr(plane, key)) for key in _COUNTS}
+    return {
+        **({"name": text(plane.name)} if plane.name else {}),
+        **(kind_entries(plane) or {**counts, "square": number(plane.square)}),
+        **{key: flow(np.array(getattr(plane, key))) for key in _VECTORS},
+    }
+
+
 def _board(root: Field) -> Board:
     if is_kalibr(root):
         with value_failures(root.source):
             return Board((kalibr_plane(root),), "m")
+    if "kind" not in root and "planes" not in root:
+        with value_failures(root.source):
+            other = other_board(root)
+        if other is not None:
+            return other
     unit = root.get("unit", "mm").text()
     if "kind" in root:
         planes: tuple[Plane, ...] = (_plane(root, alone=True, more=("unit", "distances")),)

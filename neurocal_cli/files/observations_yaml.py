@@ -42,6 +42,8 @@ def observation_lines(points: Correspondences, long: bool) -> list[str]:
     lines = ["observations:", f"  columns: [{', '.join(columns)}]"]
     if points.undistorted:
         lines.append(f"  undistorted: {points.undistorted}")
+    if points.board:
+        lines.append(f"  board: {quoted(points.board)}")
     if points.distances:
         lines.append("  distances:  # from, to, length, std")
         for one in points.distances:
@@ -140,6 +142,7 @@ def read_observations(
             point=labels.get("point"),
             **known,
             distances=tuple(distances),
+            board=observations.get("board", "").text(),
             undistorted=observations.get("undistorted", "").text(),
             image_size=image_size,
             image_center=image_center,

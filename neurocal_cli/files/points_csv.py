@@ -133,6 +133,8 @@ def format_points(points: Correspondences) -> str:
     if points.distances:
         measured = [[one.start, one.end, one.length, one.std] for one in points.distances]
         lines.append(f"# distances: {json.dumps(measured)}")
+    if points.board:
+        lines.append(f"# board: {points.board}")
     lines.append(f"# unit: {points.unit}")
     if points.undistorted:
         lines.append(f"# undistorted: {points.undistorted}")
@@ -185,6 +187,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
         distances=_agreed("distances", tables) or () if points is not None or not several else (),
+        board=_agreed("board", tables) or "",
         undistorted=_undistorted(tables, notes),
         unit=_agreed("unit", tables) or "mm",
         source=tables[0].source,

@@ -20,7 +20,10 @@ from neurocal_cli.observations.distances import Distance
 # 1,5 for 1.5, as spreadsheets write it in many countries.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
-_METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances|undistorted)\s*:(.*)", re.DOTALL)
+# A board is the text of its file on one line; other words about it are a comment.
+_METADATA = re.compile(
+    r"#\s*(image_size|image_center|unit|distances|undistorted|board(?=\s*:\s*\{))\s*:(.*)", re.DOTALL
+)
 _KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
 _ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
 _CALISCOPE = {"imglocx", "imglocy", "objlocx", "objlocy"}  # its columns, in px and m
@@ -56,6 +59,7 @@ class Metadata:
     image_center: tuple[float, float] | None = None  # px
     unit: str | None = None
     distances: tuple[Distance, ...] | None = None
+    board: str | None = None  # text of its file
     undistorted: str | None = None  # one of `UNDISTORTED`
     misspelt: list[str] = field(default_factory=list)  # numbers of lines that are nearly metadata, and hints
 
@@ -68,7 +72,7 @@ class Metadata:
                 self.misspelt.append(f"{number}: {hint}")
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
-        read, hint = _VALUES[key]
+        read, hint = _VALUES.get(key, (lambda text: text, "the text of a board file on one line"))
         value = read(text)
         if value is None:
             raise InputError(f"{key} is {text[:40]!r}; write {hint}")

@@ -145,7 +145,7 @@ def found_words(plane: Plane) -> str:
         return f"a grid of {plane.cols} x {plane.rows} {kind}"
     if markers is None:
         return f"a chessboard of {plane.cols} x {plane.rows} inner vertices"
-    first = f"from {markers.first_id} on"
+    first = f"from {markers.first_id} on{', light and dark exchanged' if markers.inverted else ''}"
     if isinstance(plane, TagPlane):
         family = markers.dictionary.replace("DICT_APRILTAG_", "tag")
         cells = "cells" if plane.border > 1 else "cell"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import InputError
-from neurocal_cli.observations.board import Plane
+from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane, TagPlane
 from neurocal_cli.observations.markers import DICTIONARIES, code, code_count
 
@@ -125,6 +125,8 @@ def printed_rectangles(plane: Plane) -> tuple[Array, Array, NDArray[np.bool_]]:
             column = np.searchsorted(within, middles[0][at] - x) - 1
             inside = (column >= 0) & (column < count)
             grid[j, at[inside]] = dark[k, row, column[inside]]
+    if markers.inverted:
+        grid = ~grid
     lines = [_along(plane, one, axis) for axis, one in enumerate(fine)]
     return lines[0], lines[1], np.pad(grid, 1)
 
@@ -144,6 +146,33 @@ def named_dictionary(plane: Plane) -> str:
             "the dictionary of the markers is not known; name it, for example charuco:8x6:28:21:DICT_4X4_50"
         )
     return plane.markers.dictionary
+
+
+def numbered_apart(board: Board, count: int) -> tuple[Board, ...]:
+    """So many boards with the same pattern, whose markers have different numbers and one dictionary."""
+    boards, step = [], 0
+    for plane in board.planes:
+        step += len(marked_cells(plane, next(prints(plane))).number)
+    for k in range(count):
+        planes = []
+        for plane in board.planes:
+            assert plane.markers is not None
+            first = plane.markers.first_id + k * step
+            planes.append(replace(plane, markers=replace(plane.markers, first_id=first)))
+        boards.append(planes)
+    # A dictionary that is not named is the smallest for the last board.
+    names = [printed.markers.dictionary for plane in boards[-1] if (printed := to_print(plane)).markers]
+    return tuple(
+        replace(
+            board,
+            planes=tuple(
+                replace(plane, markers=replace(plane.markers, dictionary=name))
+                for plane, name in zip(planes, names, strict=True)
+                if plane.markers is not None
+            ),
+        )
+        for planes in boards
+    )
 
 
 def to_print(plane: Plane) -> Plane:

@@ -36,6 +36,7 @@ class Markers:
     # before 4.6; None: told from the image
     legacy: bool | None = None
     first_id: int = 0  # the others follow row by row
+    inverted: bool = False  # whether light and dark are exchanged on the whole board
 
     def __post_init__(self) -> None:
         if (

@@ -93,6 +93,8 @@ class Correspondences:
         `view` is ``IMAGE:BOARD``, and `point` ``BOARD/ID``.
     distances : tuple of Distance
         Distances measured on the points' board; they determine its scale.
+    board : str
+        Text of the board file of the points' board; empty for a chessboard, which the ids tell.
     undistorted : str
         The shape, one of `UNDISTORTED`, that the pixels were projected on when they were undistorted. Empty:
         they are those of the image, as far as is known.
@@ -127,6 +129,7 @@ class Correspondences:
     time: Array | None = None
     image: NDArray[Any] | Sequence[Any] | None = None
     distances: tuple[Distance, ...] = ()
+    board: str = ""
     undistorted: str = ""
     view_names: tuple[str, ...] = field(init=False)
     view_index: NDArray[np.int64] = field(init=False)
@@ -201,7 +204,11 @@ class Correspondences:
 
     @classmethod
     def from_detections(
-        cls, detections: Mapping[str, Detected], unit: str = "mm", distances: tuple[Distance, ...] = ()
+        cls,
+        detections: Mapping[str, Detected],
+        unit: str = "mm",
+        distances: tuple[Distance, ...] = (),
+        board: str = "",
     ) -> Correspondences:
         """Join the points that were measured in several images of one camera.
 
@@ -213,6 +220,8 @@ class Correspondences:
             Of the board.
         distances : tuple of Distance
             Those of the board, if any were measured: ``board.distances``.
+        board : str
+            Text of its file, if it is no chessboard.
 
         Raises
         ------
@@ -248,6 +257,7 @@ class Correspondences:
             unit=unit,
             source="detected points",
             distances=distances,
+            board=board,
         )
 
     def __repr__(self) -> str:

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 import pytest
 from support.command_line import run
+from support.marked import marked_scene
 
 from neurocal_cli import read_board
 from neurocal_cli.commands.requested_board import another_size
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.files.board_kinds import short_board
+from neurocal_cli.files.board_yaml import board_line
 from neurocal_cli.observations.board_kinds import CirclePlane
 
 DPI = 100
@@ -102,3 +104,44 @@ def test_a_part_of_a_board_with_markers_is_not_another_board() -> None:
         board = short_board(form)
         assert board is not None
         assert another_size([(3, 4)] * 5, board) == asked
+
+
+def test_the_shape_of_a_board_is_written_in_its_own_kind(tmp_path: Path) -> None:
+    camera, points = tmp_path / "camera.yaml", tmp_path / "points.csv"
+    board = short_board("charuco:8x6:28:21:DICT_4X4_50")
+    assert board is not None
+    (plane,) = board.planes
+    scene = marked_scene(plane, 1, square=30.0)
+    world, ids = plane.vertices().reshape(-1, 3), plane.vertex_ids()
+    rng = np.random.default_rng(1)
+    bowed = world + np.outer((world[:, 0] - 84) ** 2 * 2e-4, [0, 0, 1.0])
+    rows = []
+    for k in range(12):
+        pose = marked_scene(plane, k, square=24.0, tilt=40.0).pose
+        seen, _ = scene.camera.project(bowed @ pose.R.T + pose.t)
+        seen = seen + rng.normal(0, 0.02, seen.shape)
+        for name, place, (u, v) in zip(ids, world.tolist(), seen.tolist(), strict=True):
+            rows.append(f"v{k},{name},{place[0]},{place[1]},{place[2]},{u},{v},0.02")
+    head = ["# image_size: 320 240", f"# board: {board_line(board)}", "view,point,X,Y,Z,u,v,sigma"]
+    points.write_text("\n".join([*head, *rows, ""]))
+    result = run("calibrate", points, "--target", "free", "-o", camera)
+    assert camera.exists(), result.stderr
+    result = run("target", camera, "-o", tmp_path / "shape.yaml")
+    assert result.exit_code == 0, result.stderr
+    (found,) = read_board(tmp_path / "shape.yaml").planes
+    assert found.markers == plane.markers
+    assert len(found.measured) == len(world)
+
+
+def test_boards_of_a_rig_have_different_markers(tmp_path: Path) -> None:
+    result = run(
+        "board", "--board", "charuco:6x5:20:15", "--boards", 4, "--dpi", 50, "-o", tmp_path / "rig.png"
+    )
+    assert result.exit_code == 0, result.stderr
+    boards = [read_board(tmp_path / f"rig_{k}.yaml") for k in (1, 2, 3, 4)]
+    markers = [board.planes[0].markers for board in boards]
+    assert [one.first_id for one in markers if one] == [0, 15, 30, 45]
+    assert {one.dictionary for one in markers if one} == {"DICT_4X4_100"}
+    assert len(list(tmp_path.glob("rig_*.png"))) == 4
+    result = run("board", "--cols", 9, "--rows", 6, "--square", 20, "--boards", 2, "-o", tmp_path / "b.pdf")
+    assert result.exit_code == 2

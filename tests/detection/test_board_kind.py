@@ -7,11 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from support.marked import marked_scene, plane_of, taken
+from support.marked import errors_of, marked_scene, plane_of, taken
 from support.real_data import RealFiles
 
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
 from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles
+from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.lie import lie_of
 from neurocal_cli.detection.markers.numbering import joined, layouts, numbered
@@ -70,6 +71,20 @@ def test_grids_of_circles_are_found(form: str) -> None:
     true = plane_of(form)
     assert found.sure
     assert (kind_of(found.plane), found.plane.cols, found.plane.rows) == (kind_of(true), true.cols, true.rows)
+
+
+def test_light_and_dark_may_be_exchanged() -> None:
+    plane = plane_of("charuco:6x5:40:30:DICT_4X4_50")
+    assert plane.markers is not None
+    plane = replace(plane, markers=replace(plane.markers, inverted=True))
+    scene = marked_scene(plane, 2, square=30.0)
+    picture = taken(scene, 2, 4)
+    found = found_board([picture.image]).plane
+    assert found.markers is not None
+    assert (found.markers.inverted, found.cols, found.rows) == (True, 5, 4)
+    error, _ = errors_of(detect_points(picture.image, scene.board, "vertices"), picture)
+    assert len(error) == 20
+    assert np.abs(error).max() < 0.03
 
 
 def test_the_unit_and_the_side_are_the_callers() -> None:

@@ -23,6 +23,7 @@ _WRONG_BORDER = 0.1  # greatest share of light cells in a border
 _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the levels
 _CONTRAST = 12.0  # DN, least difference of these
 _FEWEST = 2  # markers
+_UNIT = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 _ENOUGH = 12  # markers at a scale after which no other is tried
 
 
@@ -45,7 +46,7 @@ def _read(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]
     """Markers of each dictionary and border in quadrangles (N, 4, 2)."""
     if not len(corners):
         return
-    H = homographies(np.broadcast_to(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), corners.shape), corners)
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
     for border in (1, 2):
         for bits in sorted(set(DICTIONARIES.values())):
             light, good = _cells(grey, H, bits, border)
@@ -64,8 +65,17 @@ def _read(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]
                     yield Marks(number, np.stack(placed)[first], dictionary), border
 
 
+def numbers_in(light: NDArray[np.float32], corners: Array, dictionary: str, border: int) -> NDArray[np.int64]:
+    """Numbers (N,) of the markers of a dictionary within quadrangles (N, 4, 2), clockwise; -1 for none."""
+    if not len(corners):
+        return np.zeros(0, dtype=np.int64)
+    H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    cells, good = _cells(light, H, DICTIONARIES[dictionary], border)
+    return np.where(good, _matched(cells, dictionary)[0], -1)
+
+
 def _cells(
-    grey: NDArray[np.uint8], H: Array, bits: int, border: int
+    grey: NDArray[np.uint8] | NDArray[np.float32], H: Array, bits: int, border: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Light cells (N, bits, bits) of codes, and (N,) whether the border is dark."""
     side = bits + 2 * border

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
+from neurocal_cli.detection.grey import negative
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.codes import read_codes
 from neurocal_cli.detection.markers.lattice import homographies, homography_at
@@ -45,6 +46,9 @@ _NAMED = 3  # boards that are named
 _MEASURED = 5  # images from which proportions are measured
 
 
+_Key = tuple[str, int, bool, bool]  # dictionary, border, whether they are tags, and whether they are inverted
+
+
 @frozen_dataclass(eq=False)
 class SeenMarkers:
     """Markers of one dictionary in an image."""
@@ -52,11 +56,12 @@ class SeenMarkers:
     image: NDArray[np.generic]
     lie: Lie
     border: int  # [cells]
+    inverted: bool  # whether the image is the negative, in which they were read
 
     @property
-    def key(self) -> tuple[str, int, bool]:
-        """What markers of one board have in common: dictionary, border, and whether they are tags."""
-        return self.lie.marks.dictionary, self.border, self.lie.tags
+    def key(self) -> _Key:
+        """What markers of one board have in common."""
+        return self.lie.marks.dictionary, self.border, self.lie.tags, self.inverted
 
 
 @frozen_dataclass
@@ -70,12 +75,17 @@ class FoundPlane:
 
 def seen_markers(image: NDArray[np.generic]) -> tuple[SeenMarkers, ...]:
     """Lattices of markers in a grey image, for each dictionary that may be meant; those of most first."""
-    found = []
-    for marks, border in read_codes(eight_bits(image)):
-        lie = lie_of(marks)
-        if lie is not None and len(lie.marks) >= _FEWEST:
-            found.append(SeenMarkers(image, lie, border))
-    return tuple(sorted(found, key=lambda one: -len(one.lie.marks)))
+    for inverted in (False, True):
+        picture = negative(image) if inverted else image
+        found = []
+        for marks, border in read_codes(eight_bits(picture)):
+            lie = lie_of(marks)
+            # On ChArUco boards, OpenCV prints borders of one cell.
+            if lie is not None and len(lie.marks) >= _FEWEST and (lie.tags or border == 1):
+                found.append(SeenMarkers(picture, lie, border, inverted))
+        if found:
+            return tuple(sorted(found, key=lambda one: -len(one.lie.marks)))
+    return ()
 
 
 def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
@@ -83,7 +93,7 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
 
     Raises NoBoardError if they do not tell it; the message says what is not known.
     """
-    score: Counter[tuple[str, int, bool]] = Counter()
+    score: Counter[_Key] = Counter()
     for each in images:
         score.update({one.key: len(one.lie.marks) for one in each})
     for key, _ in score.most_common(_TRIED):
@@ -91,15 +101,15 @@ def agreed_markers(images: Sequence[tuple[SeenMarkers, ...]]) -> FoundPlane:
         numbering = numbered([one.lie for one in seen])
         if numbering is not None:
             return _found(key, numbering, seen)
-    dictionary, _, _ = score.most_common(1)[0][0]
+    dictionary, *_ = score.most_common(1)[0][0]
     raise NoBoardError(
         f"the numbers of the markers of {dictionary} do not tell a board; show more of it, or describe it by "
         "--board, for example charuco:8x6:28:21"
     )
 
 
-def _found(key: tuple[str, int, bool], numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundPlane:
-    dictionary, border, tags = key
+def _found(key: _Key, numbering: Numbering, seen: Sequence[SeenMarkers]) -> FoundPlane:
+    dictionary, border, tags, inverted = key
     if tags and numbering.as_text:
         raise NoBoardError(
             f"the images show {numbering.cols} columns of markers of {dictionary} that stand alone, as on "
@@ -118,6 +128,8 @@ def _found(key: tuple[str, int, bool], numbering: Numbering, seen: Sequence[Seen
     step = float(np.median([part.lie.step for part in parts]))
     plane = _plane(possible[0], dictionary, border, step)
     plane = with_proportions(plane, [(seen[part.source].image, part.lie.marks) for part in parts])
+    if inverted and plane.markers is not None:
+        plane = replace(plane, markers=replace(plane.markers, inverted=True))
     return FoundPlane(plane, begins and stops, _doubts(possible))
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
+from neurocal_cli.detection.markers.codes import numbers_in
 from neurocal_cli.detection.markers.lattice import find_vertices, homographies, homography_at, place
 from neurocal_cli.detection.markers.reading import Marks
 from neurocal_cli.observations.board import Plane
@@ -28,6 +29,8 @@ _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of
 # at most.
 _CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.02
 _DIGITS = 3  # of other ratios
+_SHRUNK = (1.0, 0.96, 0.92, 0.88, 0.84, 0.8)  # sides of tags that are tried, over those that were read
+_LEAST = 0.04  # spacing
 _ALONG = np.linspace(0.35, 0.65, 7)  # of a cell's side, where the light is looked at
 _ACROSS = np.linspace(-0.15, 0.5, 53)  # of a cell, from its side inwards
 _BORDER = 0.6  # of the width of a marker's border that is looked at
@@ -39,18 +42,55 @@ _Picture = tuple[Array, NDArray[np.int64], NDArray[np.float32]]
 
 
 def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], Marks]]) -> Plane:
-    """The plane with the ratio that images of it show; the same plane if they do not show it well enough."""
-    seen = [part for image, marks in images if (part := _pictured(plane, image, marks)) is not None]
+    """The plane with the proportions that images of it show; those it has where they do not show them."""
     markers = plane.markers
     assert markers is not None
     if isinstance(plane, TagPlane):
-        spacing = _median([_spacing(plane, pixels) for pixels, _, _ in seen], plane.spacing)
-        return replace(plane, spacing=simple(spacing, _CLOSE_SPACING))
-    rough, border = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
-    found = [_side(picture, rough, border) for picture in seen]
+        tags = [part for image, marks in images if (part := _best(plane, image, marks)) is not None]
+        spacing = _median(
+            [_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags], np.nan
+        )
+        if not np.isfinite(spacing):
+            return plane
+        border = _border(plane, [picture for _, picture in tags])
+        return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
+    rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
+    seen = [picture for image, marks in images if (picture := _pictured(plane, image, marks)) is not None]
+    found = [_side(picture, rough, width) for picture in seen]
     side, blur = (_median([one[k] for one in found], other) for k, other in enumerate((rough, 1.0)))
     ratio = simple(side, min(_CLOSE_SIDE + _CLOSE_BLURRED * blur, _CLOSEST))
     return replace(plane, markers=replace(markers, side=ratio * plane.square))
+
+
+def _best(plane: TagPlane, image: NDArray[np.generic], marks: Marks) -> tuple[float, _Picture] | None:
+    """The spacing with which most vertices are found, and these; squares at its corners may shrink a tag."""
+    best: tuple[float, _Picture] | None = None
+    most = 0
+    for shrunk in _SHRUNK:
+        spacing = (1 + plane.spacing) * shrunk - 1
+        part = _pictured(replace(plane, spacing=spacing), image, marks) if spacing > _LEAST else None
+        count = 0 if part is None else int(np.isfinite(part[0][..., 0]).sum())
+        if part is not None and count > most:
+            best, most = (spacing, part), count
+    return best
+
+
+def _border(plane: TagPlane, pictures: Sequence[_Picture]) -> int:
+    """Width of the border of tags, with which most of their codes are read between the found vertices."""
+    assert plane.markers is not None
+    score = {plane.border: 1, 3 - plane.border: 0}
+    for pixels, _, light in pictures:
+        rows, cols = pixels.shape[:2]
+        first = pixels[: rows - 1 : 2, : cols - 1 : 2], pixels[: rows - 1 : 2, 1::2]
+        second = pixels[1::2, 1::2], pixels[1::2, : cols - 1 : 2]
+        # y points upwards.
+        corners = np.stack([second[1], second[0], first[1], first[0]], axis=2).reshape(-1, 4, 2)
+        number = plane.markers.first_id + np.arange(len(corners))
+        whole = np.isfinite(corners).all(axis=(1, 2))
+        for border in score:
+            read = numbers_in(light, corners[whole], plane.markers.dictionary, border)
+            score[border] += int((read == number[whole]).sum())
+    return max(score, key=lambda border: score[border])
 
 
 def simple(ratio: float, close: float) -> float:

@@ -97,7 +97,7 @@ class Document:
             return Field({"K": self.array.tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
         if _SECTION(text):
-            return Field(_sections(text, self.source), self.source)
+            return Field(sections(text, self.source), self.source)
         try:
             root = parse_tree(text, self.source)
         except FormatError:
@@ -215,7 +215,7 @@ def array_of(data: bytes, source: str) -> np.ndarray[Any, Any]:
         raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
 
 
-def _sections(text: str, source: str) -> dict[str, Any]:
+def sections(text: str, source: str) -> dict[str, Any]:
     """Read TOML, or the sections of an INI file."""
     if sys.version_info >= (3, 11):
         import tomllib
