@@ -45,6 +45,7 @@ from neurocal_cli.detection.grid import VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.observations.board_kinds import CirclePlane
 
+_AROUND = 3  # found circles around one that was not recognised
 _ROUNDS = 3
 _STEPS = 8  # Gauss-Newton steps
 _FIRST_BLUR = 1.2  # px
@@ -65,9 +66,10 @@ def measure_circles(
     raw = GridImage(light, grid, floor)
     found = map_of_vertices(raw)
     order = {tuple(one): k for k, one in enumerate(places.astype(int).tolist())}
-    places = raw.vertices
-    kept = np.array([order[tuple(one)] for one in places.astype(int).tolist()], dtype=np.intp)
-    radius = _radius(found.map, places, circles.area[kept])
+    kept = np.array([order[tuple(one)] for one in raw.vertices.astype(int).tolist()], dtype=np.intp)
+    radius = _radius(found.map, raw.vertices, circles.area[kept])
+    index = np.concatenate([circles.place[kept], _missed(plane, circles.place)])
+    places = plane.spread(index.astype(float))
     apart = np.sqrt(2) if plane.asymmetric else 1.0
     blur, shading = _FIRST_BLUR, None
     for _ in range(_ROUNDS):
@@ -93,7 +95,6 @@ def measure_circles(
     uneven = max(found.excess - 1, 0.0) * upper_median(fit.covariance[good, 0, 0]) if good.any() else 0.0
     spread = fit.covariance[:, :2, :2] * fit.variance_growth[:, None, None]
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
-    index = circles.place[kept]
     vertices = np.full((plane.rows, plane.cols, 2), np.nan)
     vertices[index[good, 1], index[good, 0]] = centre[good]
     return Measured(
@@ -106,6 +107,17 @@ def measure_circles(
         rejected=0,
         polarity=0.0,
     ).only(good)
+
+
+def _missed(plane: CirclePlane, found: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places (M, 2) of the board between found ones, whose marks were not recognised; they may be hidden."""
+    every = plane.midpoint_grid().astype(np.int64)
+    known = {tuple(one) for one in found.tolist()}
+    across = plane.spread(every.astype(float))
+    away = np.abs(across[:, None] - plane.spread(found.astype(float)))
+    near = (away.sum(axis=2) <= 2).sum(axis=1)
+    new = np.array([tuple(one) not in known for one in every.tolist()])
+    return every[new & (near >= _AROUND)]
 
 
 def _sparse(places: Array, centre: Array) -> Grid:
