@@ -27,13 +27,13 @@ def other_target(grey: NDArray[np.generic]) -> str:
     small = _small(grey)
     if _shows_markers(small):
         return (
-            "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; describe them by "
-            "--board, for example charuco:8x6:28:21"
+            "the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; leave out --cols and "
+            "--rows, so that the board is found, or describe it by --board, for example charuco:8x6:28:21"
         )
     if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
         return (
-            "the image shows a grid of circles, no chessboard; describe it by --board, for example "
-            "circles:7x6:20"
+            "the image shows a grid of circles, no chessboard; leave out --cols and --rows, so that the board "
+            "is found, or describe it by --board, for example circles:7x6:20"
         )
     return ""
 

@@ -58,7 +58,9 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     lines = [
         f"{len(detection.ids)} points, {detection.rejected} rejected; residuals x {scale}: rms "
         f"{np.sqrt((lengths**2).mean()):.3g} px, largest {lengths.max():.3g} px",
-        f"{', '.join(counts)}; edges displaced by {offsets} px before correction",
+        f"circles green ({len(every)})"
+        if any(one.circles is not None for one in detection.located)
+        else f"{', '.join(counts)}; edges displaced by {offsets} px before correction",
     ]
     canvas = _Canvas(grey, lines)
     grids = zip(detection.located, detection.measured, residuals, kinds, strict=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.finding.saddles import grey_levels, interpolate
+from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.codes import numbers_in
 from neurocal_cli.detection.markers.lattice import find_vertices, homographies, homography_at, place
 from neurocal_cli.detection.markers.reading import Marks
@@ -42,7 +43,11 @@ _Picture = tuple[Array, NDArray[np.int64], NDArray[np.float32]]
 
 
 def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], Marks]]) -> Plane:
-    """The plane with the proportions that images of it show; those it has where they do not show them."""
+    """The plane with the proportions that images of it show.
+
+    The markers of a ChArUco board stay as they are if their borders are not seen well. NoBoardError if the
+    corners of tags are not.
+    """
     markers = plane.markers
     assert markers is not None
     if isinstance(plane, TagPlane):
@@ -51,7 +56,10 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
             [_spacing(replace(plane, spacing=one), pixels) for one, (pixels, _, _) in tags], np.nan
         )
         if not np.isfinite(spacing):
-            return plane
+            raise NoBoardError(
+                "the images show tags without dark squares at their corners, or too blurred; use an AprilGrid "
+                "with them, as Kalibr's, or a ChArUco board"
+            )
         border = _border(plane, [picture for _, picture in tags])
         return replace(plane, spacing=simple(spacing, _CLOSE_SPACING), border=border)
     rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
