@@ -32,8 +32,8 @@ def other_target(grey: NDArray[np.generic]) -> str:
         )
     if small.size >= _CIRCLES * _OUTLINE and (_shows_circles(small) or _shows_circles(255 - small)):
         return (
-            "the image shows a grid of circles, no chessboard; leave out --cols and --rows, so that the board "
-            "is found, or describe it by --board, for example circles:7x6:20"
+            "the image shows a grid of circles, no chessboard; leave out --cols and --rows, so that the "
+            "board is found, or describe it by --board, for example circles:7x6:20"
         )
     return ""
 
