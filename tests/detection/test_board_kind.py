@@ -11,7 +11,7 @@ from support.marked import errors_of, marked_scene, plane_of, taken
 from support.real_data import RealFiles
 
 from neurocal_cli.detection.board_kind import FoundBoard, find_board, found_board
-from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles
+from neurocal_cli.detection.circles.pattern import SeenCircles, agreed_circles, seen_circles
 from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.lie import lie_of
@@ -158,3 +158,23 @@ def test_photographs_of_circles_tell_their_pattern(real_files: RealFiles) -> Non
     for path in real_files("photographs/circles*.jpg"):
         plane = found_board([np.asarray(cv2.imread(str(path), 0))]).plane
         assert (kind_of(plane), plane.cols, plane.rows) == ("asymmetric_circles", 7, 10)
+
+
+def test_squares_in_a_grid_are_no_circles() -> None:
+    image = np.full((300, 400), 20, np.uint8)
+    for row in range(8):
+        for column in range(10):
+            left, top = 45 + 32 * column, 25 + 32 * row
+            cv2.rectangle(image, (left, top), (left + 20, top + 20), (230,), -1)
+    for blur in (1.0, 2.0):
+        assert seen_circles(cv2.GaussianBlur(image, (0, 0), blur)) is None
+
+
+def test_tags_without_squares_at_their_corners_are_named() -> None:
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    image = np.full((300, 380), 235, np.uint8)
+    for k in range(12):
+        left, top = 20 + 88 * (k % 4), 20 + 88 * (2 - k // 4)
+        image[top : top + 70, left : left + 70] = cv2.aruco.generateImageMarker(family, k, 70)
+    with pytest.raises(NoBoardError, match="tags without dark squares at their corners"):
+        found_board([cv2.GaussianBlur(image, (0, 0), 0.8)])

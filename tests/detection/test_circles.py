@@ -12,6 +12,7 @@ from support.picture_bound import edge_bound
 
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.detection.circles.blobs import Blobs
+from neurocal_cli.detection.circles.fitting import _missed
 from neurocal_cli.detection.circles.lattice import place_circles
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.identity.placement import NoBoardError
@@ -67,6 +68,15 @@ def test_light_circles_on_dark_are_found_too() -> None:
     error, _ = errors_of(found, picture)
     assert len(error) == 28
     assert np.abs(error).max() < 0.03
+
+
+def test_circles_around_found_ones_are_measured_too() -> None:
+    plane = plane_of(ASYMMETRIC)
+    assert isinstance(plane, CirclePlane)
+    every = plane.midpoint_grid().astype(np.int64)
+    assert _missed(plane, every).tolist() == []
+    assert _missed(plane, np.delete(every, [0, 13], axis=0)).tolist() == every[[0, 13]].tolist()
+    assert _missed(plane, every[:8])[:, 1].max() == 2  # not far from these
 
 
 def test_a_hidden_circle_is_left_out() -> None:

@@ -32,6 +32,7 @@ _AROUND = 2.3  # squares; markers that predict a vertex
 _REACH = 1.6  # squares between a vertex and the nearest marker or vertex that predicts it
 _MOVED, _MOVED_PX = 0.12, 1.2  # squares and px; greatest distance between prediction and saddle point
 _BESIDE = 0.25  # of a cell; where the four colours around a vertex are looked at
+_UNLIKE = 1.4  # greatest difference of opposite colours over the contrast; 2 at the corner of a lone tag
 _LEAST_CONTRAST = 0.3  # relative to that of most vertices
 _FEWEST = 4  # vertices
 # Vertices that are enough to find one that does not fit those around it, and its distance: squares and px.
@@ -247,4 +248,7 @@ def _refined(
     parity = (grid.sum(axis=1) + dark) % 2 == 0
     sign = np.where(parity, -1.0, 1.0)
     size = 0.5 * sign * (levels[:, 0] + levels[:, 2] - levels[:, 1] - levels[:, 3])
+    # Opposite quadrants are alike; at a tag's corner without a square beyond it, they are dark and light.
+    unlike = np.maximum(np.abs(levels[:, 0] - levels[:, 2]), np.abs(levels[:, 1] - levels[:, 3]))
+    new[~(unlike < _UNLIKE * np.abs(size))] = np.nan
     return new, np.where(np.isfinite(new[:, 0]), size, np.nan)
