@@ -50,7 +50,7 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
     from neurocal_cli.detection.board_kind import found_board
     from neurocal_cli.detection.identity.placement import NoBoardError
     from neurocal_cli.observations.board import Board
-    from neurocal_cli.observations.board_kinds import found_words, unit_length
+    from neurocal_cli.observations.board_kinds import CirclePlane, found_words, unit_length
 
     with ProgressBar() as progress:
         found = found_board(_readable(_spread(paths), progress))
@@ -62,16 +62,13 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
     (side, unit), length = options.side, unit_length(plane)
     say(f"found {found_words(plane)}")
     warn(*found.doubts)
-    if not found.sure and plane.markers is None:
-        warn(
-            f"no image shows that the board ends on all sides; if it has more than {plane.cols} x "
-            f"{plane.rows} inner vertices, give their numbers by --cols and --rows"
-        )
-    elif not found.sure:
-        warn(
-            "no image shows that the board ends at its first and last row; if it has more rows, describe it "
-            "by --board"
-        )
+    if not found.sure:
+        sides, more = "on all sides", f"than {plane.cols} x {plane.rows} circles, describe it by --board"
+        if plane.markers is not None:
+            sides, more = "at its first and last row", "rows, describe it by --board"
+        elif not isinstance(plane, CirclePlane):
+            more = f"than {plane.cols} x {plane.rows} inner vertices, give their numbers by --cols and --rows"
+        warn(f"no image shows that the board ends {sides}; if it has more {more}")
     if options.square is None:
         note(_UNKNOWN.format(length))
         unit = (

@@ -140,7 +140,9 @@ def test_grids_of_circles_that_differ_are_refused() -> None:
     with pytest.raises(NoBoardError, match="different grids, 7 x 6 circles and 4 x 11 asymmetric circles"):
         agreed_circles([one, other])
     with pytest.raises(NoBoardError, match="only parts of a grid of circles"):
-        agreed_circles([replace(one, whole=False)])
+        agreed_circles([replace(one, whole=False, full=True)])
+    plane, sure = agreed_circles([replace(one, whole=False, full=True)] * 2)
+    assert (plane.cols, plane.rows, sure) == (7, 6, False)
 
 
 @pytest.mark.parametrize(("pattern", "legacy"), [("new", False), ("legacy", True)])

@@ -30,6 +30,8 @@ _FEWEST_ROWS = 3  # and columns
 _MOST_CIRCLES = 3000
 _BENT = 0.1  # greatest median of the second differences of centres, over the step
 _LOPSIDED = 0.06  # 0.02 of circles of 6 px
+# Images that show the same full pattern without what is around it, and their least share.
+_AGREE, _MOST = 2, 0.6
 _ENOUGH = 0.2  # least share of the votes for the board's pattern
 
 
@@ -41,6 +43,7 @@ class SeenCircles:
     rows: int
     asymmetric: bool
     whole: bool  # whether it fills the pattern, and the image shows that it ends at all sides
+    full: bool = False  # whether it fills the pattern
 
     def __str__(self) -> str:
         """What one counts on it."""
@@ -70,7 +73,8 @@ def seen_circles(image: NDArray[np.generic]) -> SeenCircles | None:
     area = blobs.area[list(lattice.values())]
     if _lopsided(grey.astype(np.float32), places, centre, area) > _LOPSIDED:
         return None
-    return replace(seen, whole=share == 1 and _ends_seen(places, centre, seen, grey.shape))
+    full = share == 1
+    return replace(seen, whole=full and _ends_seen(places, centre, seen, grey.shape), full=full)
 
 
 def _likelihood(one: tuple[float, SeenCircles, Array]) -> tuple[float, bool, int]:
@@ -148,8 +152,13 @@ def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
 
     Raises NoBoardError if they show only parts of a grid, or different ones.
     """
-    whole = Counter(replace(one, whole=False) for one in seen if one.whole)
+    whole = Counter(_pattern(one) for one in seen if one.whole)
     enough = [one for one, count in whole.items() if count >= _ENOUGH * whole.total()]
+    sure = bool(enough)
+    if not sure:
+        # Parts that the image border cuts off seldom agree.
+        full = Counter(_pattern(one) for one in seen if one.full)
+        enough = [one for one, count in full.items() if count >= max(_AGREE, _MOST * len(seen))]
     if len(enough) > 1:
         raise NoBoardError(
             f"the images show different grids, {' and '.join(map(str, enough[:3]))}; describe yours by "
@@ -162,4 +171,8 @@ def agreed_circles(seen: Sequence[SeenCircles]) -> tuple[CirclePlane, bool]:
             "around it, or describe it by --board, for example circles:7x6:20"
         )
     (one,) = enough
-    return CirclePlane("", one.cols, one.rows, 1.0, asymmetric=one.asymmetric), True
+    return CirclePlane("", one.cols, one.rows, 1.0, asymmetric=one.asymmetric), sure
+
+
+def _pattern(seen: SeenCircles) -> SeenCircles:
+    return replace(seen, whole=False, full=False)

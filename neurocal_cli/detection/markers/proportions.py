@@ -28,7 +28,7 @@ from neurocal_cli.observations.markers import DICTIONARIES
 _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of simple ones
 # Differences from a usual ratio of a measured spacing, and of a marker's side: without blur, by the blur, and
 # at most.
-_CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.02
+_CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.012
 _DIGITS = 3  # of other ratios
 _SHRUNK = (1.0, 0.96, 0.92, 0.88, 0.84, 0.8)  # sides of tags that are tried, over those that were read
 _LEAST = 0.04  # spacing
