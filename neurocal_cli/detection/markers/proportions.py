@@ -29,13 +29,14 @@ _USUAL, _SIMPLE = 20, 12  # denominators of usual ratios, and the largest one of
 # Differences from a usual ratio of a measured spacing, and of a marker's side: without blur, by the blur, and
 # at most.
 _CLOSE_SPACING, _CLOSE_SIDE, _CLOSE_BLURRED, _CLOSEST = 0.002, 0.004, 0.3, 0.012
+_CLOSE_ROUGH = 0.03  # of one from the corners of the markers
 _DIGITS = 3  # of other ratios
 _SHRUNK = (1.0, 0.96, 0.92, 0.88, 0.84, 0.8)  # sides of tags that are tried, over those that were read
 _LEAST = 0.04  # spacing
 _ALONG = np.linspace(0.35, 0.65, 7)  # of a cell's side, where the light is looked at
 _ACROSS = np.linspace(-0.15, 0.5, 53)  # of a cell, from its side inwards
 _BORDER = 0.6  # of the width of a marker's border that is looked at
-_FEWEST = 4  # cells
+_FEWEST = 2  # cells
 
 # A picture of a board: its vertices (rows, cols, 2) [px], NaN where none was found, the first vertices (N, 2)
 # of the cells with markers, and the light.
@@ -65,8 +66,11 @@ def with_proportions(plane: Plane, images: Sequence[tuple[NDArray[np.generic], M
     rough, width = markers.side / plane.square, 1 / (DICTIONARIES[markers.dictionary] + 2)
     seen = [picture for image, marks in images if (picture := _pictured(plane, image, marks)) is not None]
     found = [_side(picture, rough, width) for picture in seen]
-    side, blur = (_median([one[k] for one in found], other) for k, other in enumerate((rough, 1.0)))
-    ratio = simple(side, min(_CLOSE_SIDE + _CLOSE_BLURRED * blur, _CLOSEST))
+    side, blur = (_median([one[k] for one in found], np.nan) for k in (0, 1))
+    if np.isfinite(side):
+        ratio = simple(side, min(_CLOSE_SIDE + _CLOSE_BLURRED * blur, _CLOSEST))
+    else:
+        ratio = simple(rough, _CLOSE_ROUGH)
     return replace(plane, markers=replace(markers, side=ratio * plane.square))
 
 
