@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from neurocal_cli import Calibration, Camera, Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli.commands.show.camera_report import calibration_json
 from neurocal_cli.files import calibration_yaml
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.result_files import write_calibration
@@ -110,3 +111,13 @@ def test_files_have_both_poses(
         assert (again.second_poses[name].pose.R == view.pose.R).all()
         assert again.second_poses[name].probability == view.probability
         assert again.views[name].probability == found.views[name].probability
+
+
+def test_json_has_both_poses(far: tuple[list[Pose], Calibration]) -> None:
+    _, found = far
+    written = calibration_json(found)["second_poses"]
+    assert list(written) == list(found.second_poses)
+    for name, (first, second) in written.items():
+        assert first["R"] == found.views[name].pose.R.tolist()
+        assert second["t"] == found.second_poses[name].pose.t.tolist()
+        assert first["probability"] + second["probability"] == pytest.approx(1)

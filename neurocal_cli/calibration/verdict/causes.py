@@ -44,14 +44,18 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             continue  # the standard deviations include it
         if not (found.rival.of_board or found.rival.of_given) and any(x.rival.of_board for x in close):
             continue
+        names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
+        single = found.rival.patterns is None
+        if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
+            if place:
+                continue
+            known = [one for one in (found, *close) if not one.rival.unknown]
+            found = max(known, key=lambda one: _graded(contest, one, calibration)[0])  # the gravest
+            names = dict.fromkeys(x.rival.cause for x in known if x.rival.cause != found.rival.cause)
         grade, reason = _graded(contest, found, calibration)
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
             # The standard deviations do not include the board and the lens.
             grade = max(grade, int(not found.rival.of_given))
-        names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
-        single = found.rival.patterns is None
-        if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
-            continue
         if names:
             reason += f" (or, hardly less probable: {', '.join(names)})"
         yield grade, reason, found.rival.advice

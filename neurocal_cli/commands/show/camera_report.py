@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurocal_cli.calibration.calibration import Calibration, Verdict, fixed_intrinsics
+from neurocal_cli.calibration.calibration import Calibration, Verdict, ViewResult, fixed_intrinsics
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.pinhole import POSE_NAMES
@@ -178,7 +178,10 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "rmse_px": number_or_none(calibration.rmse_px),
         "max_px": number_or_none(calibration.max_px),
         "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
-        "second_poses": {name: view.probability for name, view in calibration.second_poses.items()},
+        "second_poses": {
+            name: [_pose_json(one) for one in (calibration.views[name], second)]
+            for name, second in calibration.second_poses.items()
+        },
         "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
         "target": target_json(calibration.target, calibration.unit),
         "converged": bool(calibration.converged),
@@ -186,6 +189,11 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "warnings": list(calibration.warnings),
         **verdict_json(calibration.verdict),
     }
+
+
+def _pose_json(view: ViewResult) -> dict[str, Any]:
+    """A pose, and its probability where the flat target may be tilted the other way."""
+    return {"probability": view.probability, "R": view.pose.R.tolist(), "t": view.pose.t.tolist()}
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:
