@@ -25,6 +25,7 @@ from neurocal_cli.camera.state import CameraState
 _AHEAD = 4  # rivals that are tried together with another one
 _MOST = 3  # causes at once
 _MINOR = 0.05  # share of a cause's evidence below which a further one is what its linearisation leaves
+_CURVED = 20.0  # relative error of a linearisation over the size of the cause, which is dimensionless
 _FAR = 0.25  # the same after a cause that was fitted
 _PART = 0.3  # of the evidence: a good part
 _STEPS = 30
@@ -88,7 +89,10 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
         nearest = min(found, key=lambda fit: fit.cost, default=_Fit(np.inf))
         if nearest.errors is not None and nearest.cost < float((errors**2).sum()):
             errors = nearest.errors
-        n = effective_number(n, correlation(lin.views, errors))
+        alike, of_two = correlation(lin.views, errors), _errors_of_two(lin, ranking[0], rivals, n)
+        if of_two is not None:
+            alike = min(alike, correlation(lin.views, of_two))
+        n = effective_number(n, alike)
         ranking = [_refined(lin, one, fits) for one in estimates(lin, n, rivals)]
         ranking.sort(key=lambda one: -one.evidence)
     share = n / lin.spare
@@ -98,7 +102,10 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     while ranking and ranking[0].evidence > max(LEVEL, least) and len(causes) < _MOST:
         ranking = _likeliest_first(ranking)
         chosen = _best(at, ranking, rivals, share)
-        least = max(least, (_FAR if fits.get(_key(chosen[0])) else _MINOR) * chosen[0].evidence)
+        # What the linearisation of a few unknowns leaves is of second order.
+        few = chosen[0].weights.size
+        minor = min(_MINOR, (_CURVED * chosen[0].size) ** 2) if few else _MINOR
+        least = max(least, (_FAR if fits.get(_key(chosen[0])) else minor) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)
             alone = one is ranking[0]
@@ -109,6 +116,22 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
     # As an estimated target counts it: all residuals as independent.
     evidence -= 0.5 * lin.spare * worth * (1.0 - share / worth) * float(np.log(left))
     return Contest(lin, tuple(causes), tuple(close), 1.0 - left, evidence)
+
+
+def _errors_of_two(lin: Linearised, first: Estimate, rivals: Iterable[Rival], n: float) -> Array | None:
+    """(N, 2) residuals with a second cause beside the first; at least one of them is shared by views."""
+    at = including(lin, first)
+    seconds = estimates(at, n, _others(rivals, [first]), LEVEL)
+    second = next((one for one in seconds if first.weights.size or one.weights.size), None)
+    if second is None or second.evidence < LEVEL:
+        return None
+    if not first.weights.size:
+        first, own = second, first.rival
+        at = including(lin, first)
+        second = next(iter(estimates(at, n, (own,))), second)
+    f = len(lin.free)
+    of_first = first.weights[:, None] * (first.rival.steps_at(lin) @ second.camera[f:])
+    return lin.residuals(_steps(lin, replace(second, camera=second.camera[:f])) + of_first)
 
 
 def _likeliest_first(ranking: list[Estimate]) -> list[Estimate]:
@@ -130,9 +153,8 @@ def _best(
     highest = ranking[0].evidence + LEVEL
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
-    for one in ranking[:_AHEAD]:
-        if not one.weights.size or one.evidence < LEVEL or one.rival.unknown:
-            continue
+    shared = [one for one in ranking if one.weights.size and one.evidence >= LEVEL and not one.rival.unknown]
+    for one in shared[:_AHEAD]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
         # One of them is common to all views: changes of groups and of single views look like each other.
