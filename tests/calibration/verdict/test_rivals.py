@@ -198,7 +198,8 @@ def test_turned_images_are_named(n_turned: int, shape: str, amount: float) -> No
     which = np.random.default_rng(n_turned).permutation(14)[:n_turned]
     found = calibrate(turned(points, which), distortion="k1k2", outliers="keep")
     assert "turned by 180 degrees" in reasons(found)
-    group = winner(found).weights > 0
+    (apart,) = (one for one in held(found).causes if one.rival.cause == "two cameras")
+    group = apart.weights > 0
     assert set(np.flatnonzero(group if group.sum() <= 7 else ~group)) == set(which) or n_turned == 7
 
 
