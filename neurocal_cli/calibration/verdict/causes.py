@@ -47,11 +47,12 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
         names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
         single = found.rival.patterns is None
         if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
-            if place:
+            told = [one for one in close if one.evidence > LEVEL and not one.rival.unknown]
+            if place or not told:
                 continue
-            known = [one for one in (found, *close) if not one.rival.unknown]
-            found = max(known, key=lambda one: _graded(contest, one, calibration)[0])  # the gravest
-            names = dict.fromkeys(x.rival.cause for x in known if x.rival.cause != found.rival.cause)
+            told.insert(0, found)
+            found = max(told, key=lambda one: _graded(contest, one, calibration)[0])  # the gravest
+            names = dict.fromkeys(x.rival.cause for x in told if x.rival.cause != found.rival.cause)
         grade, reason = _graded(contest, found, calibration)
         if found.pattern == "all" and (found.rival.of_board or found.rival.steps is not None):
             # The standard deviations do not include the board and the lens.
