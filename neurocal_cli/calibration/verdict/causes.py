@@ -44,6 +44,8 @@ def findings(contest: Contest, calibration: Calibration, given_told: bool) -> It
             continue  # the standard deviations include it
         if not (found.rival.of_board or found.rival.of_given) and any(x.rival.of_board for x in close):
             continue
+        if place and any(x.rival.unknown for x in close):
+            continue  # a further cause has to beat that of none as well
         names = dict.fromkeys(other.rival.cause for other in close if _is_another(found, other))
         single = found.rival.patterns is None
         if names and (place or single) and found.evidence < _UNCLEAR * LEVEL:
@@ -99,7 +101,8 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     grade = found.rival.limit.grade(size)
     if found.rival.of_given and told.moved_poses > _TOLD:
         grade = max(grade, 1 + int(found.explained > _MOST))
-    if contest.of_outliers:  # which were left out of the calibration
+    # Outliers were left out of the calibration, and what differs from view to view is in the std.
+    if contest.of_outliers or not found.weights.size:
         return grade, reason
     biased = (
         abs(by) / calibration.std[name] for name, by in told.biases.items() if calibration.std[name] > 0

@@ -26,6 +26,7 @@ _AHEAD = 4  # rivals that are tried together with another one
 _MOST = 3  # causes at once
 _MINOR = 0.05  # share of a cause's evidence below which a further one is what its linearisation leaves
 _CURVED = 20.0  # relative error of a linearisation over the size of the cause, which is dimensionless
+_OF_EACH = 0.15  # the same after a cause that each view has in its own way, which may be another motion
 _FAR = 0.25  # the same after a cause that was fitted
 _PART = 0.3  # of the evidence: a good part
 _STEPS = 30
@@ -104,7 +105,7 @@ def _held(lin: Linearised, rivals: tuple[Rival, ...], worth: float) -> Contest:
         chosen = _best(at, ranking, rivals, share)
         # What the linearisation of a few unknowns leaves is of second order.
         few = chosen[0].weights.size
-        minor = min(_MINOR, (_CURVED * chosen[0].size) ** 2) if few else _MINOR
+        minor = min(_MINOR, (_CURVED * chosen[0].size) ** 2) if few else _OF_EACH
         least = max(least, (_FAR if fits.get(_key(chosen[0])) else minor) * chosen[0].evidence)
         for one in chosen:
             causes.append(one)

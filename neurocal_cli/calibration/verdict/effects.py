@@ -44,9 +44,12 @@ def turning(seen: Seen) -> Array:
     return seen.by_entries[:, 3:5] * seen.pixels[:, None, None, 1]
 
 
-def rolling(seen: Seen) -> Array:
-    """The target, or the camera, moves in any direction while the rows are read."""
-    return seen.by_pose * seen.pixels[:, None, None, 1]
+def moving(seen: Seen) -> Array | None:
+    """The target moves past the camera while the rows are read; nearer points move farther."""
+    if seen.to_camera is None:
+        return None
+    nearer = 1 / np.linalg.norm(seen.to_camera, axis=1)
+    return seen.by_entries[:, 3:5] * (seen.pixels[:, 1] * nearer / nearer.mean())[:, None, None]
 
 
 def cut(axis: int) -> Effect:

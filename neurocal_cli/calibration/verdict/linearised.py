@@ -64,7 +64,6 @@ class Seen:
     """T batches of n points each, for the functions that return an effect's columns (T, m, 2, n)."""
 
     by_entries: Array  # (T, 5, 2, n) derivatives of the pixels by the entries of A
-    by_pose: Array  # (T, 6, 2, n) and by each view's pose
     pixels: Array  # (T, 2, n) where the camera sees the points, from the middle of the image; over S1
     observed: Array  # (T, 2, n) where they were observed [px]
     # Derivatives (T, 3, 2, n) along the board, across it and along its normal, over its half length; the
@@ -188,9 +187,9 @@ def _derivatives(
                 off[:, 0] = (off[:, 0] - w[1] * off[:, 1]) / w[0]
             off = np.nan_to_num(off, nan=0.0, posinf=0.0, neginf=0.0)  # of padding
         px = views.pixel_scale * observed + views.pixel_centre[:, None]
-        seen = Seen(J[:, :5], J[:, POSE], observed - off - middle[:, None], px)
+        seen = Seen(J[:, :5], observed - off - middle[:, None], px)
         if board is not None:
-            seen = _on_board(seen, views, state, board, view, batches.local[chunk])
+            seen = _on_board(seen, views, state, board, view, batches.local[chunk], J[:, POSE])
         found = {effect: part for effect in effects if (part := effect(seen)) is not None}
         widths = {effect: part.shape[1] for effect, part in found.items()}
         yield chunk, np.concatenate([J[:, :-1], *found.values(), J[:, -1:]], axis=1), widths
@@ -203,11 +202,12 @@ def _on_board(
     board: Board,
     view: NDArray[np.intp],
     local: Array,
+    by_pose: Array,
 ) -> Seen:
     n, scale, back = local.shape[2], views.scale[view][:, None, None], np.swapaxes(state.R[view], 1, 2)
     world = local * scale + views.centre[view][:, :, None]
     places = np.moveaxis(board.axes[:, :2].T @ (world - board.centre[:, None]) / board.size, 1, 0)
-    by_local = (back @ seen.by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
+    by_local = (back @ by_pose[:, 3:].reshape(len(view), 3, -1)).reshape(-1, 3, 2, n)
     by_board = np.einsum("ia,tipn->tapn", board.axes, by_local * (board.size / scale[..., None]))
     to_camera = np.einsum("ia,tin->tan", board.axes, -back @ state.t[view][:, :, None] - local)
     return replace(seen, by_board=by_board, places=places, to_camera=to_camera)

@@ -181,7 +181,7 @@ RIVALS: tuple[Rival, ...] = (
             _MOVED,
             effect=effect,
         )
-        for effect in (effects.turning, effects.rolling)
+        for effect in (effects.turning, effects.moving)
     ),
     *(
         Rival(

@@ -190,11 +190,8 @@ def bent_view(told: Told) -> Said:
 
 def rolling(told: Told) -> Said:
     """Rows that were read while the camera moved."""
-    rows = float(np.ptp(told.lin.views.pixels[:, 1]))
-    amounts, lin = told.found.amounts, told.lin
-    if amounts.shape[1] > 2:  # how the centroids of the targets move
-        amounts = amounts[:, 3:5] * lin.state.entries[0, 0] / lin.state.t[:, 2:]
-    px = float(np.sqrt((amounts**2).mean())) * rows * lin.views.pixel_scale
+    rows = float(np.ptp(told.lin.views.pixels[:, 1])) * told.lin.views.pixel_scale
+    px = float(np.sqrt((told.found.amounts**2).mean())) * rows
     return (
         f"camera or target moved while the rows of the images were read, by about {px:.2g} px from the first "
         "points to the last: a rolling shutter",

@@ -82,20 +82,11 @@ def test_a_cut_takes_the_displacement_away(axis: int) -> None:
     assert left(lin, cut, np.array([2.0, -1.0]) / views.pixel_scale) < 0.3  # points at the cut
 
 
-def test_rows_that_are_read_while_the_target_moves() -> None:
-    """It turns and shifts, in each view in another way."""
+def test_rows_that_are_read_while_the_camera_turns() -> None:
     points, state = exact()
-    late = (points.pixels[:, 1:] - (SIZE[1] - 1) / 2) / SIZE[1]
-    w, v = np.random.default_rng(1).normal(size=(2, points.n_views, 3)) * [[[0.003]], [[0.6]]]
-    view = points.view_index
-    turned = (state.R[view] @ (points.world - board().mean(axis=0))[..., None])[..., 0]
-    X = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
-    X += late * (np.cross(w[view], turned) + v[view])
-    pixels = X[:, :2] / X[:, 2:] * state.entries[0, [0, 2]] + state.entries[0, 3:]
-    lin, *_ = at(replace(points, pixels=pixels), state)
-    _, rolling = (one for one in RIVALS if one.cause == "a rolling shutter")
-    (found,) = estimates(lin, lin.spare, (rolling,))
-    assert found.explained > 0.99
+    rows = (points.pixels[:, 1:] - (SIZE[1] - 1) / 2) / SIZE[1]
+    lin, *_ = at(with_pixels(points, rows * [3.0, 2.0]), state)
+    assert left(lin, effects.turning, np.array([3.0, 2.0]) / SIZE[1]) < 0.05
 
 
 def test_blocks_of_a_codec() -> None:
