@@ -152,7 +152,10 @@ def _refined(found: Solution, axes: tuple[int, int]) -> float:
 
 
 def _rms(solution: Solution) -> float:
-    return float(np.sqrt(solution.squared_error / len(solution.problem.points)))
+    """Rms error [px]; infinite if it is larger than the image of the points."""
+    points = solution.problem.points
+    error = float(np.sqrt(solution.squared_error / len(points)))
+    return error if error < float(points.pixels.std()) else np.inf
 
 
 def homography(plane: Array, pixels: Array) -> Array:
