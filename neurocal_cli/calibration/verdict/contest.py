@@ -154,7 +154,8 @@ def _best(
     highest = ranking[0].evidence + LEVEL
     if ranking[0].pattern == "all":
         return best  # few unknowns do not look like two causes by chance
-    shared = [one for one in ranking if one.weights.size and one.evidence >= LEVEL and not one.rival.unknown]
+    others = [one for one in ranking[1:] if one.evidence >= LEVEL and not one.rival.unknown]
+    shared = [one for one in others if one.weights.size]
     for one in shared[:_AHEAD]:
         both = including(at, one)
         second = estimates(both, both.spare * share, _others(rivals, [one]), highest - one.evidence)
