@@ -8,30 +8,22 @@ translation for each view as in OpenCV's calibration sample, or ``rvecs`` and ``
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data
 from neurocal_cli.files.exchange.camera_names import plain
-from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted, to_vector
+from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted
+from neurocal_cli.files.exchange.dictionary_texts import entries, json_text, npz_bytes, opencv_text
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
-from neurocal_cli.files.exchange.neurocal import as_stereo
-from neurocal_cli.files.file_storage import storage_text
 from neurocal_cli.files.tree_fields import Field
-from neurocal_cli.files.yaml_text import nested
 
 _DEEPEST = 4  # mappings within each other
 # Share of the image's side by which the principal point is far from the middle, and far outside the image.
@@ -261,65 +253,6 @@ def _flat(field: Field) -> Array:
     return values
 
 
-def entries(cameras: CameraSet) -> dict[str, Any]:
-    """Make the dictionary of one or two cameras: texts, numbers, lists of names and matrices."""
-    first = cameras.cameras[0]
-    tree: dict[str, Any] = {}
-    sides = ("",) if len(cameras.cameras) == 1 else ("1", "2")
-    same = all(camera.image_size == first.image_size for camera in cameras.cameras)
-    for side, camera in zip(sides, cameras.cameras, strict=True):
-        end = "" if same else side
-        tree[f"camera_name{side}"] = camera.name
-        if camera.image_size is not None and (f"image_width{end}" not in tree):
-            tree[f"image_width{end}"], tree[f"image_height{end}"] = camera.image_size
-        model, k = to_ros(camera.distortion.model, camera.distortion.coefficients)
-        tree[f"distortion_model{side}"] = model
-        if model == "omnidir":
-            tree[f"xi{side}"], k = float(k[0]), k[1:]
-        tree[f"M{side}" if side else "camera_matrix"] = camera.A
-        tree[f"D{side}" if side else "distortion_coefficients"] = k[None]
-    if cameras.has_lengths and cameras.unit is not None:
-        tree["unit"] = cameras.unit
-    if cameras.relative:
-        (pose,) = cameras.relative
-        tree |= {"R": pose.R, "T": pose.t[:, None]}
-        rig = as_stereo(cameras)
-        tree |= {"E": rig.E, "F": rig.F}
-        rectified = rectify(rig)
-        if rectified is not None:
-            tree |= {key: getattr(rectified, key) for key in ("R1", "R2", "P1", "P2", "Q")}
-    if cameras.poses:
-        tree["view_names"] = list(cameras.poses)
-        rows = [np.concatenate([to_vector(pose.R), pose.t]) for pose in cameras.poses.values()]
-        tree["extrinsic_parameters"] = np.array(rows)
-    return tree
-
-
-def _opencv(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    tree = entries(cameras)
-    if any(camera.distortion.model == "fisheye" for camera in cameras.cameras):
-        tree["fisheye_model"] = 1  # as in OpenCV's calibration sample
-    return {"": storage_text(tree, ending)}
-
-
-def json_text(tree: Mapping[str, Any]) -> str:
-    """Write the dictionary as JSON, one entry per line; unknown numbers are null."""
-    plain = {key: nested(value) if isinstance(value, np.ndarray) else value for key, value in tree.items()}
-    lines = [f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in plain.items()]
-    return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def npz_bytes(tree: Mapping[str, Any]) -> bytes:
-    """Write the dictionary for ``numpy.load``, without the time stamps of ``numpy.savez``."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for key, value in tree.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{key}.npy"), member.getvalue())
-    return buffer.getvalue()
-
-
 _ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
 
 
@@ -330,7 +263,7 @@ def _anything(document: Document) -> bool:
 OPENCV = Format(
     "OpenCV",
     _ALL,
-    _opencv,
+    opencv_text,
     _anything,
     read,
     files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",

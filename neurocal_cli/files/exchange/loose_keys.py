@@ -48,47 +48,19 @@ from neurocal_cli.files.exchange.camera_names import (
     means,
     plain,
 )
+from neurocal_cli.files.exchange.loose_values import (
+    flat,
+    has_entries,
+    is_four,
+    is_matrix,
+    is_numbers,
+    matrix_of,
+)
 from neurocal_cli.files.failures import one_line, value_failures
-from neurocal_cli.files.tree_fields import Field, is_number
+from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
 _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
-
-
-def _is_numbers(value: Any) -> bool:
-    if isinstance(value, dict):
-        return "data" in value or (value.keys() == {"x", "y"} and all(map(_is_numbers, value.values())))
-    if isinstance(value, (list, tuple)):
-        return bool(value) and all(map(_is_numbers, value))
-    if isinstance(value, str):
-        return is_number(value) is not None
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, dict):
-        return _count(value.get("data", []))
-    return sum(map(_count, value)) if isinstance(value, (list, tuple)) else 1
-
-
-def _is_matrix(value: Any) -> bool:
-    return not isinstance(value, (int, float, str)) and _is_numbers(value) and _count(value) == 9
-
-
-def _is_four(value: Any) -> bool:
-    """Whether this is a list of fx, fy, cx, cy."""
-    return isinstance(value, list) and len(value) == 4 and all(is_number(str(entry)) for entry in value)
-
-
-def _has_entries(value: Any) -> bool:
-    """Whether a mapping has fx, fy, cx and cy under one of their names, or the pairs of them."""
-    if not isinstance(value, dict):
-        return False
-    names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
-    pairs = {plain(str(key)) for key, entry in value.items() if _is_numbers(entry)}
-    return all(not names.isdisjoint(entry) for entry in ENTRIES) or not (
-        pairs.isdisjoint(FOCAL) or pairs.isdisjoint(CENTRE)
-    )
 
 
 class LooseKeys:
@@ -120,8 +92,8 @@ class LooseKeys:
             return None
         first = self.root[keys[0]]
         for other in keys[1:]:
-            if _is_numbers(first.value) and _is_numbers(self.root.value[other]):
-                if _flat(self.root.value[other]) != _flat(first.value):
+            if is_numbers(first.value) and is_numbers(self.root.value[other]):
+                if flat(self.root.value[other]) != flat(first.value):
                     self.root.refuse(f"{keys[0]} and {other} differ, and both may be meant; remove one")
                 self.read.add(other)
         self.read.add(keys[0])
@@ -130,17 +102,17 @@ class LooseKeys:
     def has_camera(self, side: str = "") -> bool:
         """Whether there is a camera matrix, or its entries, under their usual names."""
         matrix = any(
-            _is_matrix(self.root.value[key])
-            or (len(key) > 1 and (_has_entries(self.root.value[key]) or _is_four(self.root.value[key])))
+            is_matrix(self.root.value[key])
+            or (len(key) > 1 and (has_entries(self.root.value[key]) or is_four(self.root.value[key])))
             for name in MATRIX
             for form in ((name + side, side + name) if side else (name,))
             for key in self.names.get(form, [])
         )
-        return matrix or (not side and _has_entries(self.root.value))
+        return matrix or (not side and has_entries(self.root.value))
 
     def camera(self, side: str = "", name: str = "camera") -> Camera:
         """Read the camera, or that of one side."""
-        inside = self.find(MATRIX, side, _has_entries)
+        inside = self.find(MATRIX, side, has_entries)
         if (
             inside is not None and inside is not self.root
         ):  # it may hold the coefficients and the size as well
@@ -170,7 +142,7 @@ class LooseKeys:
         field = next((f for s in sides if (f := self.find(SIZE, s)) is not None), None)
         if width is not None and height is not None:
             size = width.integer(), height.integer()
-            if field is not None and sorted(map(int, filter(np.isfinite, _flat(field.value)))) not in (
+            if field is not None and sorted(map(int, filter(np.isfinite, flat(field.value)))) not in (
                 [],
                 sorted(size),
             ):
@@ -181,12 +153,12 @@ class LooseKeys:
                 turned, field = True, self.find(SHAPE)
             if field is None:
                 return None
-            if isinstance(field.value, dict) and not _is_numbers(field.value):
+            if isinstance(field.value, dict) and not is_numbers(field.value):
                 return LooseKeys(field).image_size()
             if isinstance(field.value, str):
                 numbers: list[float] = [int(n) for n in re.findall(r"\d+", field.value)]
             else:
-                numbers = _flat(field.value)
+                numbers = flat(field.value)
             if len(numbers) != 2 and not (turned and len(numbers) == 3):
                 field.fail("two whole numbers, width and height")
             values = [Field(n, field.source, field.path).integer() for n in numbers]
@@ -200,9 +172,9 @@ class LooseKeys:
         """Refuse numbers that may be the distortion and were not read."""
         for key, value in self.root.value.items():
             name = plain(str(key))
-            if key in self.read or HARMLESS.search(name) or not _is_numbers(value):
+            if key in self.read or HARMLESS.search(name) or not is_numbers(value):
                 continue
-            numbers = _flat(value)
+            numbers = flat(value)
             if isinstance(value, (list, dict)):
                 listed = len(numbers) in LENGTHS and not NO_LIST.search(name)
                 guess = not self.coefficients_read and listed and any(n != int(n) for n in numbers)
@@ -218,8 +190,8 @@ class LooseKeys:
     coefficients_read = False
 
     def _intrinsics(self, side: str) -> Intrinsics:
-        field = self.find(MATRIX, side, lambda value: _is_matrix(value) or _has_entries(value))
-        if field is None and not side and _has_entries(self.root.value):
+        field = self.find(MATRIX, side, lambda value: is_matrix(value) or has_entries(value))
+        if field is None and not side and has_entries(self.root.value):
             field = self.root
         if field is None:
             field = self.find(
@@ -233,10 +205,10 @@ class LooseKeys:
                 "holds no camera matrix; give a file with the key camera_matrix, cameraMatrix or K"
                 f"{f' (its keys are {one_line(keys)})' if keys else ''}"
             )
-        if isinstance(field.value, dict) and _has_entries(field.value):
+        if isinstance(field.value, dict) and has_entries(field.value):
             K = (self if field is self.root else LooseKeys(field))._of_entries()
         elif isinstance(field.value, list) and len(field.value) == 4:
-            K = _matrix(*field.array(4).tolist())
+            K = matrix_of(*field.array(4).tolist())
         else:
             K = matrix_data(field, 9).reshape(3, 3)
             if not K[:2, 2].any() and K[2, :2].all():
@@ -262,18 +234,18 @@ class LooseKeys:
         found = [self.find(names, "", lambda v: not isinstance(v, (dict, list))) for names in ENTRIES]
         four = [entry.number() for entry in found if entry is not None]
         if len(four) < 4:
-            focal, centre = (self.find(names, "", _is_numbers) for names in (FOCAL, CENTRE))
+            focal, centre = (self.find(names, "", is_numbers) for names in (FOCAL, CENTRE))
             assert focal is not None
-            assert centre is not None  # `_has_entries`
-            four = [*(2 * _flat(focal.value))[:2], *_flat(centre.value)]
+            assert centre is not None  # `has_entries`
+            four = [*(2 * flat(focal.value))[:2], *flat(centre.value)]
             size = self.image_size()
             if len(four) != 4 or four[0] < (_LEAST_FOCAL if size is None else _LEAST_SHARE * size[0]):
                 raise InputError(
                     f"{focal.path} is not told to be in pixels; give a file with fx, fy, cx and cy in pixels"
                 )
-        skew = self.find(("skew", "s"), "", _is_numbers)
+        skew = self.find(("skew", "s"), "", is_numbers)
         fx, fy, cx, cy = four
-        return _matrix(fx, fy, cx, cy, 0.0 if skew is None else skew.number())
+        return matrix_of(fx, fy, cx, cy, 0.0 if skew is None else skew.number())
 
     def _stated_model(self, side: str) -> str | None:
         """ROS's name of the distortion model that the file states; None if it states none."""
@@ -308,7 +280,7 @@ class LooseKeys:
         return "plumb_bob" if stated else None
 
     def _distortion(self, side: str) -> Distortion:
-        xi = self.find(("xi",), side, _is_numbers)
+        xi = self.find(("xi",), side, is_numbers)
         coefficients, named = self._coefficients(side)
         model = self._stated_model(side)
         if coefficients is None:
@@ -350,9 +322,9 @@ class LooseKeys:
                 inner.refuse_unread()
                 return found
             return matrix_data(field, -1), False
-        radial = self.find(RADIAL, side, _is_numbers)
+        radial = self.find(RADIAL, side, is_numbers)
         if radial is not None:
-            tangential = self.find(TANGENTIAL, side, _is_numbers)
+            tangential = self.find(TANGENTIAL, side, is_numbers)
             k = (
                 matrix_data(radial, -1)
                 if not isinstance(radial.value, (int, float))
@@ -365,7 +337,7 @@ class LooseKeys:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         values = {}
         for name in names:
-            entry = self.find((name,), side, lambda v: _is_numbers(v) and not isinstance(v, (list, dict)))
+            entry = self.find((name,), side, lambda v: is_numbers(v) and not isinstance(v, (list, dict)))
             if entry is not None:
                 values[name] = entry.number()
         if not values:
@@ -374,19 +346,6 @@ class LooseKeys:
             return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
         full = [values.get(name, 0.0) for name in names]
         return np.array(full if any(full[5:]) else full[:5]), True
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
-    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _flat(value: Any) -> list[float]:
-    """The numbers in nested lists, or in a matrix."""
-    if isinstance(value, dict):
-        return _flat(value["data"] if "data" in value else [value.get("x", []), value.get("y", [])])
-    if isinstance(value, (list, tuple)):
-        return [number for entry in value for number in _flat(entry)]
-    return [float(value)] if _is_numbers(value) else [float("nan")]
 
 
 def _omnidirectional(xi: Field, coefficients: Array, model: str) -> Distortion:
