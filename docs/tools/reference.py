@@ -17,6 +17,7 @@ from neurocal_cli.commands import neurocal
 from neurocal_cli.files.exchange.reading import FORMATS, READ
 
 DOCS = Path(__file__).resolve().parents[1]
+_MANY_SHARED = 5  # options; fewer are described again
 MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
 
 # The names of the package by topic. A name that is in none of them goes to the last.
@@ -75,12 +76,29 @@ def _command_page(ctx: click.Context) -> str:
         "Arguments",
         [(f"`{p.metavar}`", p.description) for p in ctx.command.params if hasattr(p, "description")],
     )
-    parts += _list(
-        "Options", [_option(ctx, p) for p in ctx.command.get_params(ctx) if isinstance(p, click.Option)]
-    )
+    parts += _list("Options", _options(ctx))
     for example in examples:
         parts += ["## Examples", _code(inspect.cleandoc(example.partition("Examples:")[2]))]
     return "\n\n".join(parts) + "\n"
+
+
+def _options(ctx: click.Context) -> list[tuple[str, str]]:
+    """The options of a command; those that it shares with `calibrate` are named there alone, in one line."""
+    own = _described(ctx)
+    calibrate = neurocal.get_command(ctx, "calibrate")
+    assert calibrate is not None
+    there = _described(click.Context(calibrate, info_name="calibrate", parent=_root()))
+    shared = [option for option in own if option in there]
+    if ctx.command is calibrate or len(shared) < _MANY_SHARED:
+        return own
+    names = [re.search("--[a-z-]+", term) for term, _ in shared]
+    text = ", ".join(f"`{name[0]}`" for name in names if name is not None and name[0] != "--help")
+    of_calibrate = ("[As in `neurocal calibrate`](calibrate.md#options)", text)
+    return [of_calibrate, *(option for option in own if option not in shared)]
+
+
+def _described(ctx: click.Context) -> list[tuple[str, str]]:
+    return [_option(ctx, p) for p in ctx.command.get_params(ctx) if isinstance(p, click.Option)]
 
 
 def _paragraph(text: str) -> str:

@@ -38,6 +38,7 @@ def main() -> None:
 def _write(page: Path, outcomes: dict[str, tuple[str, str]]) -> None:
     text = page.read_text(encoding="utf-8")
     made = [f"| {name} | {word} | {_reason(reason)} |\n" for name, (word, reason) in outcomes.items()]
+    text = re.sub(r"^(Each of the )\d+ rows", rf"\g<1>{len(made)} rows", text, flags=re.MULTILINE)
     head = "| wrong input | ends | because |\n| --- | --- | --- |\n"
     page.write_text(text[: text.index(head)] + head + "".join(made), encoding="utf-8")
 

@@ -127,11 +127,38 @@ def test_each_public_name_is_in_the_python_reference() -> None:
     ) == set(neurocal_cli.__all__)
 
 
+def prose(page: Path) -> str:
+    return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as Python-Markdown makes them, and those that are given."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
+    given = [re.search(r"{#([\w-]+)}", heading) for heading in headings]
+    plain = [re.sub(r"[^\w\s-]", "", re.sub(r"\]\([^)]*\)", "", one)).strip().lower() for one in headings]
+    return {
+        re.sub(r"[\s-]+", "-", text) if mark is None else mark[1]
+        for text, mark in zip(plain, given, strict=True)
+    }
+
+
 def test_links_lead_somewhere() -> None:
     for page in PAGES:
-        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-        for target in re.findall(r"\]\(([^)#\s]+)", text):
-            assert target.startswith("http") or (page.parent / target).exists(), (name(page), target)
+        for target, _, anchor in re.findall(r"\]\(([^)#\s]*)(#([^)\s]*))?\)", prose(page)):
+            if target.startswith("http"):
+                continue
+            there = page.parent / target if target else page
+            assert there.exists(), (name(page), target)
+            assert not anchor or anchor in anchors(there), (name(page), target, anchor)
+
+
+def test_counts_of_wrong_data_are_those_of_the_tables() -> None:
+    for page in (ROOT / "docs" / "reference").glob("wrong-*.md"):
+        text = page.read_text(encoding="utf-8")
+        counts = re.findall(r"^Each of the (\d+) rows", text, flags=re.MULTILINE)
+        assert counts == [
+            str(len(re.findall(r"^\| .+ \| (?:refused|poor|usable) \|", text, flags=re.MULTILINE)))
+        ]
 
 
 def test_files_of_the_project_that_a_page_names_are_there() -> None:
@@ -142,7 +169,7 @@ def test_files_of_the_project_that_a_page_names_are_there() -> None:
 
 
 def test_the_architecture_page_is_of_this_package() -> None:
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "development" / "architecture.md").read_text(encoding="utf-8")
     package = ROOT / "neurocal_cli"
     way = re.findall(r"^\| `([\w/]+\.py)` \|", text, flags=re.MULTILINE)
     assert 1 < len(way) <= 8
