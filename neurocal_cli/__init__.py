@@ -1,7 +1,7 @@
 """neurocal: camera calibration by a neural network whose weights are the camera.
 
-Data flow one way: points, network, calibration, evaluation. The page `docs/development/architecture.md` lists the
-packages in their order and describes the path of a calibration through them.
+Data flow one way: points, network, calibration, evaluation. The page `docs/development/architecture.md`
+lists the packages in their order and describes the path of a calibration through them.
 
 The package `neurocal` has the same names. They are loaded on first use, so that a command imports only what
 it needs.

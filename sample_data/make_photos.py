@@ -7,7 +7,7 @@ holds its margin, and the pictures have the lens, the noise and the compression 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -27,6 +27,7 @@ CAMERA = Camera(
 SQUARES, SIDE, MARGIN = (10, 7), 25.0, 15.0  # squares across and down, mm, mm of white paper around them
 HALF = 0.5 * SIDE * np.array(SQUARES)  # of the pattern, from its middle [mm]
 CURL, ANEW = 0.5, 0.1  # mm that the paper bends, in all pictures alike and anew in each
+SEED = 100
 FINE = 4  # rays across and down in each pixel
 BLUR, FULL_WELL, GAMMA, QUALITY = 0.9, 900.0, 2.2, 80
 # Of each picture: where the board's middle is in the image, its distance [mm], tilt, side of the tilt, and
@@ -39,9 +40,9 @@ VIEWS = (
 )  # fmt: skip
 
 
-def poses() -> Iterator[Pose]:
+def poses(views: Sequence[tuple[float, ...]] = VIEWS) -> Iterator[Pose]:
     """World to camera, with the middle of the pattern at the origin."""
-    for u, v, distance, tilt, side, roll in VIEWS:
+    for u, v, distance, tilt, side, roll in views:
         ray = CAMERA.seen_points(np.array([[u * 639, v * 479]]))[0]
         turn = Pose.from_euler(0, 0, np.radians(side), np.zeros(3)).R
         R = turn @ Pose.from_euler(np.radians(tilt), 0, 0, np.zeros(3)).R @ turn.T
@@ -55,13 +56,20 @@ def height(x: Array, y: Array, bend: Array) -> Array:
     return bend[0] * (a * a - 1 / 3) + bend[1] * (b * b - 1 / 3) + bend[2] * a * b
 
 
-def photograph(pose: Pose, bend: Array, rng: np.random.Generator) -> Array:
-    """A picture in grey values from 0 to 255."""
-    width, height_px = CAMERA.image_size or (0, 0)
+def bent(rng: np.random.Generator, anew: float = ANEW) -> Array:
+    """How the paper bends in a picture [mm]."""
+    return CURL * np.array([1.0, -0.3, 0.4]) + anew * rng.standard_normal(3)
+
+
+def photograph(
+    pose: Pose, bend: Array, rng: np.random.Generator, camera: Camera = CAMERA, moved: int = 1
+) -> Array:
+    """A picture in grey values from 0 to 255; the camera may have moved by some pixels while it was taken."""
+    width, height_px = camera.image_size or (0, 0)
     step = (np.arange(FINE) + 0.5) / FINE - 0.5
     u = (np.arange(width)[:, None] + step).ravel()
     v = (np.arange(height_px)[:, None] + step).ravel()
-    rays = CAMERA.unproject(np.stack(np.meshgrid(u, v), axis=-1))
+    rays = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
     direction, centre = rays @ pose.R, -pose.R.T @ pose.t  # in the paper's frame
     z = np.zeros(rays.shape[:2])
     for _ in range(5):
@@ -75,9 +83,9 @@ def photograph(pose: Pose, bend: Array, rng: np.random.Generator) -> Array:
     slope = 2 * bend[0] * x / HALF[0] ** 2
     light = 1.0 + 8.0 * slope + 0.0006 * (0.7 * x - y)
     scene = np.where(on_paper, paper * light, behind(rng, rays.shape[:2]))
-    thumb(scene, pose, bend, rng)
+    thumb(scene, pose, camera, rng)
     seen = scene.reshape(height_px, FINE, width, FINE).mean(axis=(1, 3))
-    seen = cv2.GaussianBlur(seen, (0, 0), BLUR)
+    seen = cv2.blur(cv2.GaussianBlur(seen, (0, 0), BLUR), (moved, max(1, moved // 2)))
     rho = np.hypot(*np.meshgrid(np.linspace(-1, 1, width), np.linspace(-0.75, 0.75, height_px))) / 1.25
     seen = np.clip(seen * (0.86 - 0.2 * rho**2), 0, 1)
     electrons = rng.poisson(FULL_WELL * seen) + rng.normal(0, 14.0, seen.shape)
@@ -95,20 +103,19 @@ def behind(rng: np.random.Generator, size: tuple[int, int]) -> Array:
     return np.asarray(cv2.GaussianBlur(wall, (0, 0), 2.2 * FINE))
 
 
-def thumb(scene: Array, pose: Pose, bend: Array, rng: np.random.Generator) -> None:
+def thumb(scene: Array, pose: Pose, camera: Camera, rng: np.random.Generator) -> None:
     """Draw a thumb over the white margin of the paper."""
     side = rng.choice([-1.0, 1.0])
     x, y = side * (HALF[0] + MARGIN), rng.uniform(-0.6, 0.6) * HALF[1]
     tip, root = (np.array([x - side * 8, y, 0.0]), np.array([x + side * 45, y + 12, 0.0]))
-    ends = CAMERA.project(pose.to_camera(np.array([tip, root])))[0]
-    (a, b), scale = (ends + 0.5) * FINE, CAMERA.A[0, 0] / pose.t[2] * FINE
+    ends = camera.project(pose.to_camera(np.array([tip, root])))[0]
+    (a, b), scale = (ends + 0.5) * FINE, camera.A[0, 0] / pose.t[2] * FINE
     cv2.line(scene, a.astype(int).tolist(), b.astype(int).tolist(), 0.38, max(1, int(15 * scale)))
     cv2.circle(scene, a.astype(int).tolist(), int(7 * scale), 0.41, -1)
 
 
 if __name__ == "__main__":
     for number, pose in enumerate(poses(), start=1):
-        rng = np.random.default_rng(number)
-        bend = CURL * np.array([1.0, -0.3, 0.4]) + ANEW * rng.standard_normal(3)
-        image = np.round(photograph(pose, bend, rng)).astype(np.uint8)
+        rng = np.random.default_rng(SEED + number)
+        image = np.round(photograph(pose, bent(rng), rng)).astype(np.uint8)
         write_whole(str(HERE / f"photo{number:02d}.jpg"), encode_image(image, ".jpg", QUALITY))

@@ -47,7 +47,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     else:
         print_text(lambda: "\n".join(advice_lines(advice)))
     if plot is not None:
-        from neurocal_cli.commands.show.advice import draw_advice
+        from neurocal_cli.commands.show.advised_views import draw_advice
 
         write_plot(plot, draw_advice, advice, known)
         tell_written(plot)

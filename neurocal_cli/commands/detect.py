@@ -158,7 +158,7 @@ def detect(
           | neurocal calibrate - -o camera.yaml
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
       neurocal detect sample_data/board*.png --board board.yaml --json \\
-          --cache found --frames 30 -o points.csv
+          --cache found --frames 30 --board-name left -o points.csv
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
       neurocal board --board charuco:8x6:28:21 --dpi 100 -o print.png
       neurocal detect print.png --board charuco:8x6:28:21 -o points.csv

@@ -17,14 +17,13 @@ def sample(folder: str) -> None:
     """Write the sample data, with which all examples work.
 
     The folder then has simulated points of single cameras, of stereo pairs, rigs and a zoom lens, and
-    rendered images of a chessboard. Its README.md tells what each file shows, and the true cameras. Files
-    that are there already are left as they are; a file of such a name with other content is an error.
+    rendered photographs of a chessboard. Its README.md tells what each file shows, and the true cameras.
+    Files that are there already are left as they are; a file of such a name with other content is an error.
 
     \b
     Examples:
       neurocal sample sample_data
-      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
-          -o points.csv
+      neurocal detect sample_data/photo*.jpg --square 25 -o points.csv
       neurocal calibrate points.csv -o camera.yaml
     """  # noqa: D301 - as in the group
     preparation.check_folder("DIR", folder)

@@ -12,8 +12,9 @@ import pytest
 from support.command_line import run
 from support.distorted import bent_set
 from support.made_calibration import made_calibration
+from support.places import SAMPLES
 
-from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, write_calibration
+from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, read_points, write_calibration
 from neurocal_cli.calibration.advice import (
     Candidate,
     _Known,
@@ -26,6 +27,7 @@ from neurocal_cli.calibration.advice import (
 )
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.commands.show.advice import advice_lines
+from neurocal_cli.commands.show.advised_views import board_of, draw_advice
 from neurocal_cli.errors import InputError
 
 MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")
@@ -155,3 +157,19 @@ def test_what_cannot_be_advised_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=message):
             advise(given)
+
+
+def test_the_squares_of_the_board_are_drawn_where_they_are() -> None:
+    calibration = calibrate(read_points(SAMPLES / "flat.csv"), distortion="none", skew=False)
+    squares, rim = board_of(calibration)
+    assert len(squares) == 35  # dark ones of 10 x 7
+    assert np.allclose(np.ptp(squares, axis=1)[:, :2], 25.0)
+    inner = np.abs(squares.mean(axis=1) - [12.5, 12.5, 0]).sum(axis=1) < 1e-6
+    assert inner.sum() == 1  # beside the vertex 0:0
+    assert np.allclose(rim.min(axis=0), [-25, -25, 0], atol=1e-6)
+    assert np.allclose(rim.max(axis=0), [225, 150, 0], atol=1e-6)
+    unnamed = replace(calibration, points=replace(calibration.points, point=None))
+    squares, rim = board_of(unnamed)
+    assert not len(squares)
+    assert rim[:, 0].max() == pytest.approx(200)
+    assert draw_advice(advise(unnamed, 1), unnamed) != draw_advice(advise(calibration, 1), calibration)

@@ -20,9 +20,16 @@ from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration.calibration import Rejected, Verdict
 from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
-from neurocal_cli.commands.show.html_page import enlargement, error_bars, heat_map, residual_map
+from neurocal_cli.commands.show.html_drawings import (
+    board_shape,
+    enlargement,
+    error_bars,
+    heat_map,
+    residual_map,
+)
 from neurocal_cli.files.images import encode_png, parse_image
 from neurocal_cli.files.result_files import write_result
+from neurocal_cli.observations.target import Target
 
 VOID = {"meta", "br"}
 
@@ -278,6 +285,32 @@ def test_bars_are_as_high_as_the_errors() -> None:
     heights = [float(h) for h in re.findall(r'height="([\d.]+)" class="bar"', drawn)]
     assert heights[1] / heights[0] == pytest.approx(4, rel=0.01)
     assert "b&lt;: 0.4 px" in drawn
+    assert re.findall(r'text-anchor="end">([\d.]+)<', drawn) == ["0", "0.1", "0.2", "0.3", "0.4", "0.5"]
+    assert re.findall(r'text-anchor="middle">(\d+)<', drawn) == ["1", "2"]
+
+
+def test_the_discs_of_a_board_are_as_large_as_its_heights() -> None:
+    places = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
+    drawn = board_shape(places, np.array([0.1, -0.4, 0.2, 0.0]))
+    found = re.findall(r'cx="(\d+)" cy="(\d+)" r="([\d.]+)" class="(up|down)"', drawn)
+    assert [(int(x), int(y)) for x, y, _, _ in found] == [(0, 0), (10, 0), (0, 10), (10, 10)]
+    areas = np.array([float(radius) for _, _, radius, _ in found]) ** 2
+    assert areas / areas[1] == pytest.approx([0.25, 1.0, 0.5, 0.0], abs=0.01)
+    assert [side for *_, side in found] == ["up", "down", "up", "down"]
+    assert board_shape(places, np.zeros(4)) == ""
+
+
+def test_the_page_shows_the_board_as_it_was_found_and_the_lenses_tried(tmp_path: Path) -> None:
+    calibration = made_calibration(3)
+    world = np.unique(calibration.points.world, axis=0)
+    bent = np.column_stack([np.zeros((len(world), 2)), 1e-5 * world[:, 0] ** 2])
+    target = Target(world, world + bent, np.full_like(world, 0.01), np.zeros(len(world), int), {}, False, 9.0)
+    tried = {"k1": 0.2, calibration.distortion_model: 0.1}
+    write_calibration(replace(calibration, target=target, lens_choice=tried), tmp_path / "camera.yaml")
+    page = Page(run("report", tmp_path / "camera.yaml").stdout)
+    assert "target: bent by" in page.text
+    assert page.tags.count("circle") == len(world) + 1
+    assert page.text.index("0.1000") < page.text.index("chosen") < page.text.index("0.2000")
 
 
 @pytest.mark.parametrize(

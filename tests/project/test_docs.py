@@ -191,11 +191,14 @@ def test_pictures_have_a_script() -> None:
 
 @pytest.mark.slow
 def test_the_scripts_of_the_pictures_run(tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "docs" / "pictures", tmp_path / "docs" / "pictures")
+    for part in ("pictures", "how-to"):
+        shutil.copytree(ROOT / "docs" / part, tmp_path / "docs" / part)
     (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     for script in sorted((tmp_path / "docs" / "pictures").glob("*.py")):
         subprocess.run([sys.executable, script], check=True, env=environment)
+    words = Path("docs", "how-to", "photograph.md")  # what is said of the rendered sets
+    assert agrees((ROOT / words).read_text("utf-8"), (tmp_path / words).read_text("utf-8"))
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from neurocal_cli.camera.camera import Camera, camera_of
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, say, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, picture, plain, say, style
 from neurocal_cli.observations.board import planes_are_named
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
@@ -37,13 +38,13 @@ _CELLS = 6  # across and down, as in the verdict
 _MOST_DOTS = 5000
 _LEVELS = 12  # of uncertainty
 _FLAT = 0.02  # greatest thickness over size of a target that is drawn as an outline; admits bent boards
-_MOST_NAMES = 8  # of views in space
+_MOST_NAMES = 24  # of views in space
 _SIZE = 0.12  # of a drawn camera, relative to the scene
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 _HERE = Pose(np.eye(3), np.zeros(3))
 _LONGEST = 0.12  # of a target's plane, for the longest arrow
 _HEIGHT_LEVELS = 13
-_WIDTH, _HEIGHT = 5.5, 4.5  # inches of a target's panel
+_WIDTH, _HEIGHT = 5.0, 3.6  # inches of a target's panel
 
 
 @frozen_dataclass
@@ -123,9 +124,9 @@ def draw_residuals(axes: Axes, subject: Subject) -> None:
     )
     axes.plot(subject.camera.intrinsics.u0, subject.camera.intrinsics.v0, "+", color=ACCENT, markersize=11)
     some = "" if len(shown) == len(seen) else f", {len(shown)} of {len(seen)} points"
-    style(axes, f"Residuals, predicted minus observed,\nenlarged {scale:,.10g} times{some}")
+    style(axes, f"Residuals, {scale:,.10g} times enlarged{some}")
     set_image(axes, subject)
-    axes.set_xlabel("u [px]  (+ is the image centre)")
+    axes.set_xlabel("u [px]; arrows from observed to predicted, + centre")
 
 
 def draw_scatter(axes: Axes, subject: Subject) -> None:
@@ -138,12 +139,12 @@ def draw_scatter(axes: Axes, subject: Subject) -> None:
     )
     angle = np.linspace(0, 2 * np.pi, 181)
     circle = evaluation.rmse_px * np.array([np.cos(angle), np.sin(angle)])
-    axes.plot(*circle, color=ACCENT, linewidth=1.2, label=f"rms {evaluation.rmse_px:.4g} px")
-    axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=ACCENT, markersize=9, label="mean")
+    axes.plot(*circle, color=ACCENT, linewidth=1.5)
+    axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=ACCENT, markersize=9)
     limit = 1.1 * max(evaluation.max_px, 1e-12) if np.isfinite(evaluation.max_px) else 1.0
-    style(axes, "Residuals of all points")
-    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="du [px]", ylabel="dv [px]")
-    axes.legend(loc="upper right", frameon=False)
+    style(axes, f"Residuals of all points, rms {evaluation.rmse_px:.3g} px")
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", ylabel="dv [px]")
+    axes.set_xlabel("du [px]; the circle is the rms, + the mean")
 
 
 def draw_views(axes: Axes, subject: Subject) -> None:
@@ -155,15 +156,16 @@ def draw_views(axes: Axes, subject: Subject) -> None:
     else:
         edges = np.arange(len(errors) + 1) - 0.5
         axes.stairs(np.nan_to_num(errors), edges, fill=True, color=INK)
-    axes.axhline(evaluation.rmse_px, color=ACCENT, linewidth=1.2, label="all points")
-    style(axes, "Error of each view")
-    axes.set(xlabel="view", ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
+    axes.axhline(evaluation.rmse_px, color=ACCENT, linewidth=1.2)
+    style(axes, f"Error of each view; the line is that of all points, {evaluation.rmse_px:.3g} px")
+    axes.set(ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
     if len(errors) <= _MOST_BARS:
         names = [plain(name[-20:]) for name in evaluation.views]
         axes.set_xticks(np.arange(len(errors)), names, rotation=90 if len(errors) > 6 else 0)
+    else:
+        axes.set_xlabel("view, in the order of the data")
     highest = np.nanmax(errors, initial=0.0)
-    axes.set_ylim(0, 1.25 * highest if highest > 0 else 1.0)  # room for the legend
-    axes.legend(loc="upper right", frameon=False)
+    axes.set_ylim(0, 1.1 * highest if highest > 0 else 1.0)
 
 
 def draw_learning(axes: Axes, subject: Subject) -> None:
@@ -176,13 +178,11 @@ def draw_learning(axes: Axes, subject: Subject) -> None:
         return
     curve = np.maximum(np.array(network.curve), _ZERO)
     marker = "o" if len(curve) <= 60 else ""
-    axes.semilogy(
-        np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK, label="error of the network"
-    )
-    label = f"error after bundle adjustment, {network.rmse_after:.4g} px"
-    axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2, label=label)
-    axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
-    axes.legend(loc="upper right", frameon=False)
+    axes.semilogy(np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK)
+    axes.axhline(max(network.rmse_after, _ZERO), color=ACCENT, linewidth=1.2)
+    what = "iteration" if calibration.trainer == "lm" else "checkpoint"
+    axes.set(xlabel=f"{what}; the line is {network.rmse_after:.3g} px, after bundle adjustment")
+    axes.set_ylabel("rms of the network [px]")
 
 
 def draw_coverage(axes: Axes, subject: Subject) -> None:
@@ -192,13 +192,13 @@ def draw_coverage(axes: Axes, subject: Subject) -> None:
     across, down = np.linspace(left, right, _CELLS + 1), np.linspace(top, bottom, _CELLS + 1)
     counts = np.histogram2d(v, u, (down, across))[0]
     drawn = axes.pcolormesh(across, down, counts, cmap="Blues", vmin=0, vmax=max(1.0, 1.3 * counts.max()))
-    axes.figure.colorbar(drawn, ax=axes, label="points", shrink=0.7)
+    colour_bar(axes, drawn, "points")
     for row, column in np.argwhere(counts == 0).tolist():
         middle = across[column : column + 2].mean(), down[row : row + 2].mean()
         axes.plot(*middle, "x", color=ACCENT, markersize=8)
     some = np.random.default_rng(0).permutation(len(u))[:_MOST_DOTS]
     axes.plot(u[some], v[some], ".", color=INK, markersize=1.5, rasterized=len(u) > _MANY_DOTS)
-    style(axes, f"Coverage: {np.mean(counts > 0):.0%} of the parts of the image hold points")
+    style(axes, f"Coverage: {100 * np.mean(counts > 0):.0f} % of the image; crosses have no points")
     axes.grid(False)
 
 
@@ -206,7 +206,7 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     """Draw the standard deviation of projected pixels over the image, at the points' median distance."""
     projection = None if subject.evidence is None else subject.evidence.projection
     if projection is None or not np.isfinite(projection.std[1]).any():
-        style(axes, "Uncertainty of projected pixels")
+        style(axes, "Uncertainty")
         say(axes, "known only of a calibration whose image size is known")
         return
     from matplotlib.colors import BoundaryNorm
@@ -218,10 +218,11 @@ def draw_uncertainty(axes: Axes, subject: Subject) -> None:
     least = max(float(std.min()), 1e-12)
     levels = np.geomspace(least, max(float(std.max()), 1.01 * least), _LEVELS)
     drawn = axes.contourf(u, v, std, levels=levels, cmap="viridis_r", norm=BoundaryNorm(levels, 256))
-    axes.figure.colorbar(drawn, ax=axes, label="std [px]", format="%.2g", ticks=levels[::2], shrink=0.7)
+    colour_bar(axes, drawn, "std [px]", format="%.2g", ticks=levels[::2])
     pixels = subject.points.pixels
     axes.plot(*pixels[:: max(1, len(pixels) // 1000)].T, ".", color="white", markersize=1, alpha=0.7)
-    style(axes, f"Uncertainty of projected pixels, {projection.worst:.3g} px at most")
+    unit = "" if subject.calibration is None else plain(subject.calibration.unit)
+    style(axes, f"Uncertainty at {projection.depths[1]:.3g} {unit}: {projection.worst:.3g} px at most")
     axes.grid(False)
 
 
@@ -234,7 +235,7 @@ def targets_of(calibration: Calibration, mounted: Pose | None = None) -> list[Ou
     points, found = calibration.points, []
     for k, name in enumerate(points.view_names):
         world = points.world[points.view_index == k]
-        outline = calibration.views[name].pose.to_camera(flat := _outline(world))
+        outline = calibration.views[name].pose.to_camera(flat := outline_of(world))
         if mounted is not None:
             outline = (outline - mounted.t) @ mounted.R
         found.append((name, outline, calibration.views[name].rmse_px, len(flat) < len(world)))
@@ -254,7 +255,7 @@ def draw_poses(
     one.
     """
     space: Any = axes
-    style(axes, "Poses")
+    style(axes, "Poses of the views")
     if calibration is None or not calibration.views or not len(calibration.points):
         space.text2D(0.5, 0.5, "known only of a calibration", ha="center", transform=space.transAxes)
         space.set_axis_off()
@@ -268,20 +269,23 @@ def draw_poses(
     known = errors[np.isfinite(errors)]
     colour = ScalarMappable(Normalize(0, float(known.max()) if known.size else 1.0), colormaps["viridis"])
     extent = [np.zeros((1, 3))]
+    names_of_views = _short([name for name, *_ in shown])
+    middle = np.mean([outline.mean(axis=0) for _, outline, *_ in shown], axis=0)
     for name, outline, error, flat in shown:
         extent.append(outline)
         shade = colour.to_rgba(np.asarray(error))
         closed = np.vstack([outline, outline[:1]]) if flat else outline
         space.plot(*_turned(closed).T, "-" if flat else ".", color=shade, linewidth=1.3, markersize=2)
-        if len(shown) <= _MOST_NAMES:
-            space.text(*_turned(outline[:1])[0], name[-12:].replace("$", r"\$"), fontsize=7, color="0.3")
+        if label := names_of_views.get(name):
+            outermost = outline[np.linalg.norm((outline - middle)[:, :2], axis=1).argmax()]
+            space.text(*_turned(outermost[None])[0], label, fontsize=8, color=INK, fontweight="bold")
     size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
     for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
         corners = (_frustum(camera, size) - pose.t) @ pose.R
         extent.append(corners)
         centre, *ends = _turned(corners)
-        if names:
-            space.text(*centre, names[number].replace("$", r"\$"), fontsize=8, color=INK)
+        label = names[number] if names else "camera" if not others else ""
+        space.text(*centre, plain(label), fontsize=9, color=INK, ha="right", va="top")
         for end, after in zip(ends, [*ends[1:], ends[0]], strict=True):
             space.plot(*np.array([centre, end, after]).T, color=(INK, ACCENT)[number % 2], linewidth=1.2)
     everything = _turned(np.vstack(extent))
@@ -289,10 +293,22 @@ def draw_poses(
     space.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=1.1)
     unit = calibration.unit.replace("$", r"\$")
     space.set(xlabel=f"X right [{unit}]", ylabel=f"Z forward [{unit}]", zlabel=f"Y down [{unit}]")
-    space.locator_params(nbins=5)
+    space.locator_params(nbins=4)
+    space.tick_params(pad=0, labelsize=8)
+    space.yaxis.labelpad = 6
     space.invert_zaxis()
     space.view_init(elev=22, azim=-60)
-    axes.figure.colorbar(colour, ax=axes, label="rms [px]", shrink=0.6, pad=0.16)
+    scale = axes.inset_axes((1.2, 0.15, 0.04, 0.7))
+    axes.figure.colorbar(colour, cax=scale, label="rms [px]")
+
+
+def _short(names: Sequence[str]) -> dict[str, str]:
+    """What distinguishes the names of views: they without what all begin with; none if there are many."""
+    if len(names) > _MOST_NAMES:
+        return {}
+    letters = zip(*names, strict=False) if len(names) > 1 else ()
+    common = sum(1 for _ in takewhile(lambda alike: len(set(alike)) == 1, letters))
+    return {name: plain((name[common:] or name)[-12:]) for name in names}
 
 
 def _turned(points: Array) -> Array:
@@ -300,7 +316,7 @@ def _turned(points: Array) -> Array:
     return points[:, [0, 2, 1]]
 
 
-def _outline(world: Array) -> Array:
+def outline_of(world: Array) -> Array:
     """Corners of a flat target's convex hull, in order; all points of other targets."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -341,16 +357,16 @@ def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
     planes = int(target.plane.max()) + 1
 
     def draw(figure: Figure) -> None:
-        rows = figure.subplots(planes, 2, squeeze=False)
-        for plane, (height, arrows) in enumerate(rows):
-            _draw_plane(target, plane, unit, height, arrows)
+        panels = figure.subplots(2 * planes, 1)
+        for plane in range(planes):
+            _draw_plane(target, plane, unit, *panels[2 * plane : 2 * plane + 2])
         figure.suptitle(f"The target as it was found, std {np.sqrt((target.std**2).mean()):.2g} {unit}")
 
-    return picture(draw, (2 * _WIDTH, planes * _HEIGHT), 0.12, kind)
+    return picture(draw, (_WIDTH, 2 * planes * _HEIGHT), 0.12, kind)
 
 
-def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axes) -> None:
-    """Draw one plane of a target: the offsets out of it in one panel, those in it in the other."""
+def in_plane(target: Target, plane: int) -> tuple[Array, Array]:
+    """Points (n, 2) of a plane of a target from their middle, and offsets (n, 3): across, down, out of it."""
     rows = target.plane == plane
     given, offsets = target.given[rows], target.offsets[rows]
     centred = given - given.mean(axis=0)
@@ -361,15 +377,20 @@ def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axe
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(normal, across), normal])
     axes *= np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
-    x, y, _ = axes @ centred.T
-    dx, dy, dz = axes @ offsets.T
+    return (centred @ axes.T)[:, :2], offsets @ axes.T
+
+
+def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axes) -> None:
+    """Draw one plane of a target: the offsets out of it in one panel, those in it in the other."""
+    places, offsets = in_plane(target, plane)
+    (x, y), (dx, dy, dz) = places.T, offsets.T
     most = float(np.abs(dz).max()) or 1.0
     drawn = height.tricontourf(x, y, dz, levels=np.linspace(-most, most, _HEIGHT_LEVELS), cmap="RdBu_r")
-    height.figure.colorbar(drawn, ax=height, label=f"height [{unit}]")
+    colour_bar(height, drawn, f"height [{unit}]", format="%.2g")
     height.plot(x, y, ".", color="0.3", markersize=2)
     name = ""
     if target.point is not None and planes_are_named(target.point):
-        name = f"{str(target.point[rows][0]).split('/')[0]}, "
+        name = f"{str(target.point[target.plane == plane][0]).split('/')[0]}, "
     style(height, f"{name}out of the plane: {np.ptp(dz):.2g} {unit} from end to end")
     longest = float(np.hypot(dx, dy).max()) or 1.0
     length = _LONGEST * float(np.ptp(x))

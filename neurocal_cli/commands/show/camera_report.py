@@ -32,6 +32,7 @@ from neurocal_cli.observations.target import Target, scale_of
 if TYPE_CHECKING:
     from neurocal_cli.calibration.evaluation import CameraEvaluation
 
+_LEAST_STRETCH = 1e-6  # that is told of a bent target; less is rounding
 _TIED = 1.009  # ratio of cross-validation errors that the choice of the model takes for equal
 _GIVEN = {
     1: "nothing given",
@@ -214,7 +215,8 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     lines = []
     if not target.only_bends:
         parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
-        parts.append(f"stretched by {100 * target.stretch():.2g} %")
+        if target.flat or target.stretch() > _LEAST_STRETCH:
+            parts.append(f"stretched by {100 * target.stretch():.2g} %")
         lines.append(
             f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
         )

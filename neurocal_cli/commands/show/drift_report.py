@@ -11,7 +11,7 @@ from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.drift import SHARE, Drift
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.figure import ACCENT, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, colour_bar, picture, style
 from neurocal_cli.commands.show.text import (
     UNITS,
     Table,
@@ -152,8 +152,8 @@ def draw_drift(drift: Drift, size: tuple[int, int], kind: str = "png") -> bytes:
 
     def draw(figure: Figure) -> None:
         length, ratio = drift.length, drift.length / np.maximum(drift.std, 1e-300)
-        first, second = figure.subplots(1, 2)
-        _map(figure, first, drift, length, "px")
+        first, second = figure.subplots(2, 1)
+        _map(first, drift, length, "px")
         longest = float(length.max(initial=1e-300))
         enlarged = _LONGEST * size[0] / longest
         u, v = np.unique(drift.pixels[:, 0]), np.unique(drift.pixels[:, 1])
@@ -163,27 +163,24 @@ def draw_drift(drift: Drift, size: tuple[int, int], kind: str = "png") -> bytes:
             *drift.pixels[some].T, *drift.difference[some].T,
             color="white", angles="xy", scale_units="xy", scale=1 / enlarged, width=0.005,
         )  # fmt: skip
-        style(first, f"New minus old pixel of the same ray,\narrows enlarged {enlarged:,.2g} times")
+        style(first, f"New minus old pixel of a ray, {enlarged:,.2g} times enlarged")
         first.grid(False)
-        _map(figure, second, drift, ratio, "standard deviations")
+        _map(second, drift, ratio, "standard deviations")
         second.tricontour(*drift.pixels.T, ratio, levels=[_STRONG], colors=ACCENT)
         second.plot(*drift.pixels[drift.worst], "o", color=ACCENT, fillstyle="none", markersize=10)
         word = "different" if drift.different else "the same"
-        style(
-            second,
-            f"In standard deviations of both: {word}\n(line: {_STRONG:g}; circle: largest)",
-        )
+        style(second, f"In std of both: {word} (line: {_STRONG:g}, circle: most)")
         second.grid(False)
         for axes in (first, second):
             axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5), aspect="equal")
             axes.set(xlabel="u [px]", ylabel="v [px]")
 
-    return picture(draw, (11.0, 4.6), 0.1, kind)
+    return picture(draw, (5.2, 7.6), 0.1, kind)
 
 
-def _map(figure: Figure, axes: Axes, drift: Drift, values: Array, unit: str) -> None:
+def _map(axes: Axes, drift: Drift, values: Array, unit: str) -> None:
     """Draw values over the image, with a colour bar."""
     levels = np.linspace(0.0, max(float(values.max()), 1e-12), _LEVELS)
     u, v = drift.pixels.T
     shown = axes.tricontourf(u, v, values, levels=levels, cmap="viridis")
-    figure.colorbar(shown, ax=axes, label=unit, shrink=0.8, format="%.2g")
+    colour_bar(axes, shown, unit, format="%.2g")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.errors import NeurocalError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 INK, ACCENT = "#1f4e79", "#c0392b"
@@ -54,10 +55,16 @@ def plain(text: str) -> str:
 
 def style(axes: Axes, title: str) -> None:
     """Set title, grid and frame of a panel."""
-    axes.set_title(title)
+    axes.set_title(title, loc="left")
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def colour_bar(axes: Axes, drawn: ScalarMappable, label: str, **how: Any) -> None:
+    """Add a scale as high as the panel, whose room is the panel's own: nothing else moves for it."""
+    scale = axes.inset_axes((1.03, 0.0, 0.04, 1.0))
+    axes.figure.colorbar(drawn, cax=scale, label=label, **how)
 
 
 def say(axes: Axes, text: str) -> None:

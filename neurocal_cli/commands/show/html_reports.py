@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
+from operator import itemgetter
 
 import numpy as np
 
@@ -15,17 +16,21 @@ from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 from neurocal_cli.calibration.zoom.judgement import judge_lens
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_report import parameter_rows
+from neurocal_cli.commands.show.camera_panels import in_plane
+from neurocal_cli.commands.show.camera_report import parameter_rows, target_lines
+from neurocal_cli.commands.show.html_drawings import (
+    board_shape,
+    enlargement,
+    error_bars,
+    heat_map,
+    residual_map,
+    scatter,
+)
 from neurocal_cli.commands.show.html_page import (
     Origin,
     definitions,
-    enlargement,
-    error_bars,
     figure,
-    heat_map,
     page,
-    residual_map,
-    scatter,
     section,
     table,
     verdict_block,
@@ -187,13 +192,56 @@ def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) ->
             _uncertainty(calibration),
             figure(
                 scatter(residuals),
-                "du and dv. Noise makes a round cloud about the middle; the circle is their rms.",
+                "Residuals of all points. Noise makes a round cloud, or a cross for mid-points, which are "
+                "measured across their edges alone.",
             ),
-            figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
+            figure(
+                error_bars(names, errors, calibration.rmse_px),
+                "Rms error of each view [px], in their order. The line is that of all points, "
+                f"{calibration.rmse_px:.3g} px.",
+            ),
         ]
-        parts.append(section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'))
+        parts += [
+            section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'),
+            _models(calibration),
+            _board(calibration),
+        ]
         parts += _view_parts(calibration, residuals, size, scale, photographs)
     return [*parts, _rejected(calibration), _warnings(calibration.warnings)]
+
+
+def _models(calibration: Calibration) -> str:
+    """Section on the lens models that were tried, best first."""
+    choice = sorted(calibration.lens_choice.items(), key=itemgetter(1))
+    rows = [["distortion model", "cross-validation error [px]", ""]]
+    rows += [
+        [name, f"{error:.4f}", "chosen" if name == calibration.distortion_model else ""]
+        for name, error in choice
+    ]
+    text = "The simplest of those that predict points that were left out best is chosen."
+    return section("Lens models tried", table(rows), f'<p class="soft">{text}</p>' if choice else "")
+
+
+def _board(calibration: Calibration) -> str:
+    """Section on the target as it was found, with a drawing of each of its planes."""
+    target, unit = calibration.target, printable(calibration.unit)
+    if target is None:
+        return ""
+    drawings = []
+    for plane in range(int(target.plane.max()) + 1):
+        across, offsets = in_plane(target, plane)
+        height = offsets[:, 2]
+        drawings.append(
+            figure(
+                board_shape(across, height),
+                f"Height of its points, {height.min():.2g} to {height.max():.2g} {unit}. The area of a "
+                "disc is the height, and its colour the side.",
+            )
+        )
+    words = "".join(f"<li>{escape(line)}</li>" for line in target_lines(target, unit))
+    return section(
+        "The board as it was found", f"<ul>{words}</ul>", f'<div class="figures">{"".join(drawings)}</div>'
+    )
 
 
 def _measurements(calibration: Calibration) -> str:
@@ -208,8 +256,8 @@ def _measurements(calibration: Calibration) -> str:
         return ""
     text = (
         "On a plane that faces the camera at this distance, which is taken as exact: the length is half of "
-        "what the image shows, and the points are relative to the camera. neurocal evaluate camera --at has "
-        "other distances."
+        "what the image shows, and the points are relative to the camera. For other distances: neurocal "
+        "evaluate camera --at."
     )
     rows = plane_table(calibration.errors_at(distance), calibration.unit)
     return section("What it means for measurements", table(rows), f'<p class="soft">{escape(text)}</p>')

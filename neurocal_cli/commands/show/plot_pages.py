@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAD = 0.12  # inches
-_PAGE = (16.0, 12.5)
-_PANEL = (6.4, 5.0)
+_PAGE = (15.0, 11.0)
+_PANEL = (5.0, 4.0)  # text of 9 points is still read where the picture is 400 px wide
+_SIDES = ("left", "right")
 _ROWS = (("residuals", "coverage", "uncertainty"), ("scatter", "poses", "learning"), ("views",) * 3)
 
 Draw = Callable[["Axes"], None]
@@ -49,7 +50,7 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
         for side, subject in sides.items()
         for name, draw in panels_of(subject).items()
     }
-    panels["poses"] = lambda axes: draw_poses(axes, rig.left, [(rig.right.camera, rig.pose)])
+    panels["poses"] = lambda axes: draw_poses(axes, rig.left, [(rig.right.camera, rig.pose)], _SIDES)
     if panel == "poses":
         return _alone(panel, panels[panel], kind)
     rows = [[f"{side} {name}" for name in _ROWS[0]] for side in sides]
@@ -87,7 +88,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 
     def titled(axes: Axes) -> None:
         draw(axes)
-        axes.set_title(f"{side}: {axes.get_title()}")
+        axes.set_title(f"{side}: {axes.get_title(loc='left')}", loc="left")
 
     return titled
 
@@ -100,12 +101,13 @@ def draw_points_in_space(
     unit = plain(evaluation.unit)
     errors = found.errors[np.isfinite(found.errors[:, 0])]
     others = [] if rig is None else [(rig.right.camera, rig.pose)]
+    names = () if rig is None else _SIDES
     panels: dict[str, Draw] = {
         "across": lambda axes: _draw_cloud(axes, errors[:, :2], "Y down", unit),
         "depth": lambda axes: _draw_cloud(axes, errors[:, [0, 2]], "Z depth", unit),
         "depths": lambda axes: _draw_depths(axes, found, unit),
         "views": lambda axes: _draw_space_views(axes, evaluation, unit),
-        "poses": lambda axes: draw_poses(axes, None if rig is None else rig.left, others),
+        "poses": lambda axes: draw_poses(axes, None if rig is None else rig.left, others, names),
     }
     if panel is not None:
         return _alone(panel, panels[panel], kind)

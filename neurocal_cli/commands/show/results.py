@@ -88,7 +88,7 @@ def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture
     """
     check_choice("kind", kind, _KINDS)
     if isinstance(result, Calibration) and panel == "next":
-        from neurocal_cli.commands.show.advice import draw_advice
+        from neurocal_cli.commands.show.advised_views import draw_advice
 
         return Picture(draw_advice(advise(result), result, kind))
     panels = CAMERA_PANELS if isinstance(result, (Calibration, StereoRig)) else ()

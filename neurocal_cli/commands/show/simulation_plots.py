@@ -42,13 +42,13 @@ def draw_simulation(study: NoiseStudy, starts: StartStudy | None, unit: str, kin
     """
 
     def draw(figure: Figure) -> None:
-        grid = figure.add_gridspec(2, 2 if starts is None else 3)
+        grid = figure.add_gridspec(2 if starts is None else 3, 2)
         for n, name in enumerate(FIG_1):
             _draw_errors(figure.add_subplot(grid[n // 2, n % 2]), study, name, _UNITS.get(name, unit), n == 0)
         if starts is not None:
-            _draw_starts(figure.add_subplot(grid[:, 2]), starts)
+            _draw_starts(figure.add_subplot(grid[2, :]), starts)
 
-    return picture(draw, (8.6 if starts is None else 13.0, 7.0), 0.1, kind)
+    return picture(draw, (6.6, 6.0 if starts is None else 9.0), 0.1, kind)
 
 
 def _draw_errors(axes: Axes, study: NoiseStudy, name: str, unit: str, legend: bool) -> None:
@@ -104,25 +104,25 @@ def _draw_starts(axes: Axes, starts: StartStudy) -> None:
         axes.text(2, row, f"{reached} of {of}", va="center", fontweight="bold")
     style(axes, f"Where single random starts end, noise {starts.sigma:g} px")
     axes.set(xlabel="starts [%]", xlim=(0, 100))
-    axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.1))
+    axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
 
 def draw_rates(study: RateStudy, kind: str = "png") -> bytes:
     """Draw, for each pair of rates, on how many data sets a start converges, and how fast."""
 
     def draw(figure: Figure) -> None:
-        left, right = figure.subplots(1, 2)
+        upper, lower = figure.subplots(2, 1)
         share = 100 * study.converged / study.sets
         labels = [[str(count) for count in row] for row in study.converged]
-        _draw_grid(left, study, share, labels, (0.0, 100.0), dark_is_low=True)
-        left.set_title(f"Data sets of {study.sets} on which one start converges")
+        _draw_grid(upper, study, share, labels, (0.0, 100.0), dark_is_low=True)
+        upper.set_title(f"Data sets of {study.sets} on which one start converges", loc="left")
         known = np.log10(np.where(study.epochs > 0, study.epochs, np.nan))
         texts = [["" if np.isnan(e) else f"{e:.0f}" for e in row] for row in study.epochs]
         limits = float(np.nanmin(known)), float(np.nanmax(known))
-        _draw_grid(right, study, known, texts, limits, dark_is_low=False)
-        right.set_title("Median epochs of these")
+        _draw_grid(lower, study, known, texts, limits, dark_is_low=False)
+        lower.set_title("Median epochs of these", loc="left")
 
-    return picture(draw, (12.0, 5.2), 0.12, kind)
+    return picture(draw, (5.6, 8.0), 0.12, kind)
 
 
 def _draw_grid(

@@ -32,7 +32,9 @@ _MOST_DECIMALS = 9  # further digits are rounding errors
 _FACTS: dict[str, Callable[[float], str]] = {
     "held_out_px": "cross-validation error {:.3g} px".format,
     "precision_px": "noise floor {:.3g} px".format,
-    "projection_px": lambda std: f"std of predicted pixels {two_digits(std)} px at most",
+    "projection_px": lambda std: (
+        f"std of predicted pixels {two_digits(std)} px at most at the views' distance"
+    ),
     "depth_share": lambda std: f"std of triangulated depth {100 * std:.2g} % of the depth",
     "coverage": lambda share: f"{100 * share:.0f} % of the image covered",
 }

@@ -12,7 +12,7 @@ from neurocal_cli.calibration.zoom.evaluation import LensEvaluation
 from neurocal_cli.calibration.zoom.initialisation import local_covariance
 from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, colour_bar, picture, style
 from neurocal_cli.commands.show.text import UNITS
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 _FINE = 121  # points of a curve
 _MOST_CURVES = 6  # values of the second control; more are not legible
-_COLUMNS = 3
-_PANEL = (4.4, 3.3)  # inches
+_COLUMNS = 2
+_PANEL = (3.4, 2.8)  # inches
 
 
 def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
@@ -41,7 +41,7 @@ def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
             _draw_parameter(panels[j], lens, j, name)
         title = f"{len(lens.settings)} settings, bands of two standard deviations"
         if not lens.known:
-            _draw_errors(figure, panels[-1], lens.controls, lens.settings, lens.rmse, "Error at the settings")
+            _draw_errors(panels[-1], lens.controls, lens.settings, lens.rmse, "Error at the settings")
             title += f", rms {lens.rmse_px:.4g} px"
         figure.suptitle(title)
 
@@ -54,14 +54,14 @@ def draw_evaluation(evaluation: LensEvaluation, controls: tuple[str, ...], kind:
     def draw(figure: Figure, panels: list[Axes]) -> None:
         settings = np.array([[s.values[name] for name in controls] for s in evaluation.settings])
         values = np.array([s.rmse_px for s in evaluation.settings])
-        _draw_errors(figure, panels[0], controls, settings, values, "Error of the networks")
+        _draw_errors(panels[0], controls, settings, values, "Error of the networks")
         _draw_baselines(panels[1], evaluation)
 
     return _picture(draw, 2, kind)
 
 
 def _picture(draw: Callable[[Figure, list[Axes]], None], count: int, kind: str) -> bytes:
-    """A figure of some panels, three in a row."""
+    """A figure of some panels, two in a row."""
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
 
@@ -110,9 +110,7 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
         axes.legend(frameon=False, fontsize=7)
 
 
-def _draw_errors(
-    figure: Figure, axes: Axes, controls: tuple[str, ...], settings: Array, values: Array, title: str
-) -> None:
+def _draw_errors(axes: Axes, controls: tuple[str, ...], settings: Array, values: Array, title: str) -> None:
     """Error over one control as bars, over two as coloured squares."""
     style(axes, f"{title}, rms [px]")
     if len(controls) == 1:
@@ -123,7 +121,7 @@ def _draw_errors(
     drawn = axes.scatter(x, y, c=values, s=90, marker="s", cmap="viridis", edgecolors="0.4", linewidths=0.4)
     axes.set(xlabel=controls[0], ylabel=controls[1])
     axes.margins(0.1)
-    figure.colorbar(drawn, ax=axes, shrink=0.9)
+    colour_bar(axes, drawn, "")
 
 
 def _draw_baselines(axes: Axes, evaluation: LensEvaluation) -> None:
