@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypedDict, get_args
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion, Model
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_seed
+from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice, check_kind, check_seed
 from neurocal_cli.network.options import Options, Progress, options_for
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import TARGETS, Target, TargetChoice
@@ -38,6 +38,28 @@ Trainer = Literal["lm", "backprop"]
 Lens = Model | Literal["auto", "plumb-line"]
 Outliers = Literal["reject", "keep"]
 Skew = Literal["free", "fixed", "auto"]
+
+
+class CameraOptions(TypedDict, total=False):
+    """The arguments of `calibrate` that rigs take for each of their cameras."""
+
+    type: int
+    image_center: tuple[float, float] | None
+    intrinsics: Camera | Calibration | Intrinsics | Array | None
+    extrinsics: Mapping[str, Pose] | Calibration | None
+    method: Method
+    trainer: Trainer
+    distortion: Lens
+    skew: bool | Skew
+    outliers: Outliers
+    seed: int
+    target: TargetChoice | Target
+    preferred: Model | Literal[""]
+    fix: Mapping[str, float] | None
+    square_pixels: bool
+    starts: int
+    backprop: BackpropOptions | None
+
 
 METHODS = get_args(Method)
 TRAINERS = get_args(Trainer)
@@ -140,6 +162,7 @@ def calibrate(
     InputError, DegenerateGeometryError
         The points do not determine the camera; the message says why.
     """
+    check_kind("points", points, Correspondences, "what read_points or Correspondences.from_detections made")
     if points.image is not None:
         from neurocal_cli.calibration.arranged_boards import arranged
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.camera import Camera, camera_of
+from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, StraightLines, coefficient_names
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -248,6 +249,14 @@ class Calibration(Presented):
         is not positive, and without image size.
         """
         found: PlaneErrors = late("calibration.plane_measurement", "errors_at")(self, distance)
+        return found
+
+    def position(self, view: str) -> CameraPosition:
+        """Where the camera was when it saw a view, in the coordinates of the view's target.
+
+        Its covariance includes that of the camera. Raises InputError if there is no such view.
+        """
+        found: CameraPosition = late("calibration.plane_measurement", "position")(self, view)
         return found
 
     def pose_of(self, view: str) -> Pose:

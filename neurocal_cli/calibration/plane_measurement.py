@@ -1,4 +1,4 @@
-"""Pixels to points on a plane, and what the uncertainty of a camera means for lengths on it.
+"""Pixels to points on a plane, where a camera was, and what its uncertainty means for lengths.
 
 A pixel moves by J dc with the camera's parameters c and by B dX with a point X of the plane. So a pixel that
 is measured with an error du shows the point X + B^-1 (du - J dc).
@@ -9,8 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
-from neurocal_cli.calibration.verdict.assessment import camera_and_covariance, pixel_covariance_of
+from neurocal_cli.calibration.verdict.assessment import (
+    camera_and_covariance,
+    pixel_covariance_of,
+    position_covariance_of,
+)
 from neurocal_cli.calibration.verdict.projection_uncertainty import image_grid
+from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.given_values import real_array
 from neurocal_cli.camera.plane_points import PlaneErrors, PlanePoints, Spread
@@ -60,6 +65,12 @@ def _check_flat(calibration: Calibration, view: str) -> None:
         and calibration.target is None
     ):
         raise InputError(f"no point of the view {view!r} has Z = 0, which is the plane that is measured on")
+
+
+def position(calibration: Calibration, view: str) -> CameraPosition:
+    """Where the camera was; see `Calibration.position`."""
+    pose = calibration.pose_of(view)
+    return CameraPosition(-pose.R.T @ pose.t, position_covariance_of(calibration, view))
 
 
 def errors_at(calibration: Calibration, distance: float) -> PlaneErrors:

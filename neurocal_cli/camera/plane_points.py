@@ -51,11 +51,16 @@ class Spread:
 
 @frozen_dataclass
 class PlaneErrors:
-    """What is measured how well on a plane that faces the camera at a distance, which is taken as exact."""
+    """What is measured how well on a plane that faces the camera.
+
+    Of one camera, the distance is taken as exact. Points of a rig are triangulated, and their errors are in
+    all three directions.
+    """
 
     distance: float  # from the camera, along its axis [world unit]
     sigma: float  # standard deviation of a pixel, in u and in v [px]
     length: float  # measured in the middle of the image, half as long as what the image shows [world unit]
     of_length: Spread
-    of_middle: Spread  # of a point in the middle of the image, across the axis, both coordinates together
+    of_middle: Spread  # of a point in the middle of the image, all coordinates together
     of_worst: Spread  # of the least certain point of the image
+    of_depth: Spread | None = None  # of a triangulated point in the middle, along the axis

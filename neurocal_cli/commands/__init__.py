@@ -16,7 +16,16 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.streams import TYPED, debugging, one_line, set_verbosity, tell
+from neurocal_cli.commands.streams import (
+    NEXT,
+    TYPED,
+    debugging,
+    one_line,
+    set_verbosity,
+    tell,
+    tell_ending,
+    waiting,
+)
 from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
@@ -78,11 +87,23 @@ class _LazyGroup(click.Group):
         return ctx
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command."""
-        from neurocal_cli.files.writing import all_or_none
-
-        with _one_line_errors(), all_or_none(finishing=(click.exceptions.Exit,)):
+        """Run the command, and say in the end what it wrote and what to do next."""
+        with _one_line_errors(), _ended(ctx):
             return super().invoke(ctx)
+
+
+@contextmanager
+def _ended(ctx: click.Context) -> Iterator[None]:
+    """Write all outputs or none, and tell the end of a command that has not failed."""
+    from neurocal_cli.files.writing import all_or_none
+
+    try:
+        with all_or_none(finishing=(click.exceptions.Exit,)) as outputs, waiting("reading"):
+            yield
+    except click.exceptions.Exit:
+        tell_ending(outputs.written, ctx.meta.get(NEXT, ()))
+        raise
+    tell_ending(outputs.written, ctx.meta.get(NEXT, ()))
 
 
 @contextmanager
@@ -122,13 +143,17 @@ def _explain(error: Exception) -> str:
 
 @click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.option(
-    "-q", "--quiet", count=True, show_default="no", help="Print only warnings and errors; twice: only errors."
+    "-q",
+    "--quiet",
+    count=True,
+    show_default=False,
+    help="Print only warnings and errors; twice: only errors.",
 )
 @click.option(
     "-v",
     "--verbose",
     is_flag=True,
-    show_default="no",
+    show_default=False,
     help="Also print progress with times, and all reasons of a verdict.",
 )
 @click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import ProgressBar, print_summary, print_text, tell_written
+from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.streams import ProgressBar, answer, suggest
 
 
 @click.command(cls=options.Command)
@@ -21,10 +21,10 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     17 tilts and 2 rotations. It chooses the view that lowers the uncertainty of the camera most, then the
     best next one, and so on. The number after each view is the remaining uncertainty.
 
-    The uncertainty is the largest standard deviation of a projected pixel in the image, for points at half to
-    ten times the distance of the views. A change of the camera that a motion of its frame compensates does
-    not count. Systematic errors, such as a wrong distortion model, are not included; see the verdict of
-    neurocal evaluate camera.
+    The uncertainty is the largest standard deviation of predicted pixels in the image, for points at half to
+    ten times the distance of the views; that of the verdict is for points at that distance. A change of the
+    camera that a motion of its frame compensates does not count. Systematic errors, such as a wrong
+    distortion model, are not included; see the verdict of neurocal evaluate camera.
 
     \b
     Examples:
@@ -33,8 +33,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    check_plot(plot)
-    preparation.check_outputs((plot,), (calibration,))
+    preparation.check((calibration,), plots=(plot,))
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines
     from neurocal_cli.files.calibration_tree import read_calibration
@@ -42,12 +41,10 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     known = read_calibration(calibration)
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
-    if as_json:
-        print_summary(advice_json(advice))
-    else:
-        print_text(lambda: "\n".join(advice_lines(advice)))
+    answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
     if plot is not None:
         from neurocal_cli.commands.show.advised_views import draw_advice
 
         write_plot(plot, draw_advice, advice, known)
-        tell_written(plot)
+    elif not as_json:
+        suggest(calibration, "neurocal advise {} --plot next.png")

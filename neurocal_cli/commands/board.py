@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import print_summary, say, warn
+from neurocal_cli.commands.streams import print_summary, say, suggest, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
 
@@ -54,10 +54,10 @@ def board(
 ) -> None:
     """Draw a target to print: chessboard, ChArUco, tags or circles.
 
-    Without a size, the board has 9 x 6 inner vertices and the largest squares, in whole mm, that fit on the
-    paper. One of these numbers is odd and one is even, so the board looks different after a turn of 180
-    degrees. A board of several planes that meet in a corner, from a board file, is unfolded; dashes show
-    where to fold it.
+    Without --cols and --rows, the board has 9 x 6 inner vertices. One of these numbers is odd and one is
+    even, so the board looks different after a turn of 180 degrees. Without --square it has the largest
+    squares, in whole mm, that fit on the paper. A board of several planes that meet in a corner, from a board
+    file, is unfolded; dashes show where to fold it.
 
     Squares have their exact size. Print at 100 %, without fitting to the page, and measure the two rulers:
     if 100 mm on them are not 100 mm, correct `square` in the board file.
@@ -68,6 +68,7 @@ def board(
     \b
     Examples:
       neurocal board -o target.pdf
+      neurocal board --cols 7 --rows 4 -o few.pdf
       neurocal board --cols 11 --rows 8 --square 28 --paper A3 -o large.svg
       neurocal board --cols 8 --rows 5 --square 1 --unit inch --paper letter \\
           --dpi 150 -o letter.png
@@ -88,12 +89,13 @@ def board(
     beside = [
         None if board.is_file and boards == 1 else f"{os.path.splitext(one)[0]}.yaml" for one in outputs
     ]
-    preparation.check_outputs((*outputs, *beside), (board.file,))
+    preparation.check((board.file,), (*outputs, *beside))
     from neurocal_cli.observations.marked_cells import numbered_apart, to_print
     from neurocal_cli.observations.printed_sheet import default_board, on_paper, paper_size
 
     size = paper_size(paper)
-    target = board.read() or default_board(size)
+    sized = (board.file, board.square, board.unit) != (None,) * 3
+    target = (board.read() if sized else None) or default_board(size, *board.counts)
     if boards > 1 and any(plane.markers is None for plane in target.planes):
         raise UsageError("--boards is for boards with markers, whose numbers tell them apart")
     several = (target,) if boards == 1 else numbered_apart(target, boards)
@@ -107,6 +109,8 @@ def board(
         if file is not None:
             write_board(one, file)
         _report(one, sheet, file, as_json)
+    if boards == 1:
+        suggest(beside[0], "neurocal detect IMAGE... --board {} -o points.csv")
 
 
 def _draw(path: str, sheet: Sheet, dpi: float) -> None:

@@ -6,9 +6,11 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
+from neurocal_cli.commands.pages import Plots, files_of, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS
-from neurocal_cli.commands.streams import ProgressBar, concluding, tell_written, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, suggest, warn
+
+_STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 
 
 @click.command(cls=options.Command)
@@ -76,12 +78,9 @@ def calibrate(
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     estimation.check()
-    preparation.check_summary(as_json, output, html)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
-    preparation.check_one_stdin(*inputs)
     options.check_camera_name(camera_name)
-    check_plots(plots, output)
-    preparation.check_outputs((output, html, *(file for _, file in plots)), inputs)
+    preparation.check(inputs, (output, html), plots=files_of(plots), as_json=as_json)
     given, arguments = estimation.prepare(preparation.given_points(*points))
 
     from neurocal_cli.calibration.calibrate import calibrate as learn
@@ -99,7 +98,10 @@ def calibrate(
 
             write_plots(plots, draw_camera, Subject.of(calibration))
         write_page(html, calibration, *inputs)
-        poor = calibration.verdict is not None and calibration.verdict.word != "good"
-        better = "`neurocal advise {}` names the views to take next" if poor else ""
-        uses = "`neurocal report {} -o report.html` shows it, `neurocal undistort {} IMAGE...` uses it"
-        tell_written(output, *(file for _, file in plots), html, then=better or uses)
+        verdict, distorted = calibration.verdict, not calibration.camera.distortion.is_identity
+        if html is None:
+            suggest(output, "neurocal report {} -o report.html")
+        if verdict is not None and verdict.word != "good" and not lean:
+            suggest(output, "neurocal advise {}")
+        else:
+            suggest(output, "neurocal " + (_STRAIGHTEN if distorted else "evaluate {} --at DISTANCE"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands import options, preparation
@@ -13,6 +13,7 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration.calibrate import CameraOptions, Outliers
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
@@ -45,7 +46,7 @@ class Estimation:
     skew: str
     square_pixels: bool
     fix: options.Named
-    outliers: str
+    outliers: Outliers
     target: str
 
     def check(self) -> None:
@@ -123,7 +124,14 @@ class Estimation:
             option, need = f"--{name.replace('_', '-')}", f"--{other} {wanted}"
             raise UsageError(f"{option} needs {need}, but the {other} is {value}; give {need}")
 
-    def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
+    def of_known(self, intrinsics: str) -> Estimation:
+        """The same for a camera that is known, of which only the poses are estimated."""
+        return replace(
+            self, type="3", intrinsics=intrinsics, image_center=None, no_skew=False, skew="free", fix=(),
+            square_pixels=False, distortion="none",
+        )  # fmt: skip
+
+    def prepare(self, points: Correspondences) -> tuple[Correspondences, CameraOptions]:
         """Read the given files; return the points and the library's keyword arguments."""
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
@@ -159,7 +167,7 @@ class Estimation:
 
             arguments["extrinsics"] = read_extrinsics(self.extrinsics, points.unit)
             _note_exact("each given pose")
-        return points, arguments
+        return points, cast("CameraOptions", arguments)
 
     def _known(self, points: Correspondences) -> tuple[Correspondences, Camera | Calibration]:
         """The known camera; --distortion names its model if the file does not."""

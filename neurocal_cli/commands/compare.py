@@ -7,7 +7,7 @@ from dataclasses import replace
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary, print_text
+from neurocal_cli.commands.streams import ProgressBar, answer, note
 
 
 @click.command(cls=options.Command)
@@ -81,7 +81,7 @@ def compare(
       neurocal compare sample_data/flat.csv --methods neuro,linear --outliers keep \\
           --image-size 640 480 --seed 1 --json
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(points, right)
+    preparation.check((points, right))
     preparation.compute_in_one_thread()
     given = [preparation.given_points(name) for name in (points, right) if name is not None]
     if image_size is not None:
@@ -93,7 +93,4 @@ def compare(
     with ProgressBar() as progress:
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
     note(*found.notes)
-    if as_json:
-        print_summary(comparison_json(found))
-    else:
-        print_text(lambda: comparison_report(found))
+    answer(as_json, lambda: comparison_json(found), lambda: comparison_report(found))

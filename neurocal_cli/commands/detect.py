@@ -22,12 +22,13 @@ from neurocal_cli.commands.requested_board import (
 from neurocal_cli.commands.streams import (
     ProgressBar,
     debugging,
+    first_of,
     note,
     note_once,
     one_line,
     print_summary,
     say,
-    tell_written,
+    suggest,
     warn,
     where_reasons_are,
 )
@@ -198,8 +199,9 @@ def detect(
         for name, outcome in outcomes.items():
             if outcome.overlay is not None:
                 write_whole(os.path.join(overlay, f"{name}.png"), outcome.overlay)
-    write_whole(output, text)
-    tell_written(output, save_board, overlay, then="`neurocal calibrate {} -o camera.yaml`")
+    if not preparation.is_for_the_eye(output, "points.csv"):
+        write_whole(output, text)
+    suggest(output, "neurocal calibrate {} -o camera.yaml")
 
 
 @dataclass
@@ -304,11 +306,12 @@ def _report(outcomes: Mapping[str, Outcome], board: Board, as_json: bool) -> Non
     }
     if as_json:
         print_summary(summary)
-    else:
-        say(
-            f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
-            f"{summary['n_rejected']} rejected"
-        )
+        return
+    unread = [outcome.path for outcome in outcomes.values() if outcome.unread]
+    say(
+        f"board detected in {len(found)} of {len(outcomes)} images: {summary['n_points']} points, "
+        f"{summary['n_rejected']} rejected" + (f"; {first_of(unread)} could not be read" if unread else "")
+    )
 
 
 def _mixed_orientations(outcomes: Iterable[Outcome]) -> list[str]:

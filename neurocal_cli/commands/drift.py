@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
+from neurocal_cli.commands.pages import plot_option, write_plot
 from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.errors import FormatError
 
@@ -47,9 +47,7 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
       neurocal drift old.yaml new.yaml --plot drift.png
       neurocal drift old.yaml new.yaml --json
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(old, new)
-    check_plot(plot)
-    preparation.check_outputs((plot,), (old, new))
+    preparation.check((old, new), plots=(plot,))
     from neurocal_cli.calibration.drift import find_drift
     from neurocal_cli.camera.camera import camera_of
     from neurocal_cli.commands.show.drift_report import (

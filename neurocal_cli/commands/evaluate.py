@@ -5,21 +5,24 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import Plots, check_plots, panel_option, write_plots
+from neurocal_cli.commands.pages import Plots, files_of, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import first_of, note, print_summary, tell_written, warn
-from neurocal_cli.errors import FormatError, UsageError
+from neurocal_cli.commands.streams import first_of, note, print_summary, suggest, warn
+from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.rig.evaluation import StereoEvaluation
+    from neurocal_cli.calibration.rig.rig import Rig
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.calibration.rig.triangulation import Method
+    from neurocal_cli.camera.plane_points import PlaneErrors
     from neurocal_cli.observations.points import Correspondences
 
 
@@ -33,7 +36,12 @@ class _Group(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in self.commands and os.path.isfile(args[0]):
-            args = [_kind_of(args[0]), *args]
+            kind = _kind_of(args[0])
+            if kind == "lens":
+                from neurocal_cli.commands.lens import evaluate as lens
+
+                return kind, lens, args
+            args = [kind, *args]
         elif args and args[0] not in self.commands and {".", os.sep} & set(args[0]):
             raise FormatError("there is no such file; check the path", args[0])
         return super().resolve_command(ctx, args)
@@ -45,10 +53,7 @@ def _kind_of(file: str) -> str:
 
     root = read_tree(file)
     if "neurocal_lens" in root:
-        raise UsageError(
-            f"{file} is a zoom lens; judge it by neurocal lens evaluate {file} POINTS.csv, on points that it "
-            "was not fitted to"
-        )
+        return "lens"
     if "rig" in root and "stereo" not in root:
         return "rig"
     return "stereo" if "stereo" in root else "camera"
@@ -58,7 +63,8 @@ def _kind_of(file: str) -> str:
 def evaluate() -> None:
     """Measure the error of a calibrated camera or rig.
 
-    Instead of the kind, a file may be given: `neurocal evaluate FILE` judges whatever the file is.
+    Instead of the kind, a file may be given: `neurocal evaluate FILE` judges whatever the file is, also a
+    zoom lens (see `neurocal lens evaluate`).
 
     \b
     Examples:
@@ -82,12 +88,30 @@ def _distance(ctx: click.Context, param: click.Parameter, text: str | None) -> D
     return float(found[1]), found[2]
 
 
-def _in_unit(distance: Distance, unit: str) -> float:
-    """A distance in a unit."""
+def _errors_at(distance: Distance | None, result: Calibration | StereoRig | Rig | None) -> PlaneErrors | None:
+    """The errors at a distance in any unit; None if there is no distance."""
+    if distance is None or result is None:
+        return None
     from neurocal_cli.observations.printed_sheet import millimetres
 
     value, own = distance
-    return value if own in ("", unit) else value * millimetres(own) / millimetres(unit)
+    try:
+        factor = 1.0 if own in ("", result.unit) else millimetres(own) / millimetres(result.unit)
+    except InputError as error:
+        raise UsageError(f"--at {value:g}{own}: {error}") from error
+    return result.errors_at(value * factor)
+
+
+def _at_option(what: str) -> Callable[[options.F], options.F]:
+    """Add ``--at``, a distance."""
+    return click.option(
+        "--at",
+        metavar="DISTANCE",
+        callback=_distance,
+        show_default="none",
+        help=f"Also say how well {what} at this distance, such as 1000mm or 1m; without a unit, in that of "
+        "the calibration.",
+    )
 
 
 @evaluate.command(cls=options.Command)
@@ -102,17 +126,13 @@ def _in_unit(distance: Distance, unit: str) -> float:
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
-@click.option(
-    "--at",
-    metavar="DISTANCE",
-    callback=_distance,
-    show_default="none",
-    help="Also say how well lengths and points are measured on a plane at this distance, such as 1000mm or "
-    "1m; without a unit, in that of the calibration.",
-)
+@_at_option("lengths and points are measured on a plane")
+@options.flag("--positions", "Also say where the camera was in each view, in the coordinates of the target.")
 @panel_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @options.json
-def camera(calibration: str, points: str | None, at: Distance | None, plots: Plots, as_json: bool) -> None:
+def camera(
+    calibration: str, points: str | None, at: Distance | None, positions: bool, plots: Plots, as_json: bool
+) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
     The residuals of a point are du and dv, its projected pixel minus its observed pixel. The rms error
@@ -127,7 +147,8 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     With --at, a table says what the uncertainty means for measurements on a plane that faces the camera at
     this distance, which is taken as exact: the std of a length half as long as what the image shows, of a
     point in the middle of the image relative to the camera, and of the least certain point; each with the
-    shares of the calibration and of the noise of the pixels.
+    shares of the calibration and of the noise of the pixels. With --positions, a table has the camera's
+    centre in each view of the calibration, with standard deviations that include those of the camera.
 
     A calibration also gets a verdict. It uses the points of the calibration: the cross-validation error,
     the noise floor, the agreement of two halves of the data, the coverage of the image and the uncertainty
@@ -141,14 +162,12 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       neurocal evaluate camera camera.yaml sample_data/stereo_left.csv --json
-      neurocal evaluate camera camera.yaml --at 1000mm
+      neurocal evaluate camera camera.yaml --at 1000mm --positions
       neurocal evaluate camera camera.yaml --plot errors.png \\
           --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(calibration, points)
-    check_plots(plots)
-    preparation.check_outputs((file for _, file in plots), (calibration, points))
+    preparation.check((calibration, points), plots=files_of(plots))
     given = None if points is None else preparation.given_points(points)
     from neurocal_cli.calibration.calibration import Calibration
     from neurocal_cli.calibration.drift import drift_since
@@ -157,19 +176,24 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     from neurocal_cli.calibration.verdict.given_points import judged_by_points
     from neurocal_cli.commands.show.camera_report import evaluation_json, evaluation_tables
     from neurocal_cli.commands.show.drift_report import drift_json, since_line
-    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
+    from neurocal_cli.commands.show.plane_report import (
+        plane_json,
+        plane_table,
+        position_table,
+        positions_json,
+    )
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
-    if at is not None and not isinstance(judged, Calibration):
+    own = judged if isinstance(judged, Calibration) else None
+    if own is None and (at is not None or positions):
         raise UsageError(
-            "--at needs a calibration of neurocal, because others do not say how certain they are"
+            f"{'--positions' if at is None else '--at'} needs a calibration of neurocal, because others do "
+            "not say how certain they are"
         )
-    on_plane, unit = None, ""
-    if at is not None and isinstance(judged, Calibration):
-        unit = judged.unit
-        on_plane = judged.errors_at(_in_unit(at, unit))
+    on_plane = _errors_at(at, own)
+    places = {name: own.position(name) for name in own.views} if own is not None and positions else {}
     evaluation = evaluate_camera(judged, seen)
     verdict, drift = None, None
     anew = isinstance(judged, Calibration) and given is not None and evaluation.fit is not None
@@ -192,17 +216,21 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     if as_json:
         since = {} if drift is None else {"drift": drift_json(drift)}
         work = {} if on_plane is None else {"at": plane_json(on_plane)}
-        print_summary(evaluation_json(evaluation, verdict) | since | work)
+        where = {"positions": positions_json(places)} if positions else {}
+        print_summary(evaluation_json(evaluation, verdict) | since | work | where)
     else:
         tables = [*evaluation_tables(evaluation)]
-        tables += [] if on_plane is None else [plane_table(on_plane, unit)]
+        tables += [] if on_plane is None or own is None else [plane_table(on_plane, own.unit)]
+        tables += [position_table(places, own.unit)] if places and own is not None else []
         show(tables, [*([since_line(drift)] if anew else []), *verdict_lines(verdict)])
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
 
         write_plots(plots, draw_camera, Subject.of(judged, given, evaluation))
-        tell_written(None, *(file for _, file in plots))
+    if verdict is not None and not as_json:
+        better = "report {} -o report.html" if verdict.word == "good" else "advise {}"
+        suggest(calibration, f"neurocal {better}")
 
 
 @evaluate.command(cls=options.Command)
@@ -227,10 +255,16 @@ def camera(calibration: str, points: str | None, at: Distance | None, plots: Plo
     "takes the middle between the two rays.",
     default="optimal",
 )
+@_at_option("points and lengths are triangulated")
 @panel_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @options.json
 def stereo(
-    cameras: tuple[str, ...], points: tuple[str, str] | None, method: Method, plots: Plots, as_json: bool
+    cameras: tuple[str, ...],
+    points: tuple[str, str] | None,
+    method: Method,
+    at: Distance | None,
+    plots: Plots,
+    as_json: bool,
 ) -> None:
     """Measure the triangulation error of two calibrated cameras.
 
@@ -251,6 +285,9 @@ def stereo(
     With --points the poses of images that are not in the calibrations are fitted, also of one that only has
     the name of a calibrated view.
 
+    With --at, a table says how well points and lengths are triangulated at this distance from the left
+    camera, with the shares of the calibration and of the noise of the pixels.
+
     The rig also gets a verdict, as in neurocal stereo. It uses the points of the calibrations, and the error
     on the points after --points.
 
@@ -260,6 +297,7 @@ def stereo(
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
       neurocal evaluate stereo rig.yaml --plot space.png --plot depth=depth.svg
+      neurocal evaluate stereo rig.yaml --at 1m
       neurocal calibrate sample_data/stereo_left.csv -o left.yaml
       neurocal calibrate sample_data/stereo_right.csv -o right.yaml
       neurocal evaluate stereo left.yaml right.yaml --method linear --json
@@ -271,11 +309,13 @@ def stereo(
             f"there are {len(cameras)} files; give two calibrations, or one rig, and points after --points"
         )
     inputs = *cameras, *(points or ())
-    preparation.check_one_stdin(*inputs)
-    check_plots(plots)
-    preparation.check_outputs((file for _, file in plots), inputs)
+    preparation.check(inputs, plots=files_of(plots))
     given = points and (preparation.given_points(points[0]), preparation.given_points(points[1]))
     evaluation, rig = _evaluate_stereo(cameras, given, method)
+    if at is not None and rig is None:
+        raise UsageError("--at needs a rig; give one that neurocal stereo wrote")
+    space = _errors_at(at, rig)
+    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
     from neurocal_cli.commands.show.stereo_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
@@ -292,14 +332,17 @@ def stereo(
         )
     warn(*evaluation.warnings)
     if as_json:
-        print_summary(stereo_evaluation_json(evaluation))
+        work = {} if space is None else {"at": plane_json(space)}
+        print_summary(stereo_evaluation_json(evaluation) | work)
     else:
-        show(stereo_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
+        more = () if space is None else (plane_table(space, evaluation.unit),)
+        show((*stereo_evaluation_tables(evaluation), *more), verdict_lines(evaluation.verdict))
     if plots:
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
         write_plots(plots, draw_points_in_space, evaluation, rig)
-        tell_written(None, *(file for _, file in plots))
+    if rig is not None and not as_json:
+        suggest(cameras[0], "neurocal report {} -o report.html")
 
 
 @evaluate.command(cls=options.Command)
@@ -312,8 +355,9 @@ def stereo(
     nargs=-1,
     required=False,
 )
+@_at_option("points and lengths are triangulated")
 @options.json
-def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
+def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) -> None:
     """Measure the errors of a rig of any number of cameras.
 
     Every point that two cameras or more saw is triangulated from all of them and compared with its place on
@@ -322,22 +366,25 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
     cameras predict.
 
     Without POINTS.csv the points of the rig itself are used, and the errors are too optimistic. With
-    POINTS.csv the poses of the frames are fitted first, with the cameras fixed.
+    POINTS.csv the poses of the frames are fitted first, with the cameras fixed. With --at, a table says how
+    well points and lengths are triangulated at this distance from the first camera, by all cameras that see
+    them.
 
     \b
     Examples:
       neurocal sample sample_data
       neurocal rig sample_data/rig_cam0.csv sample_data/rig_cam1.csv \\
           sample_data/rig_cam2.csv -o rig.yaml
-      neurocal evaluate rig rig.yaml
+      neurocal evaluate rig rig.yaml --at 1m
       neurocal evaluate rig rig.yaml sample_data/rig_cam0.csv \\
           sample_data/rig_cam1.csv --json
     """  # noqa: D301 - as in the group
     from neurocal_cli.commands.rig import named_file
 
     named = [named_file(word) for word in points]
-    preparation.check_one_stdin(file, *(name for _, name in named))
+    preparation.check((file, *(name for _, name in named)))
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
+    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
     from neurocal_cli.commands.show.rig_report import rig_evaluation_json, rig_evaluation_tables
     from neurocal_cli.commands.show.terminal import show
     from neurocal_cli.commands.show.text import verdict_lines
@@ -347,13 +394,16 @@ def rig(file: str, points: tuple[str, ...], as_json: bool) -> None:
     found, notes = read_rig(file), list[str]()
     given = read_rig_points(named, notes) if named else None
     note(*notes)
-    evaluation = evaluate_rig(found, given)
+    evaluation, space = evaluate_rig(found, given), _errors_at(at, found)
     if evaluation.n_behind:
         warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
     if as_json:
-        print_summary(rig_evaluation_json(evaluation))
-    else:
-        show(rig_evaluation_tables(evaluation), verdict_lines(evaluation.verdict))
+        work = {} if space is None else {"at": plane_json(space)}
+        print_summary(rig_evaluation_json(evaluation) | work)
+        return
+    more = () if space is None else (plane_table(space, evaluation.unit),)
+    show((*rig_evaluation_tables(evaluation), *more), verdict_lines(evaluation.verdict))
+    suggest(file, "neurocal report {} -o report.html")
 
 
 def _evaluate_stereo(

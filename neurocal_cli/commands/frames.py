@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from neurocal_cli.commands.streams import ProgressBar, complain, note, one_line, say
-from neurocal_cli.errors import FormatError, NeurocalError, plural
+from neurocal_cli.errors import FormatError, InputError, NeurocalError, plural
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,17 +69,21 @@ def detections(outcomes: Mapping[str, Outcome]) -> dict[str, Detection]:
 
 
 def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
-    """Leave out boards in images whose size differs from the most common one; none if two sizes tie."""
+    """Leave out boards in images whose size differs from the most common one; an InputError if two tie."""
     found = detections(outcomes)
     sizes = Counter(detection.image_size for detection in found.values()).most_common(2)
-    if len(sizes) < 2 or sizes[0][1] == sizes[1][1]:
+    if len(sizes) < 2:
         return outcomes
-    most = sizes[0][0]
+    most, tied = sizes[0][0], sizes[0][1] == sizes[1][1]
     kept = dict(outcomes)
     for name, detection in found.items():
         if detection.image_size != most:
-            both = "{} x {} px and most have {} x {}".format(*detection.image_size, *most)
+            both = "{} x {} px and {} have {} x {}".format(
+                *detection.image_size, "as many" if tied else "most", *most
+            )
             problem = f"{name}: the image has {both}{_why_another_size(detection.image_size, most)}"
+            if tied:
+                raise InputError(problem)
             kept[name] = replace(outcomes[name], detection=None, overlay=None, problem=problem)
     return kept
 
@@ -87,7 +91,8 @@ def of_one_size(outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
 def _why_another_size(size: tuple[int, int], most: tuple[int, int]) -> str:
     """What probably happened to an image of another size than most, and what to do."""
     if size == most[::-1]:
-        return ": it was held or turned upright; turn it back, as each way has its own image centre"
+        turned = "upright" if size[1] > size[0] else "on its side"
+        return f": it was held or turned {turned}; turn it back, as each way has its own image centre"
     if max(abs(a - b) for a, b in zip(size, most, strict=True)) <= _TRIMMED:
         return ": it was probably cut or scaled by a program; give the file of the camera"
     if abs(size[0] * most[1] - size[1] * most[0]) <= _TRIMMED * max(most):

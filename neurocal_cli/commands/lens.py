@@ -5,17 +5,18 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
+from neurocal_cli.commands.pages import plot_option, write_plot
 from neurocal_cli.commands.streams import (
     ProgressBar,
+    answer,
     concluding,
     note,
     print_summary,
-    print_text,
     say,
-    tell_written,
+    suggest,
     warn,
 )
+from neurocal_cli.errors import UsageError
 
 _MOST_UNITS = 20  # of a layer
 # Options that change nothing on known cameras.
@@ -142,10 +143,7 @@ def fit(
           --target given --json -o lens.yaml
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    preparation.check_one_stdin(*points)
-    preparation.check_summary(as_json, output)
-    check_plot(plot, output)
-    preparation.check_outputs((output, plot), points)
+    preparation.check(points, (output,), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
     from neurocal_cli.files.lens_points import read_lens_data
@@ -180,8 +178,7 @@ def fit(
 
             write_plot(plot, draw_lens, learnt)
         settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
-        then = f"`neurocal lens camera {{}} {settings} -o camera.yaml` gives the camera at one setting"
-        tell_written(output, plot, then=then)
+        suggest(output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
 
 
 @lens.command(cls=options.Command)
@@ -218,8 +215,7 @@ def camera(
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     options.check_camera_name(camera_name)
-    preparation.check_summary(as_json, output)
-    preparation.check_outputs((output,), (lens_file,))
+    preparation.check((lens_file,), (output,), as_json=as_json)
     from neurocal_cli.calibration.zoom.zoom_lens import camera_at
     from neurocal_cli.files.lens_yaml import read_lens
     from neurocal_cli.files.result_files import write_calibration
@@ -238,18 +234,21 @@ def camera(
 
         say(camera_report(calibration))
     warn(*calibration.warnings)
+    suggest(output, "neurocal undistort {} IMAGE... -o DIR")
 
 
 @lens.command(cls=options.Command)
 @_LENS
 @options.argument(
     "points",
-    "POINTS.csv",
-    "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
+    "[POINTS.csv]",
+    "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input. Without "
+    "it, the lens is judged by its own calibration.",
+    required=False,
 )
 @plot_option("the error over the settings, and the errors of the baseline models")
 @options.json
-def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
+def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
 
     The error is compared with that of baseline models. These are fitted to the data that the lens was
@@ -270,9 +269,12 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --json
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    preparation.check_one_stdin(lens_file, points)
-    check_plot(plot)
-    preparation.check_outputs((plot,), (lens_file, points))
+    preparation.check((lens_file, points), plots=(plot,))
+    if points is None:
+        if plot is not None:
+            raise UsageError("--plot shows the errors at points; give POINTS.csv")
+        _judge(lens_file, as_json)
+        return
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.judgement import judge_lens
     from neurocal_cli.commands.show.zoom_report import evaluation_json, evaluation_report
@@ -285,13 +287,24 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     note(*notes)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
-    if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
-    else:
-        print_text(lambda: evaluation_report(evaluation, learnt.controls, verdict))
+    answer(
+        as_json,
+        lambda: evaluation_json(evaluation, verdict),
+        lambda: evaluation_report(evaluation, learnt.controls, verdict),
+    )
     warn(*evaluation.warnings)
     if plot is not None:
         from neurocal_cli.commands.show.zoom_plots import draw_evaluation
 
         write_plot(plot, draw_evaluation, evaluation, learnt.controls)
-        tell_written(plot)
+
+
+def _judge(lens_file: str, as_json: bool) -> None:
+    """Show a lens with its verdict, as `fit` does."""
+    from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
+    from neurocal_cli.files.lens_yaml import read_lens
+
+    learnt = read_lens(lens_file)
+    answer(as_json, lambda: lens_json(learnt), lambda: lens_report(learnt))
+    warn(*learnt.warnings)
+    suggest(lens_file, "neurocal lens evaluate {} POINTS.csv", "neurocal report {} -o report.html")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurocal_cli.calibration.verdict.findings import two_digits
-from neurocal_cli.commands.streams import note, print_summary, say, tell_written, warn
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, plural
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.plane_csv import Batch, format_plane_points, read_pixels
@@ -67,4 +67,3 @@ def points_on_plane(
         shares += [f"{two_digits(of_camera)} by the calibration"] if np.isfinite(of_camera) else []
         told.append(f"std {' and '.join(shares)}")
     say(", ".join(told))
-    tell_written(output)

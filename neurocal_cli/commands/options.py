@@ -18,12 +18,11 @@ from click.types import FloatParamType
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.commands.streams import note
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import UsageError, plural
+from neurocal_cli.files.reading import detect_line
 
 if TYPE_CHECKING:
     from neurocal_cli.observations.board import Board
-
-NO_SIZE = "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
 
 F = TypeVar("F", bound=Callable[..., Any])
 Named = tuple[tuple[str, str], ...]  # values of an option NAME=VALUE that can be repeated
@@ -50,6 +49,7 @@ MODELS = f"{_USUAL} thin_prism tilted fisheye omnidir double_sphere eucm"
 COMMON_MODELS = f"auto {_USUAL} fisheye"
 """Those from which "auto" chooses by cross-validation."""
 
+_OF_THE_GROUP = ("-q", "--quiet", "-v", "--verbose")
 _FEW = 10  # options that need no headings
 _REST = "Options"
 # Headings of options in the help of commands that have many, and the parameters below each.
@@ -79,26 +79,40 @@ class Command(click.Command):
     """A command whose help lists its arguments before its options."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse, and explain where --quiet and --verbose belong, and what to do with images."""
+        """Parse, and explain what new users mistake."""
         words = list(args)  # parsing empties args
         try:
             return super().parse_args(ctx, args)
-        except click.NoSuchOption as error:
-            if error.option_name not in ("-q", "--quiet", "-v", "--verbose"):
-                raise
-            line = " ".join(["neurocal", error.option_name, *ctx.command_path.split()[1:]])
-            told = f"{error.option_name} stands before the command: {line}"
-            raise click.NoSuchOption(error.option_name, told, ctx=ctx) from None
         except click.UsageError as error:
-            images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
-            if not images:
+            told = self._explained(error, words, ctx)
+            if told is None:
                 raise
-            some = f"{', '.join(images[:2])}{', ...' if len(images) > 2 else ''}"
-            raise click.UsageError(
-                f"{some}: these are images; find the points in those of each camera first: neurocal detect "
-                "IMAGE... -o POINTS.csv",
-                ctx,
-            ) from None
+            raise click.UsageError(told, ctx) from None
+
+    def _explained(self, error: click.UsageError, words: Sequence[str], ctx: click.Context) -> str | None:
+        """Where -q and -v belong, what an option needs, what to do with images; None: as click says it."""
+        if isinstance(error, click.NoSuchOption) and error.option_name in _OF_THE_GROUP:
+            line = " ".join(["neurocal", error.option_name, *ctx.command_path.split()[1:]])
+            return f"{error.option_name} stands before the command: {line}"
+        if isinstance(error, click.BadOptionUsage):  # such as 640x480 for the two numbers of a size
+            option = next((one for one in self.params if error.option_name in one.opts), None)
+            if option is None or not option.metavar or "requires" not in error.message:
+                return None
+            needed = plural(option.nargs, "word")
+            return f"{error.option_name} needs {needed}: {error.option_name} {option.metavar}."
+        if isinstance(error, click.MissingParameter):
+            kind = None if error.param is None else error.param.type
+            if error.param is None or not isinstance(kind, click.Choice):
+                return None
+            return f"{error.param.opts[0]} is missing; choose from {', '.join(map(str, kind.choices))}."
+        images = _images(words) if type(error) is click.UsageError and self._reads_points() else []
+        if not images:
+            return None
+        some = f"{', '.join(images[:2])}{', ...' if len(images) > 2 else ''}"
+        return (
+            f"{some}: these are images; find the points in those of each camera first: "
+            f"{detect_line(images[0])}"
+        )
 
     def _reads_points(self) -> bool:
         return any(".csv" in metavar for metavar, _ in arguments(self))
@@ -156,12 +170,21 @@ class FiniteNumber(FloatParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Read a number, or fail as click does."""
-        number = float(super().convert(value, param, ctx))
+        try:
+            number = float(super().convert(value, param, ctx))
+        except click.BadParameter:
+            self.fail(f"{value!r} is not a number; give it alone, without a unit.", param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         if self._positive and number <= 0:
             self.fail(f"{value!r} is not greater than 0.", param, ctx)
         return number
+
+
+class _WholeNumber(click.IntRange):
+    """A whole number in a range."""
+
+    name = "whole number"
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -190,7 +213,7 @@ def count(
     **more: Any,
 ) -> Callable[[F], F]:
     """An option that is a whole number, or as many as its metavar has words."""
-    return _option(name, help, without, metavar=metavar, type=click.IntRange(least, most), **more)
+    return _option(name, help, without, metavar=metavar, type=_WholeNumber(least, most), **more)
 
 
 def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:
@@ -305,19 +328,31 @@ class BoardOptions:
         if (cols, rows, square, unit) == (None,) * 4:
             return None
         if cols is None or rows is None or square is None:
-            raise UsageError(NO_SIZE)
+            given = {"--cols": cols, "--rows": rows, "--square": square}
+            missing = " and ".join(name for name, value in given.items() if value is None)
+            raise UsageError(f"{missing} missing; give --cols, --rows and --square, or --board BOARD.yaml")
         return Board.single(cols, rows, square, "mm" if unit is None else unit)
 
     def read_or_unknown(self) -> Board | None:
         """The board, for a command that finds its size itself: None without a size; the square may lack."""
-        if self.file is not None or (self.cols is None) != (self.rows is None):
+        if self.file is not None:
             return self.read()
-        square, unit = self.side
-        if self.cols is None or self.rows is None:
+        counts, (square, unit) = self.counts, self.side
+        if not counts:
             return None
         from neurocal_cli.observations.board import Board
 
-        return Board.single(self.cols, self.rows, square, unit)
+        return Board.single(*counts, square, unit)
+
+    @property
+    def counts(self) -> tuple[int, int] | tuple[()]:
+        """Columns and rows; none if neither is given."""
+        if self.cols is not None and self.rows is not None:
+            return self.cols, self.rows
+        if self.cols is None and self.rows is None:
+            return ()
+        missing = "--rows" if self.rows is None else "--cols"
+        raise UsageError(f"{missing} is missing; give both --cols and --rows, or neither")
 
     @property
     def side(self) -> tuple[float, str]:

@@ -59,7 +59,7 @@ def panel_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
     )
 
 
-def check_plot(plot: str | None, output: str = "-") -> None:
+def check_plot(plot: str | None) -> None:
     """Refuse a picture that cannot be drawn, before any work is done."""
     if plot is None:
         return
@@ -67,15 +67,12 @@ def check_plot(plot: str | None, output: str = "-") -> None:
         raise UsageError(
             f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
         )
-    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give two different files")
     check_available()
 
 
-def check_plots(plots: Plots, output: str = "-") -> None:
-    """Refuse pictures that cannot be drawn; see `check_plot`."""
-    for _, file in plots:
-        check_plot(file, output)
+def files_of(plots: Plots) -> list[str]:
+    """The files of pictures."""
+    return [file for _, file in plots]
 
 
 def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from neurocal_cli.commands import options
+from neurocal_cli.commands.pages import check_plot
 from neurocal_cli.commands.screen import is_terminal
 from neurocal_cli.commands.streams import note, say, warn
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
@@ -21,6 +22,22 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.observations.points import Correspondences
+
+
+def check(
+    inputs: Iterable[str | None],
+    outputs: Iterable[str | None] = (),
+    *,
+    plots: Iterable[str | None] = (),
+    as_json: bool = False,
+) -> None:
+    """Refuse what cannot be read, drawn or written, before any work is done."""
+    inputs, outputs, plots = tuple(inputs), tuple(outputs), tuple(plots)
+    check_one_stdin(*inputs)
+    check_summary(as_json, *outputs)
+    for plot in plots:
+        check_plot(plot)
+    check_outputs((*outputs, *plots), inputs)
 
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, tell_written
+from neurocal_cli.commands.streams import note, suggest
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.image_files import photographs_of
 from neurocal_cli.files.reading import decode, read_bytes
@@ -60,7 +60,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     """  # noqa: D301 - as in the group
     if len(images) > 2:
         raise UsageError("--images is for one folder, or for the left and the right one of a rig")
-    preparation.check_outputs((output,), (result,))
+    preparation.check((result,), (output,))
     import hashlib
 
     from neurocal_cli.files.file_storage import parse_tree
@@ -71,7 +71,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
     if preparation.is_for_the_eye(output, "report.html", "the page"):
         return
     write_whole(output, text)
-    tell_written(output, then="open {} in a browser")
+    suggest(output, "open {} in a browser")
 
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:

@@ -151,15 +151,14 @@ def _shown(outcome: Outcome) -> Size | None:
 
 
 def complain_of(outcomes: Collection[Outcome], board: Board) -> None:
-    """Report why images were left out, a line each, and once the remedy of the commonest reason."""
+    """Report why images were left out, a line each, and once a remedy that several have in common."""
     problems = [outcome.problem for outcome in outcomes if outcome.problem]
-    if len(problems) < 2:
-        for problem in problems if len(outcomes) > 1 else ():
-            complain(problem)
-        return
     parts = [problem.partition("; ") for problem in problems]
-    for reason, _, _ in parts:
-        complain(reason)
-    (remedy, count), *_ = Counter(remedy for _, _, remedy in parts).most_common(1)
-    if remedy and another_size([_shown(outcome) for outcome in outcomes], board) is None:
+    remedies = Counter(remedy for _, _, remedy in parts)
+    for problem, (reason, _, remedy) in zip(problems, parts, strict=True) if len(outcomes) > 1 else ():
+        complain(problem if remedies[remedy] == 1 else reason)
+    if another_size([_shown(outcome) for outcome in outcomes], board) is not None:
+        return
+    remedy, count = max(remedies.items(), key=lambda item: item[1], default=("", 0))
+    if remedy and count > 1:
         complain(f"{count} of these {len(problems)} images: {remedy}")

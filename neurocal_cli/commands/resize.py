@@ -58,8 +58,7 @@ def resize(
       neurocal resize camera.yaml --crop 80 0 480 480 \\
           | neurocal resize - --to 240 240 -o square.yaml
     """  # noqa: D301 - as in the group
-    preparation.check_summary(as_json, output)
-    preparation.check_outputs((output,), (file,))
+    preparation.check((file,), (output,), as_json=as_json)
     from neurocal_cli.calibration.resized import resized
     from neurocal_cli.camera.resizing import resizing
     from neurocal_cli.files.exchange.neurocal import result_of

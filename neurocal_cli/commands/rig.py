@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import check_plot, html_option, plot_option, write_page, write_plot
-from neurocal_cli.commands.streams import ProgressBar, concluding, note, tell_written, warn
+from neurocal_cli.commands.pages import html_option, plot_option, write_page, write_plot
+from neurocal_cli.commands.streams import ProgressBar, concluding, note, suggest, warn
 from neurocal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration.calibrate import CameraOptions
 
 
 class _Command(options.Command):
@@ -118,17 +121,15 @@ def rig(
           --rate-gamma 0.4 -o rig.yaml
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
-    preparation.check_summary(as_json, output, html)
     if estimation.type in ("3", "4"):
         raise UsageError(
             f"--type {estimation.type} is for one camera; give known cameras by --intrinsics NAME=CAMERA.yaml"
         )
     estimation.check()
-    check_plot(plot, output)
     named = [named_file(file) for file in files]
     inputs = [file for _, file in named]
-    preparation.check_one_stdin(*inputs, *(file for _, file in known))
-    preparation.check_outputs((output, plot, html), (*inputs, *(file for _, file in known)))
+    read = *inputs, *(file for _, file in known)
+    preparation.check(read, (output, html), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.commands.show.rig_report import rig_json, rig_report
     from neurocal_cli.files.result_files import write_result
@@ -144,21 +145,11 @@ def rig(
                     f"{what} {name}=...: there is no camera {name!r}; the cameras are {', '.join(points)}"
                 )
     given_cameras, own_model = dict(known), dict(models)
-    camera_options: dict[str, dict[str, Any]] = {}
+    camera_options: dict[str, CameraOptions] = {}
     for name, one in points.items():
         own = replace(estimation, distortion=own_model.get(name, estimation.distortion))
         if name in given_cameras:
-            own = replace(
-                own,
-                type="3",
-                intrinsics=given_cameras[name],
-                image_center=None,
-                no_skew=False,
-                skew="free",
-                fix=(),
-                square_pixels=False,
-                distortion="none",
-            )
+            own = own.of_known(given_cameras[name])
         points[name], camera_options[name] = own.prepare(one)
     with ProgressBar() as progress:
         found = calibrate_rig(points, camera_options, outliers=estimation.outliers, progress=progress)
@@ -170,8 +161,7 @@ def rig(
 
             write_plot(plot, draw_rig, found)
         write_page(html, found, *inputs)
-        then = "`neurocal evaluate {}` has its errors, `neurocal triangulate {} POINTS.csv` uses it"
-        tell_written(output, plot, html, then=then)
+        suggest(output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
 
 
 def named_file(word: str) -> tuple[str, str]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import shlex
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import say
+from neurocal_cli.commands.streams import say, suggest
 
 
 @click.command(cls=options.Command)
@@ -30,6 +29,5 @@ def sample(folder: str) -> None:
     from neurocal_cli.files.sample_data import write_sample_data
 
     names = write_sample_data(folder)
-    say(f"{len(names)} files are in {folder}; README.md tells what they show")
-    images = f"{shlex.quote(os.path.join(folder, 'board'))}*.png"
-    say(f"next: neurocal detect {images} --cols 9 --rows 6 --square 25 -o points.csv")
+    say(f"{os.path.join(folder, 'README.md')} tells what the {len(names)} files show")
+    suggest(os.path.join(folder, "photo"), "neurocal detect {}*.jpg --square 25 -o points.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,10 @@ from typing import TextIO
 
 _HANGING = "  "  # how much farther than its first line the rest of a wrapped line is indented
 _NARROWEST = 20  # columns; below, nothing is legible
+# Blanks between a number and its unit, or the two numbers of a size, where a line is not broken.
+_UNIT = r"(?:px|mm|cm|m|s|rad|degrees|%)(?:[\s,;.:)]|$)"
+_KEPT = re.compile(rf"(?<=\d) (?={_UNIT})|(?<=\d) (?=x \d)|(?<=\d x) (?=\d)")
+_UNBROKEN = "\xa0"
 
 # The width of the terminal for which text is being made; None: there is none.
 _WIDTH: ContextVar[int | None] = ContextVar("width", default=None)
@@ -59,6 +64,8 @@ def _wrapped(line: str, width: int) -> list[str]:
     if len(line) <= width:
         return [line]
     indent = line[: len(line) - len(line.lstrip(" "))] + _HANGING
-    return textwrap.wrap(
-        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-    ) or [line]
+    words = _KEPT.sub(_UNBROKEN, line)
+    lines = textwrap.wrap(
+        words, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return [one.replace(_UNBROKEN, " ") for one in lines] or [line]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import ProgressBar, note, print_summary, print_text, tell_written
+from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.streams import ProgressBar, answer, note
 from neurocal_cli.errors import DegenerateGeometryError, FormatError, UsageError
 from neurocal_cli.files.writing import make_folder, write_whole
 
@@ -167,7 +167,6 @@ def simulate(
       neurocal simulate --rig ring:8 --views 80 --sigma 0.3 --trials 2 --save ring
       neurocal simulate --rates --data-sets 1
     """  # noqa: D301 - as in the group
-    preparation.check_one_stdin(camera, board)
     if rates:
         options.note_unused("with --rates", "sigma", "trials", "methods", "random_starts")
     else:
@@ -178,8 +177,7 @@ def simulate(
         raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
     if save is not None:
         preparation.check_folder("--save", save)
-    check_plot(plot)
-    preparation.check_outputs((plot,), (camera, board))
+    preparation.check((camera, board), plots=(plot,))
     preparation.compute_in_one_thread()
     if rig is not None:
         if rates or (camera, board, plot) != (None,) * 3 or images:
@@ -207,15 +205,15 @@ def simulate(
     with ProgressBar() as progress:
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
         starts = _starts(scene, random_starts, seed, jobs, progress)
-    if as_json:
-        print_summary(simulation_json(scene, seed, study, starts))
-    else:
-        print_text(lambda: text_of(*simulation_tables(study, starts, paper)))
+    answer(
+        as_json,
+        lambda: simulation_json(scene, seed, study, starts),
+        lambda: text_of(*simulation_tables(study, starts, paper)),
+    )
     if plot is not None:
         from neurocal_cli.commands.show.simulation_plots import draw_simulation
 
         write_plot(plot, draw_simulation, study, starts, scene.unit)
-        tell_written(plot)
 
 
 def _scene(
@@ -270,15 +268,11 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
-    if as_json:
-        print_summary(rates_json(study))
-    else:
-        print_text(lambda: text_of(*rates_tables(study)))
+    answer(as_json, lambda: rates_json(study), lambda: text_of(*rates_tables(study)))
     if plot is not None:
         from neurocal_cli.commands.show.simulation_plots import draw_rates
 
         write_plot(plot, draw_rates, study)
-        tell_written(plot)
 
 
 def _rig(
@@ -314,10 +308,7 @@ def _rig(
             for name, points in study.rig.points(level, np.random.default_rng((seed, k, 0))).items():
                 file = f"sigma_{str(level).removesuffix('.0')}_{name}.csv"
                 write_points(points, os.path.join(save, file))
-    if as_json:
-        print_summary(rig_study_json(study))
-    else:
-        print_text(lambda: text_of(*rig_study_table(study)))
+    answer(as_json, lambda: rig_study_json(study), lambda: text_of(*rig_study_table(study)))
 
 
 def _save(scene: SimulatedScene, folder: str, levels: list[float], seed: int, images: bool) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.pages import Plots, check_plots, html_option, panel_option, write_page, write_plots
+from neurocal_cli.commands.pages import Plots, files_of, html_option, panel_option, write_page, write_plots
 from neurocal_cli.commands.show import RIG_PANELS
-from neurocal_cli.commands.streams import ProgressBar, concluding, note, tell_written, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, note, suggest, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.files.writing import write_whole
 
@@ -107,7 +106,6 @@ def stereo(
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     ros_files = ros or ()
-    preparation.check_summary(as_json, output, html, *ros_files)
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
@@ -123,12 +121,7 @@ def stereo(
         )
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
-    preparation.check_one_stdin(*inputs)
-    check_plots(plots, output)
-    names = [os.path.realpath(name) for name in (output, *ros_files) if name != "-"]
-    if len(set(names)) < len(names):
-        raise UsageError("-o and --ros name the same file twice; give three different files")
-    preparation.check_outputs((output, html, *ros_files, *(file for _, file in plots)), inputs)
+    preparation.check(inputs, (output, html, *ros_files), plots=files_of(plots), as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
     from neurocal_cli.commands.show.stereo_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
@@ -153,8 +146,7 @@ def stereo(
 
             write_plots(plots, draw_stereo, rig)
         write_page(html, rig, *inputs)
-        then = "`neurocal evaluate {}` has its errors, `neurocal rectify {} LEFT RIGHT -o DIR` uses it"
-        tell_written(output, *ros_files, *(name for _, name in plots), html, then=then)
+        suggest(output, "neurocal evaluate {}", "neurocal rectify {} LEFT... RIGHT... -o DIR")
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
@@ -171,14 +163,4 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
                 "out --type"
             )
         return estimation
-    return replace(
-        estimation,
-        type="3",
-        intrinsics=intrinsics,
-        image_center=None,
-        no_skew=False,
-        skew="free",
-        fix=(),
-        square_pixels=False,
-        distortion="none",
-    )
+    return estimation.of_known(intrinsics)

@@ -24,12 +24,15 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-TYPED = "neurocal.typed"  # key of the words of the command line in click's context
+# Keys in click's context: the words of the command line, and what to do after the command.
+TYPED, NEXT = "neurocal.typed", "neurocal.next"
 
 # -1: warnings only, -2: no warnings either, 1: progress as well. Errors are always shown.
 _VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
 _NOT_CONVERGED = 3  # exit status
 _PATIENCE = 0.5  # seconds after which the bar appears
+_SHORT = 0.3  # the same while modules and files are read
+_MOST_NAMED = 3  # files in a folder whose names are told
 
 T = TypeVar("T")
 
@@ -106,6 +109,7 @@ def tell(text: str) -> None:
     if (capture := _CAPTURE.get()) is not None:
         capture.lines.append(text)
         return
+    end_waiting()
     with suppress(OSError):
         click.echo(wrapped(text, sys.stderr), err=True)
 
@@ -176,18 +180,43 @@ def concluding(
 def print_text(made: Callable[[], str]) -> None:
     """Print a text on stdout, made for its width if it is a terminal."""
     with drawn_on(sys.stdout):
-        click.echo(wrapped(made(), sys.stdout))
+        text = wrapped(made(), sys.stdout)
+    end_waiting()
+    click.echo(text)
 
 
-def tell_written(output: str | None, *others: str | None, then: str = "") -> None:
-    """Say on a terminal which files were written, and what to do next with the first of them, ``{}``."""
+def answer(as_json: bool, in_json: Callable[[], dict[str, Any]], in_words: Callable[[], str]) -> None:
+    """Print a result on stdout: as JSON, or as text for its width if it is a terminal."""
+    if as_json:
+        print_summary(in_json())
+    else:
+        print_text(in_words)
+
+
+def suggest(output: str | None, *steps: str) -> None:
+    """Suggest what to do next with a file, ``{}``; a terminal shows it when the command has ended."""
+    if output not in (None, "-"):
+        told = [step.replace("{}", shlex.quote(str(output))) for step in steps]
+        click.get_current_context().meta.setdefault(NEXT, []).extend(told)
+
+
+def tell_ending(written: Sequence[str], steps: Sequence[str]) -> None:
+    """Say on a terminal which files were written, and what to do next: a line to type is not wrapped."""
     if not _on_terminal():
         return
-    written = [file for file in (output, *others) if file not in (None, "-")]
-    if written:
-        say(f"wrote {', '.join(map(str, written))}")
-    if then and output not in (None, "-"):
-        say(f"next: {then.replace('{}', shlex.quote(str(output)))}")
+    folders: dict[str, list[str]] = {}
+    for file in written:
+        folders.setdefault(os.path.dirname(file), []).append(file)
+    parts = [
+        ", ".join(files) if len(files) <= _MOST_NAMED else f"{len(files)} files in {folder or '.'}"
+        for folder, files in folders.items()
+    ]
+    if parts:
+        say(f"wrote {', '.join(parts)}")
+    for number, step in enumerate(steps):
+        if _VERBOSITY.get() >= 0:
+            with suppress(OSError):
+                click.echo(f"{'      ' if number else 'next: '}{step}", err=True)
 
 
 def first_of(names: Sequence[str]) -> str:
@@ -197,6 +226,7 @@ def first_of(names: Sequence[str]) -> str:
 
 def print_summary(tree: dict[str, Any]) -> None:
     """Print the summary of a result as JSON on stdout; None for numbers that do not exist."""
+    end_waiting()
     click.echo(json.dumps(tree, indent=2, allow_nan=False))
 
 
@@ -207,7 +237,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     nothing, and rich is not imported. With --verbose, each stage is a line instead.
     """
 
-    def __init__(self, stage: str = "") -> None:
+    def __init__(self, stage: str = "", patience: float = _PATIENCE) -> None:
+        end_waiting()
         self._stage = stage
         self._share = 0  # of the work that is done, in thousandths
         self._start = time.monotonic()
@@ -216,7 +247,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
         if _on_terminal() and not verbose() and _VERBOSITY.get() >= 0:
-            self._timer = threading.Timer(_PATIENCE, self._appear)
+            self._timer = threading.Timer(patience, self._appear)
             self._timer.daemon = True
             self._timer.start()
 
@@ -239,20 +270,49 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             if self._timer is None:  # the work has ended meanwhile
                 return
             parts = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
-            self._bar = Progress(*parts, console=Console(stderr=True), transient=True)
+            # Results go to stdout meanwhile, which may be a pipe.
+            console = Console(stderr=True)
+            self._bar = Progress(*parts, console=console, transient=True, redirect_stdout=False)
             self._task = self._bar.add_task(self._stage, total=1000 if self._share else None)
             self._bar.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Remove the bar."""
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None
             if self._bar is not None:
                 self._bar.stop()
+                self._bar = None
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
         tell_more(f"{time.monotonic() - self._start:7.2f} s  {'done' if kind is None else 'stopped'}")
+
+
+# The bar of a command that has neither told anything nor drawn a bar of its own.
+_WAITING: ContextVar[ProgressBar | None] = ContextVar("waiting", default=None)
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """Draw a bar soon, unless something is told before: reading may take long, too."""
+    token = _WAITING.set(ProgressBar(what, _SHORT))
+    try:
+        yield
+    finally:
+        end_waiting()
+        _WAITING.reset(token)
+
+
+def end_waiting() -> None:
+    """Remove the bar of `waiting`, for what the command shows itself."""
+    if (bar := _WAITING.get()) is not None:
+        _WAITING.set(None)
+        bar.close()
 
 
 def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:

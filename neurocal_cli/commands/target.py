@@ -5,8 +5,8 @@ from __future__ import annotations
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.pages import check_plot, plot_option, write_plot
-from neurocal_cli.commands.streams import print_summary, say
+from neurocal_cli.commands.pages import plot_option, write_plot
+from neurocal_cli.commands.streams import print_summary, say, suggest
 from neurocal_cli.errors import InputError
 
 
@@ -43,9 +43,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
       neurocal target camera.yaml --board chessboard:9x6:25 -o again.yaml
     """  # noqa: D301 - as in the group
-    check_plot(plot, output)
-    preparation.check_summary(as_json, output)
-    preparation.check_outputs((output, plot), (camera, file))
+    preparation.check((camera, file), (output,), plots=(plot,), as_json=as_json)
 
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
     from neurocal_cli.files.board_yaml import read_board, write_board
@@ -79,6 +77,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
 
         board = with_found_points(described, *known)
     write_board(board, output)
+    suggest(output, "neurocal detect IMAGE... --board {} -o points.csv")
     if as_json:
         print_summary(target_json(calibration.target, calibration.unit) or {})
     else:

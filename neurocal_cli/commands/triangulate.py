@@ -124,9 +124,7 @@ def triangulate(
         raise UsageError(f"{given} given; give RIG.yaml MATCHES.csv, or LEFT.yaml RIGHT.yaml MATCHES.csv")
     if sigma is not None and sigma > _LARGEST_SIGMA:
         raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
-    preparation.check_one_stdin(*inputs)
-    preparation.check_summary(as_json, output)
-    preparation.check_outputs((output,), inputs)
+    preparation.check(inputs, (output,), as_json=as_json)
     if plane is not None:
         if len(inputs) != 2:
             raise UsageError("--plane is of a single camera; give CAMERA.yaml PIXELS.csv")
@@ -206,7 +204,8 @@ def _triangulate_many(
         worst = max(range(len(names)), key=lambda k: int((found.contradicts == k).sum()))
         count = int((found.contradicts == worst).sum())
         parts.append(
-            f"{without} without a camera that contradicts the others, mostly {names[worst]} ({count})"
+            f"{without} of them measured without a camera that contradicts the others, mostly "
+            f"{names[worst]} ({count})"
         )
     say(", ".join(parts))
 

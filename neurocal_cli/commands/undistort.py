@@ -19,7 +19,6 @@ from neurocal_cli.commands.streams import (
     note_once,
     print_summary,
     say,
-    tell_written,
     warn,
 )
 from neurocal_cli.errors import InputError, UsageError
@@ -158,7 +157,6 @@ def undistort(
         say("the camera has no distortion, so the pixels stay where they are")
     if len(paths) > 1:
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
-    tell_written(None if not paths else folder or output, new_camera, maps)
 
 
 def _check_view(alpha: float | None, shape: str, fov: float | None, size: tuple[int, int] | None) -> None:

@@ -65,6 +65,7 @@ class Outcome:
     # (cols, rows): number of inner vertices of another board in the image
     shown: tuple[int, int] | None = None
     turned: str = ""  # what was done to the image as its EXIF orientation says
+    unread: bool = False  # whether the file is missing, or no image
 
 
 @frozen_dataclass
@@ -101,7 +102,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
             return _named(known, path, source)
         image = parse_image(data, source)
     except NeurocalError as error:
-        return Outcome(path, problem=str(error))
+        return Outcome(path, problem=str(error), unread=True)
     try:
         found = _detected(image, options)
         return _named(_stored(found, data, options.cache), path, source)

@@ -22,6 +22,7 @@ from neurocal_cli.detection.identity.placement import NoBoardError
 from neurocal_cli.detection.markers.locate import locate
 from neurocal_cli.detection.measuring import Points, linearised, measure
 from neurocal_cli.detection.other_targets import other_target
+from neurocal_cli.errors import check_kind
 from neurocal_cli.observations.board import Board, Plane
 from neurocal_cli.observations.board_kinds import CirclePlane
 
@@ -132,6 +133,7 @@ def detect_points(
     InputError
         The image has another shape or type, or pixels that are not finite.
     """
+    check_kind("board", board, Board, "one such as Board.single(9, 6, 25.0)")
     image = grey_image(image)
     if is_inverted(board):
         # The response is that of the light, not of its negative.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import Any
 
 import cv2
@@ -27,6 +28,9 @@ def grey_image(image: NDArray[Any]) -> NDArray[Any]:
     InputError
         The array has another shape or type, no pixels, or pixels that are not finite.
     """
+    if image is None or isinstance(image, (str, bytes, PathLike)):
+        why = "None, as of a file that cv2.imread cannot read" if image is None else "the name of a file"
+        raise InputError(f"an image must be an array, found {why}; read it with read_image(FILE).grey")
     image = np.asarray(image)
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[..., 0]

@@ -27,6 +27,7 @@ from neurocal_cli.files.camera_tree import image_size
 from neurocal_cli.files.failures import value_failures
 from neurocal_cli.files.file_storage import read_tree
 from neurocal_cli.files.observations_yaml import read_observations
+from neurocal_cli.files.reading import is_point_table
 from neurocal_cli.files.tree_fields import Field
 from neurocal_cli.observations.points import Correspondences
 
@@ -127,7 +128,10 @@ def covariance_from_field(block: Field, key: str) -> tuple[tuple[str, ...], Arra
 def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
-        root.refuse("is not a calibration", "give a file that calibrate wrote")
+        if isinstance(root.value, str) and is_point_table(root.value):
+            root.refuse("is a table of points", "calibrate first: neurocal calibrate POINTS.csv -o C.yaml")
+        what = "is empty" if root.value is None else "is not a calibration"
+        root.refuse(what, "give a file that calibrate wrote")
     if "neurocal" not in root:
         if "stereo" in root and "left" in root:
             root.refuse("is a stereo rig", "give the file of one camera")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import re
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +18,7 @@ from neurocal_cli.files.failures import one_line, reading_failures
 from neurocal_cli.files.writing import held_back
 
 _IMAGES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")  # how PNG, JPEG, BMP and TIFF begin
+_POINTS_HEADER = re.compile(r"\s*(?:#[^\n]*\n\s*)*[^\n:]*\bX[,;\t ]\s*Y[,;\t ]\s*Z\b").match
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
     (b"\x00\x00\xfe\xff", "UTF-32"),
@@ -98,6 +101,20 @@ def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
     return decode(data, source, kind), source
 
 
+def is_point_table(text: str) -> bool:
+    """Whether a text begins as a table of points does."""
+    return _POINTS_HEADER(text) is not None
+
+
+def detect_line(image: str) -> str:
+    """The line to type for the points of an image and those that differ from it in their numbers."""
+    stem, ending = os.path.splitext(image)
+    folder, name = os.path.split(stem)
+    start = name.rstrip("0123456789")
+    images = f"{shlex.quote(os.path.join(folder, start))}*{ending}" if start != name else shlex.quote(image)
+    return f"neurocal detect {images} --square 25 -o points.csv, with the side of your squares in mm"
+
+
 def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
     """Decode UTF-8; a message about a binary file names the `kind` that is wanted, and ends in `instead`."""
     if data.isascii() and b"\0" not in data:
@@ -112,12 +129,8 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         if max(even, odd) >= 0.8 * (len(head) // 2) and min(even, odd) == 0:
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
         if data.startswith(_IMAGES):
-            detect = (
-                "find its points first: neurocal detect IMAGES --cols 9 --rows 6 --square 25 -o points.csv"
-            )
-            raise FormatError(
-                f"is an image, not {kind}", source, advice=detect if "points" in kind else f"give {kind}"
-            )
+            advice = f"find its points first: {detect_line(source)}" if "points" in kind else f"give {kind}"
+            raise FormatError(f"is an image, not {kind}", source, advice=advice)
         raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
         return data.decode("utf-8-sig")

@@ -78,7 +78,7 @@ def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
         target = os.path.realpath(path)
         temporary = _written_beside(target, chunks, former)
         if outputs is not None:
-            outputs.stage(temporary, target)
+            outputs.stage(temporary, target, str(path))
         else:
             os.replace(temporary, target)
 
@@ -181,9 +181,10 @@ class Outputs:
 
     def __init__(self) -> None:
         self._inputs: set[_Identity] = set()
-        self._staged: list[tuple[str, str]] = []
+        self._staged: list[tuple[str, str, str]] = []
         self._folders: list[str] = []
         self._stdout: list[bytes] = []
+        self.written: list[str] = []  # files that have got their contents, as they were named
 
     def protect(self, *paths: str | None) -> None:
         """Protect input files from being overwritten; missing files are ignored here."""
@@ -201,9 +202,9 @@ class Outputs:
         if former is not None and (former.st_dev, former.st_ino) in self._inputs:
             raise UsageError(f"{shown} is an input and would be overwritten; give another output")
 
-    def stage(self, temporary: str, target: str) -> None:
-        """Move a temporary file to its target at the end."""
-        self._staged.append((temporary, target))
+    def stage(self, temporary: str, target: str, name: str) -> None:
+        """Move a temporary file to its target, which the user calls by this name, at the end."""
+        self._staged.append((temporary, target, name))
 
     def make_folder(self, folder: str) -> None:
         """Make a folder, and the folders that it is in; those that are new are removed again by `discard`."""
@@ -227,16 +228,17 @@ class Outputs:
         """Move all files to their targets, and return the data for stdout."""
         with _undisturbed():
             while self._staged:
-                temporary, target = self._staged[0]
+                temporary, target, name = self._staged[0]
                 os.replace(temporary, target)
                 del self._staged[0]
+                self.written.append(name)
         self._folders = []
         held, self._stdout = self._stdout, []
         return held
 
     def discard(self) -> None:
         """Remove the temporary files and the new folders, and leave the targets unchanged."""
-        for temporary, _ in self._staged:
+        for temporary, *_ in self._staged:
             with suppress(OSError):
                 os.unlink(temporary)
         for folder in reversed(self._folders):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import UNDISTORTED, Array
 from neurocal_cli.camera.given_values import checked_size, real_array
-from neurocal_cli.errors import InputError
+from neurocal_cli.errors import InputError, check_kind
 from neurocal_cli.observations.distances import Distance
 from neurocal_cli.observations.labels import factorise, first_repeat
 
@@ -228,6 +228,7 @@ class Correspondences:
         InputError
             There is no image, or image sizes differ, so the images come from more than one camera.
         """
+        check_kind("detections", detections, Mapping, "a dict of Detection by the name of the image")
         if not detections:
             raise InputError("there are no images with points; give at least one")
         names, found = list(detections), list(detections.values())

@@ -134,13 +134,15 @@ def paper_size(name: str) -> tuple[float, float]:
     )
 
 
-def default_board(paper: tuple[float, float]) -> Board:
-    """A board of 9 x 6 inner vertices, which looks different turned, with the largest squares in whole mm."""
-    room = _room(max(paper), min(paper))
-    square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
+def default_board(paper: tuple[float, float], cols: int = 9, rows: int = 6) -> Board:
+    """A board with the largest squares in whole mm; with the default numbers, it looks different turned."""
+    rooms = _room(*paper), _room(*paper[::-1])
+    square = float(np.floor(max(min(room[0] / (cols + 1), room[1] / (rows + 1)) for room in rooms)))
     if square < 5:
-        raise InputError("the paper is too small for a board of 9 x 6 inner vertices; give a larger one")
-    return Board.single(_COLS, _ROWS, square, "mm")
+        raise InputError(
+            f"the paper is too small for a board of {cols} x {rows} inner vertices; give a larger one"
+        )
+    return Board.single(cols, rows, square, "mm")
 
 
 def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 from pathlib import Path
@@ -251,8 +252,8 @@ def test_a_board_that_looks_the_same_turned_round_is_named(tmp_path: Path) -> No
     ("words", "code", "message"),
     [
         (["-o", "target.jpg"], 2, "give a name that ends in .svg, .pdf, .png"),
-        (["--cols", "9", "-o", "a.pdf"], 2, "the size of the board is missing"),
-        (["--unit", "inch", "-o", "a.pdf"], 2, "the size of the board is missing"),
+        (["--cols", "9", "-o", "a.pdf"], 2, "--rows is missing"),
+        (["--unit", "inch", "-o", "a.pdf"], 2, "--cols and --rows and --square missing"),
         (["--paper", "B7", "-o", "a.pdf"], 2, "the paper 'B7' is not known"),
         (["--cols", "9", "--rows", "6", "--square", "40", "-o", "a.pdf"], 1, "the board is 400 x 280 mm"),
         (["--cols", "9", "--rows", "6", "--square", "4", "--unit", "px", "-o", "a.pdf"], 1, "the unit 'px'"),
@@ -309,3 +310,13 @@ def test_made_printed_photographed_detected_and_calibrated_the_circle_closes(tmp
     assert np.abs(found.K - camera.A).max() < 0.5
     assert found.rmse_px < 0.03
     assert error.max() < 0.4  # anywhere in the image
+
+
+@pytest.mark.parametrize(("cols", "rows", "square"), [(7, 4, 33), (4, 7, 33), (9, 6, 25)])
+def test_squares_fill_the_paper_if_their_side_is_not_given(
+    tmp_path: Path, cols: int, rows: int, square: int
+) -> None:
+    done = run("board", "--cols", cols, "--rows", rows, "-o", tmp_path / "board.svg", "--json")
+    (plane,) = json.loads(done.stdout)["planes"]
+    assert (plane["cols"], plane["rows"]) == (cols, rows)
+    assert plane["square"] == square

@@ -122,8 +122,8 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     *lines, remedy, summary = result.stderr.splitlines()
     assert remedy == "3 of these 8 images: show the whole board, sharp and evenly lit"
     expected = {
-        "c_cut.png": "cut off",
-        "d_empty.png": "is empty",
+        "c_cut.png": "is cut off in the middle; copy the image again",
+        "d_empty.png": "is empty; give an image",
         "e_text.png": "is not a readable image",
         "f_bomb.png": "60000 x 60000 px",
         "g_tiny.png": "no board detected",
@@ -135,7 +135,10 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     for line, (name, words) in zip(lines, expected.items(), strict=True):
         assert line.startswith(f"{folder / name}: ")
         assert words in line
-    assert summary == "board detected in 3 of 11 images: 279 points, 0 rejected"
+    assert summary.startswith("board detected in 3 of 11 images: 279 points, 0 rejected; ")
+    assert summary.endswith(" could not be read")
+    assert f"{folder / 'absent.png'}" in summary
+    assert "h_black" not in summary
     assert {row.split(",")[0] for row in result.stdout.splitlines()[3:]} == {"board01", "board02", "board03"}
 
 
@@ -234,7 +237,7 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--cols", 9), "the size of the board is missing"),
+        (("--cols", 9), "--rows is missing"),
         (("--unit", "inch"), "--unit is the unit of --square, which is missing"),
         (("--board", "b.yaml", "--cols", 9), "leave out --cols"),
         (("--cols", 9, "--rows", 1, "--square", 25), "--rows"),
@@ -269,7 +272,7 @@ def test_an_image_of_another_size_is_left_out_and_two_sizes_alike_are_refused(
     assert read_points([tmp_path / "p.csv"]).view_names == ("board01", "board02", "board03")
     result = detect(folder / "board01.png", folder / "large.png", *BOARD, "-o", tmp_path / "q.csv")
     assert result.exit_code == 1
-    assert "the image large has 420 x 310 px but board01 has 400 x 300 px" in result.stderr
+    assert "large: the image has 420 x 310 px and as many have 400 x 300; run detect for" in result.stderr
     assert not (tmp_path / "q.csv").exists()
 
 

@@ -124,6 +124,10 @@ def test_evaluate_prints_the_contract_s_keys(folder: Path) -> None:
     assert {"zoom", "focus", "rmse_px"} <= set(found["settings"][0])
     assert {"lookup", "spline_joint", "polynomial_2", "polynomial_2_joint"} <= set(found["rivals"])
     table = run("lens", "evaluate", folder / "lens.yaml", folder / "between.csv").stdout
+    assert run("evaluate", folder / "lens.yaml", folder / "between.csv").stdout == table
+    alone = run("evaluate", folder / "lens.yaml").stdout
+    assert alone.startswith("zoom lens: ")
+    assert "verdict: " in alone
     assert f"{found['rmse_px']:.3f}" in table
     assert "polynomial 2" in table
 

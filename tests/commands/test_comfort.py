@@ -109,6 +109,35 @@ def test_images_instead_of_points_are_recognised(command: str) -> None:
     assert "these are images; find the points in those of each camera first: neurocal detect" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (("calibrate", SAMPLES / "flat.csv", "--image-size", "640x480"), 2, "--image-size W H"),
+        (("calibrate", SAMPLES / "board01.png"), 1, "board*.png --square 25 -o points.csv"),
+        (("detect", SAMPLES / "board01.png", "--square", "25mm"), 2, "'25mm' is not a number"),
+        (("detect", SAMPLES / "board01.png", "--cols", "nine"), 2, "is not a valid whole number"),
+        (("convert", SAMPLES / "flat.csv"), 2, "--to is missing; choose from neurocal, opencv, ros,"),
+        (("evaluate", SAMPLES / "flat.csv"), 1, "is a table of points; calibrate first"),
+        (("undistort", SAMPLES / "flat.csv", "a.png", "-o", "d"), 1, "give a camera file here, first"),
+    ],
+)
+def test_a_mistake_is_told_with_what_to_do(words: tuple[object, ...], status: int, told: str) -> None:
+    result = run(*words)
+    assert result.exit_code == status
+    assert told in result.stderr.splitlines()[-1]
+
+
+def test_as_many_upright_images_as_others_are_explained(tmp_path: Path) -> None:
+    image = cv2.imread(str(SAMPLES / "board01.png"))
+    cv2.imwrite(str(tmp_path / "across.png"), image)
+    cv2.imwrite(str(tmp_path / "upright.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
+    result = run("detect", tmp_path, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
+    assert result.exit_code == 1
+    assert "upright: the image has 300 x 400 px and as many have 400 x 300: it was held or turned" in (
+        result.stderr
+    )
+
+
 def test_a_file_to_judge_that_is_not_there_is_no_mistyped_command() -> None:
     result = run("evaluate", "nothere.yaml")
     assert (result.exit_code, result.stderr) == (

@@ -13,17 +13,21 @@ from support.made_calibration import made_calibration
 from support.places import SAMPLES
 
 from neurocal_cli import (
+    Board,
     Calibration,
+    Correspondences,
     Rig,
     StereoRig,
     calibrate,
     calibrate_rig,
     calibrate_stereo,
+    detect_points,
     fit_lens,
     plot,
     read_lens_points,
     read_points,
     report,
+    triangulate,
 )
 from neurocal_cli.errors import InputError, UsageError
 
@@ -149,3 +153,18 @@ def test_a_zoom_lens_is_shown_too() -> None:
     assert "zoom" in lens.summary()
     assert plot(lens).startswith(b"\x89PNG")
     assert "<svg" in report(lens)
+
+
+def test_arguments_of_another_kind_are_named_with_what_to_give() -> None:
+    board, points = Board.single(9, 6, 25.0), read_points(SAMPLES / "flat.csv")
+    for call, told in (
+        (lambda: detect_points(None, board), "cv2.imread cannot read"),
+        (lambda: detect_points("a.png", board), "the name of a file; read it with read_image"),
+        (lambda: detect_points(np.zeros((9, 9), np.uint8), (9, 6)), "board must be a Board, not tuple"),
+        (lambda: Correspondences.from_detections([]), "give a dict of Detection"),
+        (lambda: calibrate("points.csv"), "points must be a Correspondences, not str"),
+        (lambda: calibrate_stereo(points, "right.csv"), "points of right must be a Correspondences"),
+        (lambda: triangulate(camera(), points.pixels, points.pixels), "pixels are missing; give a StereoRig"),
+    ):
+        with pytest.raises(InputError, match=told):
+            call()  # type: ignore[no-untyped-call]

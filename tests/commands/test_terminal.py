@@ -21,6 +21,7 @@ from neurocal_cli.commands.show.text import align
 
 pty = pytest.importorskip("pty")
 
+BAR = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\r")
 
 
@@ -45,7 +46,9 @@ def at_terminal(width: int, folder: Path, *words: object) -> tuple[str, int, flo
             first = first or time.monotonic() - started
             shown += part
     os.close(primary)
-    return CONTROL.sub("", shown.decode()), process.returncode, first
+    # A bar that was drawn meanwhile has been removed from the screen.
+    lines = [line for line in CONTROL.sub("", shown.decode()).split("\n") if BAR not in line]
+    return "\n".join(lines), process.returncode, first
 
 
 def words_of(text: str) -> list[str]:
@@ -65,7 +68,7 @@ def test_no_line_of_a_summary_is_wider_than_the_terminal_and_no_word_is_broken(
         cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(PROJECT)}, capture_output=True, text=True,
     )  # fmt: skip
     assert words_of(shown)[: len(words_of(piped.stderr))] == words_of(piped.stderr)
-    assert "wrote camera.yaml\nnext: `neurocal " in shown
+    assert "wrote camera.yaml\nnext: neurocal report camera.yaml -o report.html\n" in shown
     assert "wrote" not in piped.stderr
 
 
@@ -76,8 +79,7 @@ def test_tables_that_are_too_wide_are_continued_below(
 ) -> None:
     shown, status, _ = at_terminal(width, tmp_path, *command)
     assert status == 0
-    # A bar that was drawn meanwhile stands before the table.
-    assert all(len(line) <= width for line in shown.splitlines() if "━" not in line)
+    assert all(len(line) <= width for line in shown.splitlines())
     assert shown.count("alpha_v ") == (2 if width == 60 else 1)
 
 
@@ -120,6 +122,32 @@ def test_the_summary_or_a_bar_comes_before_long_work_ends(words: tuple[object, .
     _, status, first = at_terminal(80, tmp_path, *words)
     assert status == 0
     assert 0 < first < 0.7 * (time.monotonic() - started)
+
+
+def test_it_ends_with_what_was_written_and_a_line_to_type(tmp_path: Path) -> None:
+    folder = tmp_path / "sample data of a name that is longer than the terminal"
+    shown, status, _ = at_terminal(60, tmp_path, "sample", folder.name)
+    assert status == 0
+    told = " ".join(shown.split())
+    assert re.search(rf"wrote \d+ files in {folder.name} next: ", told)
+    # It can be copied: the terminal alone breaks it.
+    line = next(line for line in shown.splitlines() if line.startswith("next: "))
+    assert line == f"next: neurocal detect '{folder.name}/photo'*.jpg --square 25 -o points.csv"
+
+
+def test_a_command_that_fails_wrote_nothing_and_suggests_nothing(tmp_path: Path) -> None:
+    shown, status, _ = at_terminal(60, tmp_path, "board", "--paper", "20x20", "-o", "board.pdf")
+    assert status == 1
+    assert "wrote" not in shown
+    assert "next" not in shown
+
+
+def test_a_number_keeps_its_unit() -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "30")
+        text = wrapped("the rms error of this is 0.123 px, of 640 x 480 px and 12.5 %", _Terminal())  # type: ignore[arg-type]
+    for kept in ("0.123 px", "640 x 480 px", "12.5 %"):
+        assert kept in text
 
 
 LINES = st.text(alphabet=st.sampled_from("ab ,.-"), max_size=120)

@@ -319,7 +319,8 @@ def complaint(path, content):
 
 
 FAULTS = [
-    (r"\A[\s\S]*", "", ": is not a calibration; give a file"),
+    (r"\A[\s\S]*", "", ": is empty; give a file that calibrate wrote"),
+    (r"\A[\s\S]*", "view,X,Y,Z,u,v\na,1,2,3,4,5\n", ": is a table of points; calibrate first"),
     (r"\A[\s\S]*", "[1, 2]", ": is not a calibration; give a file"),
     (r"\A[\s\S]*", "a: b", ": has no neurocal block; give a file"),
     (r"\A[\s\S]*", "left: {a: 1}\nstereo: {a: 1}", ": is a stereo rig; give the file of one camera"),

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import get_args
 
@@ -13,7 +14,7 @@ import pytest
 
 import neurocal
 import neurocal_cli
-from neurocal_cli.calibration.calibrate import DISTORTIONS, Lens
+from neurocal_cli.calibration.calibrate import DISTORTIONS, CameraOptions, Lens, calibrate
 from neurocal_cli.calibration.presented import Program
 from neurocal_cli.camera.distortion import MODELS, Model
 from neurocal_cli.camera.remapping import INTERPOLATIONS, Interpolation
@@ -58,20 +59,32 @@ def test_the_types_of_options_list_what_there_is() -> None:
     assert set(get_args(Program)) == set(FORMATS)
 
 
+def test_options_of_rigs_are_those_of_a_camera() -> None:
+    own = {"points", "camera_name", "progress"}
+    assert set(CameraOptions.__annotations__) == set(signature(calibrate).parameters) - own
+
+
 @pytest.mark.slow
 def test_a_type_checker_sees_a_wrong_option(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(
         "import numpy as np\n"
-        "from neurocal import Board, Correspondences, calibrate, detect_points, triangulate\n"
+        "from neurocal import Board, Correspondences, calibrate, calibrate_rig, calibrate_stereo\n"
+        "from neurocal import detect_points\n"
         "found = detect_points(np.zeros((9, 9), np.uint8), Board.single(9, 6, 25.0))\n"
         "points = Correspondences.from_detections({'a': found})\n"
         "camera = calibrate(points, distortion='k1')\n"
         "text: str = camera.convert('kalibr').text\n"
         "calibrate(points, distortion='brown')\n"
         "camera.convert('brown')\n"
+        "calibrate_stereo(points, points, skew=False, distortion='k1')\n"
+        "calibrate_stereo(points, points, distortion='brown')\n"
+        "calibrate_stereo(points, points, {'outliers': 'hide'})\n"
+        "calibrate_rig({'a': points, 'b': points}, target='bent')\n"
     )
     words = [sys.executable, "-m", "mypy", "--strict", program]
     done = subprocess.run(words, cwd=ROOT.parent, capture_output=True, text=True)
     lines = [line for line in done.stdout.splitlines() if "error" in line]
-    assert [line.split(":")[1] for line in lines if ": error" in line] == ["7", "8"], done.stdout
+    assert [line.split(":")[1] for line in lines if ": error" in line] == ["8", "9", "11", "12", "13"], (
+        done.stdout
+    )

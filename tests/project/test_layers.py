@@ -125,7 +125,7 @@ def rooms_used(name: str) -> set[str]:
 
 
 def test_a_module_imports_from_its_own_room_and_from_those_below() -> None:
-    level = {room: k for k, room in enumerate(ROOMS)}
+    level = {one: k for k, one in enumerate(ROOMS)}
     wrong = {
         name: above
         for name in set(NAMES) - {"__init__.py"}

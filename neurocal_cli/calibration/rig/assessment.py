@@ -67,9 +67,7 @@ class _Evidence:
 
 def assess_rig(rig: Rig) -> Verdict | None:
     """Good, usable or poor, with reasons and advice; None for a rig without points of its own."""
-    if any(set(camera.points.view_names) != set(camera.views) for camera in rig.cameras.values()):
-        return None
-    if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
+    if not has_points(rig):
         return None
     evidence = _evidence(rig)
     measures = {
@@ -84,6 +82,12 @@ def assess_rig(rig: Rig) -> Verdict | None:
     return verdict_of(_findings(rig, evidence), measures)
 
 
+def has_points(rig: Rig) -> bool:
+    """Whether a rig has the points that it was calibrated from."""
+    whole = all(set(camera.points.view_names) == set(camera.views) for camera in rig.cameras.values())
+    return whole and bool(rig.frames) and all(len(camera.points) for camera in rig.cameras.values())
+
+
 def assess_stereo(rig: StereoRig) -> Verdict | None:
     """The same for a left and a right camera."""
     return assess_rig(of_two(rig))
@@ -91,7 +95,7 @@ def assess_stereo(rig: StereoRig) -> Verdict | None:
 
 def _evidence(rig: Rig) -> _Evidence:
     names = list(rig.cameras)
-    fit = _fit(rig)
+    fit = fitted(rig)
     squares, degrees = scatter(fit)
     equations = sum(observed.n_equations for observed in fit.problem.observations)
     spare = max(equations - 6 * sum(map(len, fit.problem.names)) - int(fit.free.sum()), 1.0)
@@ -116,7 +120,7 @@ def _evidence(rig: Rig) -> _Evidence:
     )
 
 
-def _fit(rig: Rig) -> RigFit:
+def fitted(rig: Rig) -> RigFit:
     """The rig at its minimum, with the poses of its cameras and frames as unknowns."""
     frame_of: dict[tuple[str, str], int] = {
         (camera, view): k for k, views in enumerate(rig.frames.values()) for camera, view in views.items()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.calibration.arranged_boards import arranged
+from neurocal_cli.calibration.calibrate import CameraOptions
 from neurocal_cli.calibration.rig.fit import fit_rig
 from neurocal_cli.calibration.rig.frames import connected_frames
 from neurocal_cli.calibration.rig.rig import Rig
@@ -16,18 +17,21 @@ from neurocal_cli.calibration.rig.several_cameras import (
     check_options,
     with_poses,
 )
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, UsageError, check_kind
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target, TargetChoice
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 
 def calibrate_rig(
     points: Mapping[str, Correspondences],
-    camera_options: Mapping[str, Mapping[str, Any]] | None = None,
+    camera_options: Mapping[str, CameraOptions] | None = None,
     *,
     progress: Progress | None = None,
-    **options: Any,
+    **options: Unpack[CameraOptions],
 ) -> Rig:
     """Calibrate cameras that are fixed to each other, and their relative poses, from random weights.
 
@@ -62,10 +66,12 @@ def calibrate_rig(
     """
     if len(points) < 2:
         raise UsageError(f"a rig has two cameras or more, not {len(points)}; give the points of each camera")
+    for name, one in points.items():
+        check_kind(f"points of {name}", one, Correspondences, "what read_points made")
     extra = camera_options or {}
     if stray := sorted(set(extra) - set(points)):
         raise UsageError(f"there are options for a camera {stray[0]!r}, but no points; give its points")
-    of_each = {name: {**options, **extra.get(name, {})} for name in points}
+    of_each: dict[str, dict[str, Any]] = {name: {**options, **extra.get(name, {})} for name in points}
     check_options(of_each)
     points, told = with_poses(points)
     several = [name for name, one in points.items() if one.image is not None]

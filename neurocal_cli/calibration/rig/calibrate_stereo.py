@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.calibration.calibrate import CameraOptions
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.common_target import on_one_target
 from neurocal_cli.calibration.rig.adjust import adjust_rig
@@ -21,17 +21,20 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.network.options import Progress
 from neurocal_cli.observations.points import Correspondences
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 _SIDES = ("left", "right")
 
 
 def calibrate_stereo(
     left: Correspondences,
     right: Correspondences,
-    left_options: Mapping[str, Any] | None = None,
-    right_options: Mapping[str, Any] | None = None,
+    left_options: CameraOptions | None = None,
+    right_options: CameraOptions | None = None,
     *,
     progress: Progress | None = None,
-    **options: Any,
+    **options: Unpack[CameraOptions],
 ) -> StereoRig:
     """Calibrate two cameras and their rig from random weights.
 

@@ -14,7 +14,9 @@ from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix, euler_jacobian
+from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
+from neurocal_cli.camera.plane_points import PlaneErrors
 from neurocal_cli.errors import InputError
 
 
@@ -83,6 +85,16 @@ class Rig(Presented):
     def verdict(self) -> Verdict | None:
         """Verdict on this rig, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    def errors_at(self, distance: float) -> PlaneErrors:
+        """How well points and lengths are triangulated at a distance from the first camera [world unit].
+
+        Of points that two cameras or more see, with the shares of the calibration, which is correlated
+        between all points, and of the noise of the pixels. Raises InputError for a distance at which there
+        are none, or that is not positive, and for a rig without points or image size.
+        """
+        found: PlaneErrors = late("calibration.rig.space_measurement", "errors_at")(self, distance)
+        return found
 
     @property
     def lean(self) -> Rig:

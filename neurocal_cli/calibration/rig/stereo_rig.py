@@ -12,7 +12,9 @@ from neurocal_cli.calibration.calibration import Calibration, Verdict
 from neurocal_cli.calibration.presented import Presented
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
+from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.plane_points import PlaneErrors
 
 
 @frozen_dataclass(eq=False)
@@ -80,6 +82,16 @@ class StereoRig(Presented):
     def verdict(self) -> Verdict | None:
         """Verdict on this rig, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
+
+    def errors_at(self, distance: float) -> PlaneErrors:
+        """How well points and lengths are triangulated at a distance from the left camera [world unit].
+
+        Of points that two cameras or more see, with the shares of the calibration, which is correlated
+        between all points, and of the noise of the pixels. Raises InputError for a distance at which there
+        are none, or that is not positive, and for a rig without points or image size.
+        """
+        found: PlaneErrors = late("calibration.rig.space_measurement", "errors_at")(self, distance)
+        return found
 
     @property
     def lean(self) -> StereoRig:

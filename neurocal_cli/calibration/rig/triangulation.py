@@ -134,6 +134,8 @@ def triangulate(
     check_choice("method", method, METHODS)
     if isinstance(left, StereoRig):
         left, right, pose, left_pixels, right_pixels = left.left, left.right, left.pose, right, pose
+    elif left_pixels is None or right_pixels is None:
+        raise InputError("pixels are missing; give a StereoRig and pixels, or two cameras, a Pose and pixels")
     pixels = _pixels(left_pixels), _pixels(right_pixels)
     n = len(pixels[0])
     if len(pixels[1]) != n:

@@ -53,9 +53,10 @@ from neurocal_cli.calibration.verdict.rules import reach_verdict
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.geometry import Array, median
+from neurocal_cli.camera.geometry import Array, cross_matrix, median
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
+from neurocal_cli.observations.target import scale_of
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
@@ -126,6 +127,26 @@ def pixel_covariance_of(calibration: Calibration, points: Array, view: str | Non
     at = _AtMinimum(calibration)
     m, camera, shared = at.opened()
     return pixel_covariance(m, camera, at.variance, points, shared, view)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def position_covariance_of(calibration: Calibration, view: str) -> Array | None:
+    """Covariance (3, 3) of the camera's centre -R^T t in the coordinates of a view's target [world unit^2].
+
+    None if the calibration has no points of its own. A step (w, d) of the pose about the target's centre
+    moves it by -s R^T (d + tau x w).
+    """
+    if not _has_points(calibration) or _views_behind(calibration):
+        return None
+    if calibration.views[view].fixed:
+        return np.zeros((3, 3))
+    at = _AtMinimum(calibration)
+    k = at.views.names.index(view)
+    R, tau = at.state.R[k], at.state.t[k]
+    M = -at.views.scale[k] * R.T @ np.hstack([cross_matrix(tau), np.eye(3)])
+    pose = calibration.pose_of(view)
+    of_scale = scale_of(calibration.points).std * (pose.R.T @ pose.t)
+    return np.asarray(M @ at.pose_covariance[k] @ M.T + np.outer(of_scale, of_scale))
 
 
 def _has_points(calibration: Calibration) -> bool:

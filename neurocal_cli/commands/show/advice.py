@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from neurocal_cli.calibration.advice import Advice, Candidate
-from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
 from neurocal_cli.commands.show.text import number_or_none
 
@@ -21,11 +23,13 @@ _MOST_DOTS = 4000
 _COLOURS = (ACCENT, INK, "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")
 
 
-def advice_lines(advice: Advice) -> list[str]:
-    """A line for each view, with the uncertainty after it."""
+def advice_lines(advice: Advice, verdict: Verdict | None) -> list[str]:
+    """The uncertainty so far, also as in the verdict, and a line for each view with that after it."""
+    there = float("nan") if verdict is None else verdict.measures.get("projection_px", float("nan"))
+    usual = f"; {two_digits(there)} px at that distance" if math.isfinite(there) else ""
     return [
-        "largest std of a projected pixel, for points at half to ten times the distance of the views: "
-        f"{_px(advice.before)}",
+        f"std of predicted pixels {_px(advice.before)} at most, for points at half to ten times the distance "
+        f"of the views{usual}",
         *(f"{number}. {text}" for number, text in enumerate(advised_views(advice), start=1)),
     ]
 

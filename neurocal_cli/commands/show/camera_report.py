@@ -20,7 +20,9 @@ from neurocal_cli.commands.show.text import (
     joined,
     labelled,
     number_or_none,
+    outcome_json,
     parameters,
+    parameters_json,
     printable,
     rounded,
     verdict_json,
@@ -168,14 +170,7 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "type": calibration.type,
         "method": calibration.method,
         "distortion": calibration.distortion_model,
-        "parameters": {
-            name: {
-                "value": value,
-                "std": number_or_none(calibration.std.get(name, math.nan)),
-                "fixed": name in calibration.fixed,
-            }
-            for name, value in parameters(calibration).items()
-        },
+        "parameters": parameters_json(calibration),
         "rmse_px": number_or_none(calibration.rmse_px),
         "max_px": number_or_none(calibration.max_px),
         "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
@@ -185,10 +180,7 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         },
         "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
         "target": target_json(calibration.target, calibration.unit),
-        "converged": bool(calibration.converged),
-        "stop_reason": str.__str__(calibration.stop_reason),
-        "warnings": list(calibration.warnings),
-        **verdict_json(calibration.verdict),
+        **outcome_json(calibration),
     }
 
 

@@ -19,6 +19,7 @@ from neurocal_cli.commands.show.text import (
     number_or_none,
     parameters,
     rounded,
+    with_std,
 )
 
 if TYPE_CHECKING:
@@ -46,12 +47,12 @@ def drift_lines(drift: Drift) -> list[str]:
     """The judgement in words, and the numbers behind it."""
     u, v = drift.pixels[drift.worst]
     scale, *centre = zip(drift.changes.tolist(), drift.changes_std.tolist(), strict=True)
-    moves = [" +- ".join(rounded(value, std)) for value, std in centre]
+    moves = [with_std(value, std) for value, std in centre]
     return [
         f"{'different' if drift.different else 'the same within chance'}: {_in_pixels(drift)}",
         f"  most clearly at ({u:.0f}, {v:.0f}): {two_digits(drift.length[drift.worst])} px, std "
         f"{two_digits(drift.std[drift.worst])} px",
-        f"  scale: {' +- '.join(rounded(100 * scale[0], 100 * scale[1]))} %",
+        f"  scale: {with_std(100 * scale[0], 100 * scale[1])} %",
         f"  image centre: {moves[0]} px in u, {moves[1]} px in v",
         f"  chance: {_chance(drift)} of the calibrations of an unchanged camera differ as much; the limit is "
         f"{100 * SHARE:g} %",
@@ -142,7 +143,7 @@ def _image_table(drift: Drift) -> Table:
         for j in range(3):
             place = low + (high - low) * np.array([j, k]) / 2
             nearest = int(np.argmin(((drift.pixels - place) ** 2).sum(axis=1)))
-            cells.append(" +- ".join(rounded(drift.length[nearest], drift.std[nearest])))
+            cells.append(with_std(drift.length[nearest], drift.std[nearest]))
         rows.append([name, *cells])
     return rows
 

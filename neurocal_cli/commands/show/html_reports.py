@@ -39,7 +39,7 @@ from neurocal_cli.commands.show.plane_report import plane_table
 from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
 from neurocal_cli.commands.show.rig_report import pose_rows
 from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
-from neurocal_cli.commands.show.text import printable, rounded
+from neurocal_cli.commands.show.text import printable, with_std
 from neurocal_cli.commands.show.zoom_report import lens_report
 from neurocal_cli.errors import InputError
 
@@ -110,7 +110,7 @@ def rig_page(rig: Rig, origin: Origin) -> str:
     edges = [["cameras", "common frames", f"distance [{printable(rig.unit)}]"]]
     for (a, b), count in rig.edges.items():
         pair = rig.pair(a, b)
-        distance = " +- ".join(rounded(pair.baseline, pair.std["baseline"]))
+        distance = with_std(pair.baseline, pair.std["baseline"])
         edges.append([f"{printable(a)} - {printable(b)}", str(count), distance])
     left_out = [["view", "reason"]]
     left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]

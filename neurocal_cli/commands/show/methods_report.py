@@ -18,8 +18,10 @@ from neurocal_cli.commands.show.text import (
     number,
     number_or_none,
     parameters,
-    rounded,
+    parameters_json,
+    with_std,
 )
+from neurocal_cli.errors import plural
 from neurocal_cli.simulation.comparison import Compared, Comparison
 from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
@@ -51,7 +53,9 @@ def comparison_report(comparison: Comparison) -> str:
     for side, points, camera in zip(("left", "right"), comparison.points, comparison.cameras, strict=False):
         two = len(comparison.cameras) == 2
         title, line = (f"{side} camera, ", f"{side} camera: ") if two else ("", "")
-        tables.append((f"{title}{len(points)} points in {points.n_views} views", _errors(camera)))
+        tables.append(
+            (f"{title}{plural(len(points), 'point')} in {plural(points.n_views, 'view')}", _errors(camera))
+        )
         known = {method: one.calibration for method, one in camera.items() if one.calibration is not None}
         names = dict.fromkeys(
             [*INTRINSIC_NAMES, *(name for one in known.values() for name in parameters(one))]
@@ -101,8 +105,7 @@ def _estimate(calibration: Calibration, name: str) -> str:
         return "-"
     if name in calibration.fixed:
         return f"{values[name]:.6g} given"
-    value, std = rounded(values[name], calibration.std[name])
-    return f"{value} +- {std}"
+    return with_std(values[name], calibration.std[name])
 
 
 def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
@@ -151,10 +154,7 @@ def _camera_json(one: Compared) -> dict[str, Any]:
         "held_out_px": number_or_none(one.held_out_px),
         "seconds": one.seconds,
         "distortion_model": calibration.distortion_model,
-        "parameters": {
-            name: {"value": value, "std": number_or_none(calibration.std[name])}
-            for name, value in parameters(calibration).items()
-        },
+        "parameters": parameters_json(calibration),
     }
 
 

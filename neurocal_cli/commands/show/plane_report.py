@@ -1,12 +1,14 @@
-"""What is measured how well on a plane, as rows of a table and as JSON."""
+"""What is measured how well on a plane or in space, and where a camera was, as rows of tables and as JSON."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from neurocal_cli.calibration.verdict.findings import two_digits
+from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.plane_points import PlaneErrors, Spread
-from neurocal_cli.commands.show.text import Table, printable
+from neurocal_cli.commands.show.text import Table, number_or_none, printable, with_std
 
 
 def plane_table(errors: PlaneErrors, unit: str) -> Table:
@@ -16,8 +18,11 @@ def plane_table(errors: PlaneErrors, unit: str) -> Table:
     for what, spread in (
         (f"a length of {errors.length:.4g} {unit}", errors.of_length),
         ("a point in the middle", errors.of_middle),
+        ("its depth", errors.of_depth),
         ("the least certain point", errors.of_worst),
     ):
+        if spread is None:
+            continue
         rows.append([what, *map(two_digits, (spread.std, spread.by_calibration, spread.by_pixel))])
     return rows
 
@@ -33,5 +38,28 @@ def plane_json(errors: PlaneErrors) -> dict[str, Any]:
         "sigma_px": errors.sigma,
         "length": {"length": errors.length, **shares(errors.of_length)},
         "middle": shares(errors.of_middle),
+        **({} if errors.of_depth is None else {"depth": shares(errors.of_depth)}),
         "worst": shares(errors.of_worst),
+    }
+
+
+def position_table(positions: Mapping[str, CameraPosition], unit: str) -> Table:
+    """Rows, the heading first: where the camera was in each view."""
+    rows = [["camera in", *(f"{axis} [{printable(unit)}]" for axis in "XYZ")]]
+    for name, place in positions.items():
+        pairs = zip(place.point.tolist(), place.std.tolist(), strict=True)
+        cells = [with_std(value, std) if std > 0 else f"{value:.7g}" for value, std in pairs]
+        rows.append([printable(name), *cells])
+    return rows
+
+
+def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:
+    """The same as values for JSON, with covariances."""
+    return {
+        name: {
+            "point": place.point.tolist(),
+            "std": [number_or_none(std) for std in place.std.tolist()],
+            "covariance": None if place.covariance is None else place.covariance.tolist(),
+        }
+        for name, place in positions.items()
     }

@@ -12,14 +12,15 @@ from neurocal_cli.commands.show.camera_report import calibration_json, target_li
 from neurocal_cli.commands.show.text import (
     Table,
     align,
+    four_digits,
     joined,
-    number,
     number_or_none,
+    outcome_json,
     parameters,
     printable,
-    rounded,
     verdict_json,
     verdict_lines,
+    with_std,
 )
 from neurocal_cli.errors import plural
 from neurocal_cli.simulation.rigs import RigStudy
@@ -48,7 +49,7 @@ def camera_rows(rig: Rig) -> tuple[Table, Table]:
     found = [["camera", *(f"{name} [px]" for name in _SHOWN)]]
     for name, camera in rig.cameras.items():
         counts = str(len(camera.views)), str(len(camera.points))
-        seen.append([printable(name), *counts, camera.distortion_model, number(camera.rmse_px, "#.4g")])
+        seen.append([printable(name), *counts, camera.distortion_model, four_digits(camera.rmse_px)])
         values = parameters(camera)
         found.append(
             [
@@ -56,7 +57,7 @@ def camera_rows(rig: Rig) -> tuple[Table, Table]:
                 *(
                     f"{values[key]:.7g} fixed"
                     if key in camera.fixed
-                    else _with_std(values[key], camera.std.get(key, math.nan))
+                    else with_std(values[key], camera.std.get(key, math.nan))
                     for key in _SHOWN
                 ),
             ]
@@ -72,15 +73,11 @@ def pose_rows(rig: Rig) -> tuple[Table, Table]:
     for name, pose in list(rig.poses.items())[1:]:
         values = dict(zip(POSE_NAMES, [*pose.euler.tolist(), *pose.t.tolist()], strict=True))
         std = rig.std[name]
-        cells = [_with_std(values[key], std[key]) for key in POSE_NAMES]
+        cells = [with_std(values[key], std[key]) for key in POSE_NAMES]
         distance = math.sqrt(float(pose.t @ pose.t))
         turns.append([printable(name), *cells[:3]])
-        shifts.append([printable(name), *cells[3:], _with_std(distance, std["baseline"])])
+        shifts.append([printable(name), *cells[3:], with_std(distance, std["baseline"])])
     return turns, shifts
-
-
-def _with_std(value: float, std: float) -> str:
-    return " +- ".join(rounded(value, std))
 
 
 def _edge_lines(rig: Rig) -> list[str]:
@@ -95,13 +92,13 @@ def _edge_lines(rig: Rig) -> list[str]:
 
 def _fit_lines(rig: Rig) -> list[str]:
     lines = [
-        f"bundle adjustment: rms {number(rig.rmse_px, '#.4g')} px, maximum {number(rig.max_px, '#.4g')} "
+        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} "
         "px, after "
         f"{plural(rig.iterations, 'iteration')}"
     ]
     if rig.delays:
         unit = "s" if rig.timed else "of the time between frames"
-        told = ", ".join(f"{printable(name)} {_with_std(*delay)}" for name, delay in rig.delays.items())
+        told = ", ".join(f"{printable(name)} {with_std(*delay)}" for name, delay in rig.delays.items())
         lines.append(f"images later than those of {printable(rig.first)}: {told} {unit}")
     if rig.left_out:
         lines.append(f"{plural(len(rig.left_out), 'view')} left out of the rig")
@@ -130,10 +127,7 @@ def rig_json(rig: Rig) -> dict[str, Any]:
         "rmse_px": number_or_none(rig.rmse_px),
         "max_px": number_or_none(rig.max_px),
         "left_out": [[*view, why] for view, why in rig.left_out.items()],
-        "converged": bool(rig.converged),
-        "stop_reason": str.__str__(rig.stop_reason),
-        "warnings": list(rig.warnings),
-        **verdict_json(rig.verdict),
+        **outcome_json(rig),
     }
 
 
@@ -143,14 +137,14 @@ def rig_evaluation_tables(evaluation: RigEvaluation) -> tuple[Table, ...]:
     x, y, z = evaluation.by_axis.tolist()
     overall = [[f"[{unit}]", "all cameras"]]
     for label, value in (("X rms", x), ("Y rms", y), ("Z rms", z), ("rms", evaluation.rmse)):
-        overall.append([label, number(value, "#.4g")])
-    overall += [["maximum", number(evaluation.largest, "#.4g")], ["points", str(len(evaluation.errors))]]
+        overall.append([label, four_digits(value)])
+    overall += [["maximum", four_digits(evaluation.largest)], ["points", str(len(evaluation.errors))]]
     cameras = [["camera", "points", "rms from the other cameras' prediction [px]"]]
     for name, (count, error) in evaluation.predicted.items():
-        cameras.append([printable(name), str(count), number(error, "#.4g")])
+        cameras.append([printable(name), str(count), four_digits(error)])
     frames = [["frame", f"rms [{unit}]"]]
     worst = sorted(evaluation.frames.items(), key=lambda item: -item[1])[:_MOST_EDGES]
-    frames += [[printable(name), number(error, "#.4g")] for name, error in worst]
+    frames += [[printable(name), four_digits(error)] for name, error in worst]
     return (overall, cameras, frames)
 
 

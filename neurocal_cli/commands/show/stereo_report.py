@@ -16,14 +16,17 @@ from neurocal_cli.commands.show.text import (
     Table,
     align,
     align_views,
+    four_digits,
     joined,
     labelled,
     number_or_none,
+    outcome_json,
     parameters,
     printable,
     rounded,
     verdict_json,
     verdict_lines,
+    with_std,
 )
 from neurocal_cli.errors import plural
 
@@ -41,7 +44,7 @@ def stereo_report(rig: StereoRig) -> str:
     pairs = []
     for a, b in rig.pairs:
         views = rig.left.views[a], rig.right.views[b]
-        cells = [cell for view in views for cell in (str(view.n_points), _figure(view.rmse_px))]
+        cells = [cell for view in views for cell in (str(view.n_points), four_digits(view.rmse_px))]
         pairs.append((max(view.rmse_px for view in views), [pair_name(a, b), *cells]))
     return joined(
         [", ".join(headline)],
@@ -99,22 +102,22 @@ def _fit_lines(rig: StereoRig) -> list[str]:
         if record is not None:
             lines.append(
                 f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
-                f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
+                f"at least {record.agreed} agreed in each view; rms {four_digits(camera.rmse_px)} px"
             )
     lines.append(
-        f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+        f"bundle adjustment: rms {four_digits(rig.rmse_px)} px, maximum {four_digits(rig.max_px)} px, after "
         f"{plural(rig.iterations, 'iteration')}"
     )
     if rig.delay is not None:
         unit = "s" if rig.timed else "of the time between frames"
-        lines.append(f"right images later than the left ones: {' +- '.join(rounded(*rig.delay))} {unit}")
+        lines.append(f"right images later than the left ones: {with_std(*rig.delay)} {unit}")
     lines += target_lines(rig.left.target or rig.right.target, rig.unit)
     measures = {} if rig.verdict is None else rig.verdict.measures
     growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
     if growth > _MUCH_WORSE:
         lines.append(
-            f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
-            f"it is {growth:.2g} times as much"
+            f"with the poses of each camera alone the rms is {four_digits(alone)} px; with one rig for all "
+            f"pairs it is {growth:.2g} times as much"
         )
     return [*lines, rig.stop_reason]
 
@@ -138,10 +141,7 @@ def stereo_json(rig: StereoRig) -> dict[str, Any]:
         "pairs": [list(pair) for pair in rig.pairs],
         "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
         "delay": None if rig.delay is None else {"value": rig.delay[0], "std": number_or_none(rig.delay[1])},
-        "converged": bool(rig.converged),
-        "stop_reason": str.__str__(rig.stop_reason),
-        "warnings": list(rig.warnings),
-        **verdict_json(rig.verdict),
+        **outcome_json(rig),
     }
 
 
@@ -175,29 +175,20 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[Table, ...]:
         ("epipolar rms [px]", "epipolar_px"),
     ):
         values = [getattr(way, name) for way in ways]
-        overall.append([label, *(_share(v) if name == "relative" else _figure(v) for v in values)])
+        overall.append([label, *(_share(v) if name == "relative" else four_digits(v) for v in values)])
     overall.append(["points", *(str(way.n_points) for way in ways)])
     for side, model in zip(("left", "right"), evaluation.models, strict=True):
         overall.append([f"{side} distortion model", model, *([""] * (len(ways) - 1))])
     depths = [[f"depth [{unit}]", "points", f"rms [{unit}]", "rms / depth"]]
     for part in ways[-1].depths:
-        span = f"{_figure(part.nearest)} - {_figure(part.farthest)}"
-        depths.append([span, str(part.n_points), _figure(part.rmse), _share(part.relative)])
+        span = f"{four_digits(part.nearest)} - {four_digits(part.farthest)}"
+        depths.append([span, str(part.n_points), four_digits(part.rmse), _share(part.relative)])
     views = [["view", "points", *(f"{head} [{unit}]" for head in heads)]]
     right_names = dict(evaluation.pairs)
     for name, (count, _) in ways[0].views.items():
-        errors = [_figure(way.views.get(name, (0, math.nan))[1]) for way in ways]
+        errors = [four_digits(way.views.get(name, (0, math.nan))[1]) for way in ways]
         views.append([pair_name(name, right_names[name]), str(count), *errors])
     return (overall, depths, views) if len(views) > 2 else (overall, depths)
-
-
-def _figure(value: float) -> str:
-    """Four significant digits."""
-    if not math.isfinite(value):
-        return "-"
-    if value != 0 and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.3e}"
-    return f"{value:#.4g}".rstrip(".")
 
 
 def _share(value: float) -> str:

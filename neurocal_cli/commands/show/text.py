@@ -18,6 +18,8 @@ from neurocal_cli.commands.streams import verbose
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
+    from neurocal_cli.calibration.rig.rig import Rig
+    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 
 Table = list[list[str]]
 """Rows of cells, the heading first."""
@@ -107,7 +109,22 @@ def rounded(value: float, std: float) -> tuple[str, str]:
     if decimals > _MOST_DECIMALS:
         return f"{value:.{_MOST_DECIMALS}f}", f"{std:.1e}"
     places = max(decimals, 0)
-    return f"{round(value, decimals):.{places}f}", f"{round(std, decimals):.{places}f}"
+    # + 0.0 avoids -0
+    return f"{round(value, decimals) + 0.0:.{places}f}", f"{round(std, decimals):.{places}f}"
+
+
+def with_std(value: float, std: float) -> str:
+    """A value with its standard deviation; see `rounded`."""
+    return " +- ".join(rounded(value, std))
+
+
+def four_digits(value: float) -> str:
+    """A number with four significant digits."""
+    if not math.isfinite(value):
+        return "-"
+    if value != 0 and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.3e}"
+    return f"{value:#.4g}".rstrip(".")
 
 
 def number(value: float, form: str) -> str:
@@ -135,6 +152,28 @@ def parameters(calibration: Calibration) -> dict[str, float]:
     names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
     values = [*calibration.intrinsics.values().tolist(), *calibration.distortion.tolist()]
     return dict(zip(names, values, strict=True))
+
+
+def parameters_json(calibration: Calibration) -> dict[str, dict[str, Any]]:
+    """The same for JSON, with the standard deviations."""
+    return {
+        name: {
+            "value": value,
+            "std": number_or_none(calibration.std.get(name, math.nan)),
+            "fixed": name in calibration.fixed,
+        }
+        for name, value in parameters(calibration).items()
+    }
+
+
+def outcome_json(result: Calibration | StereoRig | Rig) -> dict[str, Any]:
+    """How the estimation of a result ended, for JSON."""
+    return {
+        "converged": bool(result.converged),
+        "stop_reason": str.__str__(result.stop_reason),
+        "warnings": list(result.warnings),
+        **verdict_json(result.verdict),
+    }
 
 
 def verdict_lines(verdict: Verdict | None) -> list[str]:

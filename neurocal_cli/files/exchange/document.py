@@ -22,7 +22,7 @@ import numpy as np
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.file_storage import parse_tree
-from neurocal_cli.files.reading import decode, read_bytes
+from neurocal_cli.files.reading import decode, is_point_table, read_bytes
 from neurocal_cli.files.tree_fields import Field, is_number
 
 # What NumPy's and Python's readers raise; the header of an array is an expression.
@@ -31,6 +31,7 @@ _DAMAGED = (
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
+_CAMERA_FIRST = "give a camera file here, first, then points or images"
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
@@ -96,6 +97,8 @@ class Document:
         if self.array is not None:
             return Field({"K": self.array.tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
+        if is_point_table(text):
+            raise FormatError(f"is a table of points; {_CAMERA_FIRST}", self.source)
         if _SECTION(text):
             return Field(sections(text, self.source), self.source)
         try:
