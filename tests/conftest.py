@@ -4,7 +4,7 @@ import gc
 import os
 import signal
 
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # Two processes share the tests (pytest-xdist): threads of the BLAS in each would only be in each other's way.
 # Before NumPy loads it.
@@ -21,8 +21,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Only now, for it loads NumPy.
 from support.real_data import real_files, zhang  # noqa: E402, F401
 
-# What fails once has to fail again.
-settings.register_profile("repeatable", derandomize=True, max_examples=50)
+# What fails once has to fail again, and a busy computer is no failure.
+settings.register_profile(
+    "repeatable", derandomize=True, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("repeatable")
 
 
