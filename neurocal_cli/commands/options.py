@@ -98,7 +98,7 @@ class Command(click.Command):
             option = next((one for one in self.params if error.option_name in one.opts), None)
             if option is None or not option.metavar or "requires" not in error.message:
                 return None
-            needed = plural(option.nargs, "word")
+            needed = plural(option.nargs, "value")
             return f"{error.option_name} needs {needed}: {error.option_name} {option.metavar}."
         if isinstance(error, click.MissingParameter):
             kind = None if error.param is None else error.param.type

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -129,7 +130,8 @@ def neurocal_block(root: Field) -> Field:
     """Find the ``neurocal`` block; refuse other kinds of files, each with its own message."""
     if not isinstance(root.value, dict):
         if isinstance(root.value, str) and is_point_table(root.value):
-            root.refuse("is a table of points", "calibrate first: neurocal calibrate POINTS.csv -o C.yaml")
+            line = f"neurocal calibrate {shlex.quote(root.source)} -o camera.yaml"
+            root.refuse("is a table of points", f"calibrate first: {line}")
         what = "is empty" if root.value is None else "is not a calibration"
         root.refuse(what, "give a file that calibrate wrote")
     if "neurocal" not in root:

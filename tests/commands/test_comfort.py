@@ -117,8 +117,8 @@ def test_images_instead_of_points_are_recognised(command: str) -> None:
         (("detect", SAMPLES / "board01.png", "--square", "25mm"), 2, "'25mm' is not a number"),
         (("detect", SAMPLES / "board01.png", "--cols", "nine"), 2, "is not a valid whole number"),
         (("convert", SAMPLES / "flat.csv"), 2, "--to is missing; choose from neurocal, opencv, ros,"),
-        (("evaluate", SAMPLES / "flat.csv"), 1, "is a table of points; calibrate first"),
-        (("undistort", SAMPLES / "flat.csv", "a.png", "-o", "d"), 1, "give a camera file here, first"),
+        (("evaluate", SAMPLES / "flat.csv"), 1, "flat.csv -o camera.yaml"),
+        (("undistort", SAMPLES / "flat.csv", "a.png", "-o", "d"), 1, "give a camera file here"),
     ],
 )
 def test_a_mistake_is_told_with_what_to_do(words: tuple[object, ...], status: int, told: str) -> None:

@@ -31,7 +31,6 @@ _DAMAGED = (
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
-_CAMERA_FIRST = "give a camera file here, first, then points or images"
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
@@ -98,7 +97,7 @@ class Document:
             return Field({"K": self.array.tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
         if is_point_table(text):
-            raise FormatError(f"is a table of points; {_CAMERA_FIRST}", self.source)
+            raise FormatError("is a table of points; give a camera file here", self.source)
         if _SECTION(text):
             return Field(sections(text, self.source), self.source)
         try:
