@@ -172,6 +172,29 @@ def test_the_light_of_a_pattern_is_that_of_the_blurred_pattern() -> None:
     np.testing.assert_allclose(light[0], blurred[np.ix_(at, at)].ravel(), atol=0.01)
 
 
+def test_only_ink_beside_found_vertices_is_taken_off() -> None:
+    cell = np.array([[-1, -1], [0, 0], [1, 1], [2, 2], [9, 9]])
+    ink = Ink(cell, np.array([0.2, 0.8]), np.ones((5, 1, 1)), -np.ones(5))
+    seen = np.zeros((4, 3), dtype=bool)
+    seen[1, 1] = True
+    assert ink.beside(seen).cell.tolist() == [[0, 0], [1, 1]]
+    seen[0, 0] = True
+    assert ink.beside(seen).cell.tolist() == [[-1, -1], [0, 0], [1, 1]]
+
+
+@pytest.mark.slow
+def test_a_fifth_of_a_large_board_before_a_bent_lens() -> None:
+    """The map of the seen part takes far cells back into the image, where they have no ink."""
+    plane = plane_of("charuco:14x10:30:22:DICT_4X4_100")
+    scene = marked_scene(plane, 3, square=95, size=(640, 480), k1=-0.2, shift=(150.0, 90.0))
+    picture = taken(scene, 3, 4)
+    (truth,) = picture.truth.planes
+    error, squared = errors_of(detect_points(picture.image, scene.board, "midpoints"), picture)
+    assert len(error) >= 0.9 * truth.edges_visible.sum() > 30
+    assert np.sqrt((error**2).mean()) < 0.006
+    assert 0.4 < squared.mean() < 2
+
+
 def test_only_borders_of_one_colour_are_borders() -> None:
     light = np.array([[-1.0] * 5] * 5)[None].repeat(2, axis=0)
     light[:, 2, 2] = 1

@@ -55,6 +55,19 @@ class Ink:
         """Some of the cells."""
         return Ink(self.cell[which], self.lines, self.light[which], self.base[which])
 
+    def beside(self, seen: NDArray[np.bool_]) -> Ink:
+        """The cells with a corner among the vertices (rows, cols) that were found.
+
+        The map of a part of a board does not extend to cells far from it.
+        """
+        rows, cols = seen.shape
+        known = np.zeros(len(self.cell), dtype=np.bool_)
+        for step in _CORNERS.astype(np.int64):
+            c, r = (self.cell + step).T
+            inside = (c >= 0) & (c < cols) & (r >= 0) & (r < rows)
+            known[inside] |= seen[r[inside], c[inside]]
+        return self.only(known)
+
     @property
     def inner(self) -> Array:
         """(N, n, n) what the pattern changes."""
@@ -104,7 +117,7 @@ class Appearance:
         u, v = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
         area = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
         width = area / np.maximum(np.hypot(*u.T), np.hypot(*v.T))
-        return float(np.nanmin(width / self.blur[:, :2].max(axis=1)))
+        return float(np.nanmin(width / self.blur[:, :2].max(axis=1), initial=np.inf))
 
 
 def without_ink(image: NDArray[np.generic], ink: Ink, look: Appearance, most: float) -> NDArray[np.float32]:

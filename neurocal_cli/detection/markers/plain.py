@@ -49,7 +49,7 @@ def fit_without_ink(
     image: NDArray[np.generic], grid: Grid, floor: float, ink: Ink, undo: bool = True
 ) -> GridFit:
     """Fit a board whose cells have patterns, after sharpening by the camera is undone if `undo`."""
-    raw = GridImage(image, grid, floor)
+    raw, ink = GridImage(image, grid, floor), ink.beside(grid.seen)
     look, mapped, levels, noise = _first_look(raw, ink)
     sharpening = find_sharpening(_plain_profile(raw, mapped, _gaps(raw, ink), *levels)) if undo else None
     if sharpening is not None:
