@@ -16,6 +16,7 @@ from neurocal_cli.commands.frames import detections, of_one_size, videos_as_fram
 from neurocal_cli.commands.requested_board import (
     board_in_images,
     check_size,
+    compare_markers,
     complain_of,
     described_board,
 )
@@ -215,6 +216,7 @@ class _Request:
     overlay: bool
     cache: str | None
     enough: int  # images from which a board can be found if its ends are not seen
+    compared: bool = False  # whether the board was compared with images
 
     def options(self, paths: Sequence[str]) -> DetectionOptions:
         """The options for detection in these images, in which the board's size is found if it is not known.
@@ -226,6 +228,9 @@ class _Request:
 
         if self.board is None:
             self.board = board_in_images(paths, self.described, self.enough)
+        elif not self.compared:
+            compare_markers(paths, self.board)
+        self.compared = True
         known = None
         if self.cache is not None:
             request = f"{self.points} {self.gamma!r} {self.overlay} {format_board(self.board)}"

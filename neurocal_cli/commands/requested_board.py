@@ -23,6 +23,7 @@ Size = tuple[int, int]
 _UNKNOWN = "the {} is not given, so it is the unit of all lengths; give it by --square"
 
 _SELDOM = 0.2  # ratio of images with the described size to those with another; boards are seen in mirrors
+_COMPARED = 3  # images, with a described board with markers
 _FEW = 3  # images; fewer may by chance show the same part of the board
 
 
@@ -79,6 +80,41 @@ def board_in_images(paths: Sequence[str], options: BoardOptions, enough: int) ->
             else "distances"
         )
     return Board((plane.rescaled(side),), unit)
+
+
+def compare_markers(paths: Sequence[str], board: Board) -> None:
+    """Compare a described board of one plane with markers with what some of the images show.
+
+    It is a NeurocalError if they show other columns, whose markers would be called wrongly, or another kind;
+    of more or fewer rows, a warning.
+    """
+    from neurocal_cli.detection.identity.placement import NoBoardError
+    from neurocal_cli.detection.markers.found import agreed_markers, seen_markers
+    from neurocal_cli.observations.board_kinds import TagPlane, found_words
+
+    plane = board.planes[0]
+    if plane.markers is None or len(board.planes) > 1:
+        return
+    images = _readable(_spread(paths)[:_COMPARED], lambda text, share: None)
+    try:
+        seen = [marks for image in images if (marks := seen_markers(image))]
+        found = agreed_markers(seen) if seen else None
+    except NeurocalError:  # they do not tell the board, or cannot be read, which detection says
+        return
+    shown = None if found is None else found.plane
+    # Of several boards with different numbers, another one may be seen best.
+    if (
+        found is None
+        or shown is None
+        or shown.markers is None
+        or (shown.markers.first_id != plane.markers.first_id)
+    ):
+        return
+    told = f"the images show {found_words(shown)}; the board was described otherwise"
+    if isinstance(shown, TagPlane) != isinstance(plane, TagPlane) or shown.cols != plane.cols:
+        raise NoBoardError(f"{told}: correct its description, or leave it out")
+    if found.sure and shown.rows != plane.rows:
+        warn(f"{told}: it has another number of rows")
 
 
 def _spread(paths: Sequence[str]) -> list[str]:

@@ -61,6 +61,13 @@ def test_a_printed_board_is_found_without_a_description(tmp_path: Path) -> None:
     assert "the side of a square is not given, so it is the unit of all lengths" in result.stderr
     board = read_board(found)
     assert board.unit == "squares"
+    for wrong in ("7x4", "5x4"):
+        form = f"charuco:{wrong}:30:24:DICT_5X5_50"
+        result = run("detect", picture, "--board", form, "-o", tmp_path / "w.csv")
+        assert result.exit_code == 1
+        assert "the images show a ChArUco board of 6 x 4 squares" in result.stderr
+    result = run("detect", picture, "--board", "charuco:6x6:30:24:DICT_5X5_50", "-o", tmp_path / "w.csv")
+    assert "it has another number of rows" in result.stderr
     result = run("detect", picture, "--board", found, *words[:2], "-o", tmp_path / "q.csv")
     assert (tmp_path / "q.csv").read_bytes() == (tmp_path / "p.csv").read_bytes()
     result = run("detect", picture, "--square", 30, *words)

@@ -90,6 +90,13 @@ def test_another_dictionary_is_named() -> None:
         detect_points(taken(scene, 1).image, wrong)
 
 
+def test_markers_that_contradict_the_columns_are_refused() -> None:
+    scene = marked_scene(plane_of(CHARUCO), 1)
+    wrong = Board((plane_of("charuco:7x5:40:30:DICT_4X4_50"),))
+    with pytest.raises(NoBoardError, match="as if it had another number of columns"):
+        detect_points(taken(scene, 1).image, wrong)
+
+
 def test_too_many_markers_for_a_dictionary_are_refused() -> None:
     board = Board((plane_of("charuco:12x10:40:30:DICT_4X4_50"),))
     with pytest.raises(InputError, match="markers up to 59, and DICT_4X4_50 up to 49"):

@@ -50,6 +50,7 @@ class Placed:
     at: NDArray[np.intp]  # (N,) their positions among the cells
     ground: Array  # (N, 4, 2) [squares] their corners on the board
     unsure: bool = False  # whether as many markers agree in another print
+    share: float = 1.0  # of the markers with numbers of the board
 
 
 def place(plane: Plane, marks: Marks) -> Placed | None:
@@ -65,7 +66,8 @@ def place(plane: Plane, marks: Marks) -> Placed | None:
         if len(kept) < 2:
             continue
         if best is None or len(kept) > len(best.at):
-            best = Placed(some.only(kept), how, cells, at[kept], ground[kept])
+            share = len(kept) / len(some)
+            best = Placed(some.only(kept), how, cells, at[kept], ground[kept], share=share)
         elif len(kept) == len(best.at):
             best = replace(best, unsure=True)
     return best

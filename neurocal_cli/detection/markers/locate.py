@@ -21,6 +21,9 @@ from neurocal_cli.observations.markers import DICTIONARIES, code_count
 _ENOUGH = 4  # markers that agree, after which no other dictionary is tried
 _MOST = 0.5  # share of the markers after which no other scale is tried
 _STRANGE = 8  # markers of another dictionary that are worth a word
+# Share of the board's markers that agree with each other, below which so many of them contradict the
+# description.
+_LEAST_SHARE, _CONTRADICTING = 0.45, 6
 _MIRRORED = ((1, 0), (0, -1))
 
 
@@ -38,6 +41,11 @@ def locate(board: Board, image: NDArray[np.generic]) -> Identified:
         found = None if placed is None else find_vertices(plane, placed, light)
         if placed is None or found is None:
             continue
+        if placed.share < _LEAST_SHARE and len(placed.at) >= _CONTRADICTING * placed.share:
+            raise NoBoardError(
+                "most markers are not where the board has them, as if it had another number of columns; "
+                "correct its description, or leave out --board, so that the board is found"
+            )
         if placed.unsure:
             raise NoBoardError(
                 "the markers fit today's and the legacy pattern of OpenCV; show more of the board, or give "
