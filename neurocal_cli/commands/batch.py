@@ -167,7 +167,7 @@ def _runner(
         return lambda work, tasks: work_off(work, tasks, jobs or usable_cores())
     else:
         client = stack.enter_context(cluster.local_cluster(workers or usable_cores()))
-    return lambda work, tasks: cluster.work_off_by(client, work, tasks)
+    return lambda work, tasks: cluster.work_off_by(client, work, tasks, ahead=1 if ship else 4)
 
 
 def _check_shared(client: Any, folder: str) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import count, islice, takewhile
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_AHEAD = 8  # tasks per thread that wait at the workers' side, so that no worker waits
+_AHEAD = 4  # chunks of tasks per thread that wait at the workers' side, so that no worker waits
 _TOGETHER = 0.1  # seconds in which results are collected
+_CHUNK, _LARGEST = 0.5, 32  # seconds that a worker has to do at a time, and tasks at most
 _WAIT = 30  # seconds for the first worker
 _GONE = 10  # seconds without the scheduler, after which it will not come back
 _LOST = "the scheduler is gone; start it, then the same command goes on"
-_TRIES = 1  # after a worker died
 
 
 def is_installed() -> bool:
@@ -41,7 +42,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": _TRIES,
+        "distributed.scheduler.allowed-failures": 0,  # `work_off_by` tries again
         "distributed.admin.log-format": "%(message)s",
         "distributed.worker.memory.terminate": 0.95,  # of its share; the task is then tried elsewhere
         # What a cluster does all the time, so that the cores are left to the jobs.
@@ -58,6 +59,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
             threads_per_worker=1,
             processes=True,
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": ":0"},  # any port, so that clusters do not meet
             silence_logs=logging.CRITICAL,
         )
     try:
@@ -141,25 +143,47 @@ def work_off_by(
 ) -> Iterator[tuple[Task, Result | None]]:
     """Tasks with their results as they are finished; see `worker_pool.work_off`.
 
-    `ahead` tasks for each thread are with the workers. Tasks are sent, and results are fetched, several at a
-    time, because a message costs as much time as a dozen tasks in it. Raises NeurocalError if the scheduler
-    is gone.
+    A message takes the scheduler as long as many small tasks in it, so the workers get short tasks several
+    at a time: chunks, of which `ahead` for each thread are with them. A worker that is killed takes all its
+    chunks with it, and nobody knows which task was to blame. So their tasks are tried again at the end, each
+    on its own.
+
+    Raises NeurocalError if the scheduler is gone.
     """
-    rest, open_tasks, most = iter(tasks), dict[str, Task](), ahead * threads(client)
+    rest, chunks = iter(tasks), dict[str, list[Task]]()
+    suspects, alone = list[Task](), False
     finished: SimpleQueue[Future] = SimpleQueue()
+    most, size = ahead * threads(client), 1
     while True:
-        if len(open_tasks) <= most // 2:
-            some = list(islice(rest, most - len(open_tasks)))
-            for task, future in zip(some, client.map(work, some, pure=False), strict=True):
-                open_tasks[future.key] = task
+        if len(chunks) <= most // 2:
+            further = takewhile(bool, (list(islice(rest, size)) for _ in count()))
+            more = list(islice(further, most - len(chunks)))
+            if suspects and not (more or chunks):
+                more, alone = [[suspects.pop()]], True
+            for chunk, future in zip(more, client.map(partial(_each, work), more, pure=False), strict=True):
+                chunks[future.key] = chunk
                 future.add_done_callback(finished.put)
-        if not open_tasks:
+        if not chunks:
             return
         futures = {future.key: future for future in _finished(client, finished)}
-        results = _results(client, futures)
+        done = _results(client, futures)
         del futures  # so that the workers forget them
-        for key, result in results.items():
-            yield open_tasks.pop(key), result
+        for key, result in done.items():
+            chunk = chunks.pop(key)
+            if result is not None:
+                results, seconds = result
+                size = min(max(1, int(_CHUNK * len(chunk) / max(seconds, 1e-9))), _LARGEST)
+                yield from zip(chunk, results, strict=True)
+            elif alone:
+                yield chunk[0], None
+            else:
+                suspects += chunk
+
+
+def _each(work: Callable[[Task], Result], chunk: Sequence[Task]) -> tuple[list[Result], float]:
+    """Results of tasks, and the seconds that they took."""
+    start = time.perf_counter()
+    return [work(task) for task in chunk], time.perf_counter() - start
 
 
 def _finished(client: Client, queue: SimpleQueue[Future]) -> list[Future]:
@@ -175,7 +199,11 @@ def _finished(client: Client, queue: SimpleQueue[Future]) -> list[Future]:
 
 
 def _results(client: Client, futures: dict[str, Future]) -> dict[str, Any]:
-    """Results of finished tasks; None for a task whose worker died, again."""
-    if any(future.status not in ("finished", "error") for future in futures.values()):  # cancelled
+    """Results of finished chunks; None for one whose worker was killed."""
+    try:
+        found = dict(client.gather(futures, errors="skip"))
+    except OSError as error:
+        raise NeurocalError(_LOST) from error
+    if any(found[key] is None and future.status != "error" for key, future in futures.items()):  # cancelled
         raise NeurocalError(_LOST)
-    return dict(client.gather(futures, errors="skip"))
+    return found

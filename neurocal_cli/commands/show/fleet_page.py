@@ -25,14 +25,15 @@ _FEWEST = 5  # cameras for a histogram
 _WIDTH, _HEIGHT, _FOOT = 320.0, 130.0, 24.0
 _WORDS = ("good", "usable", "poor")
 
-# Columns of the table: heading, key and format.
+# Columns of the table: heading, key and format. Those that no row has are left out.
 _COLUMNS = (
-    ("verdict", "verdict", ""), ("alpha_u", "alpha_u", ".2f"), ("std", "alpha_u_std", ".2g"),
-    ("alpha_v", "alpha_v", ".2f"), ("u0", "u0", ".2f"), ("v0", "v0", ".2f"), ("model", "distortion", ""),
-    ("rms", "rmse_px", ".3g"), ("held out", "held_out_px", ".3g"), ("views", "n_views", ""),
-    ("points", "n_points", ""), ("outliers", "n_rejected", ""), ("s", "seconds", ".2g"),
+    ("verdict", "verdict", ""), ("drift", "drift", ""), ("drift rms", "drift_px", ".2g"),
+    ("its std", "drift_std_px", ".2g"), ("alpha_u", "alpha_u", ".2f"), ("std", "alpha_u_std", ".2g"),
+    ("alpha_v", "alpha_v", ".2f"), ("u0", "u0", ".2f"), ("v0", "v0", ".2f"), ("baseline", "baseline", ".6g"),
+    ("model", "distortion", ""), ("rms", "rmse_px", ".3g"), ("held out", "held_out_px", ".3g"),
+    ("views", "n_views", ""), ("points", "n_points", ""), ("outliers", "n_rejected", ""),
+    ("s", "seconds", ".2g"),
 )  # fmt: skip
-_CHANGE = (("drift", "drift", ""), ("drift rms", "drift_px", ".2g"), ("its std", "drift_std_px", ".2g"))
 
 
 def fleet_page(rows: Sequence[Row], name: str) -> str:
@@ -72,8 +73,7 @@ def _link(row: Row) -> str:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    first, *others = _COLUMNS
-    columns = [first, *(_CHANGE if any(row.get("drift") for row in rows) else ()), *others]
+    columns = [column for column in _COLUMNS if any(row.get(column[1]) not in (None, "") for row in rows)]
     head = "".join(f"<th>{escape(title)}</th>" for title, _, _ in [("camera", "", ""), *columns])
     lines = []
     for row in rows[:_MOST_ROWS]:
