@@ -129,7 +129,7 @@ def test_the_name_and_the_image_size_are_written(points: Path, tmp_path: Path) -
         (["--starts", "1"], "--starts"),
         (["--method", "guess"], "--method"),
         (["--plot", "picture.gif"], ".png"),
-        (["--plot", "out.png", "-o", "out.png"], "same file"),
+        (["--plot", "out.png", "-o", "out.png"], "is given for two outputs"),
         (["--camera-name", " "], "--camera-name"),
         (["-", "-"], "only once"),
         (["-", "--type", "3", "--intrinsics", "-"], "only once"),

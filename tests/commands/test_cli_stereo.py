@@ -127,7 +127,7 @@ def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path)
         (["--image-center", "1", "2"], "--image-center needs --type 2"),
         (["--alpha", "2"], "--alpha"),
         (["--epochs", "5"], "--epochs needs --trainer backprop"),
-        (["-o", "a", "--ros", "a", "b"], "same file"),
+        (["-o", "a", "--ros", "a", "b"], "is given for two outputs"),
     ],
 )
 def test_wrong_usage_is_told(options: list[str], message: str, files: tuple[Path, Path]) -> None:
