@@ -153,7 +153,7 @@ def convert(
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
       neurocal convert camera.yaml --to dlt -o dlt.csv
       neurocal convert camera.yaml --to lensfun --force --focal-length 24 \\
-          -o lens.xml
+          --crop-factor 1.5 -o lens.xml
       echo '{"K": [[280, 0, 319], [0, 280, 239], [0, 0, 1]],
           "D": [0.09, 0.005, -0.005, -0.002]}' > front.json
       neurocal convert front.json --distortion fisheye --to neurocal \\

@@ -110,6 +110,7 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
+        ".ad l",  # words of choices are so long that lines cannot be adjusted
         *_section("NAME", _wrap(rf"{_escape(name)} \- {_escape(brief)}")),
         *_section("SYNOPSIS", [" ".join(words)]),
         *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
