@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration.calibration import Calibration, Verdict
     from neurocal_cli.calibration.drift import Drift, find_drift
     from neurocal_cli.calibration.evaluation import evaluate_camera
+    from neurocal_cli.calibration.rig.advice import advise_rig
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo, fit_stereo
     from neurocal_cli.calibration.rig.evaluation import evaluate_stereo, evaluate_stereo_rig
@@ -73,6 +74,7 @@ _HOMES = {
     "Verdict": "calibration.calibration",
     "ZoomLens": "calibration.zoom.zoom_lens",
     "advise": "calibration.advice",
+    "advise_rig": "calibration.rig.advice",
     "calibrate": "calibration.calibrate",
     "calibrate_rig": "calibration.rig.calibrate_rig",
     "calibrate_stereo": "calibration.rig.calibrate_stereo",
@@ -128,6 +130,7 @@ __all__ = [
     "Verdict",
     "ZoomLens",
     "advise",
+    "advise_rig",
     "calibrate",
     "calibrate_rig",
     "calibrate_stereo",

@@ -69,7 +69,7 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     InputError
         The calibration has no points, no image size or no free parameter, or no view shows the whole target.
     """
-    known, world = _Known.of(calibration), _target(calibration)
+    known, world = _Known.of(calibration), points_of_target(calibration)
     options = candidates(calibration)
     if not options:
         raise InputError("no view shows the whole target; check the image size and the target")
@@ -137,7 +137,7 @@ class _Known:
         return cls(camera, free, information, places, sigma, square)
 
 
-def _target(calibration: Calibration) -> Array:
+def points_of_target(calibration: Calibration) -> Array:
     """(n, 3) distinct points of the target."""
     points = calibration.points
     if calibration.target is not None:
@@ -147,7 +147,7 @@ def _target(calibration: Calibration) -> Array:
 
 def candidates(calibration: Calibration) -> list[Candidate]:
     """Views with the whole target in the image, for all positions, widths, tilts and rolls."""
-    camera, world = calibration.camera, _target(calibration)
+    camera, world = calibration.camera, points_of_target(calibration)
     assert camera.image_size is not None
     size = np.array(camera.image_size, dtype=float)
     middle = 0.5 * (world.min(axis=0) + world.max(axis=0))

@@ -12,7 +12,7 @@ from neurocal_cli.errors import UsageError
 
 Program = Literal[
     "neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz", "dlt", "nerfstudio",
-    "anipose", "orb-slam", "vins", "basalt", "euroc", "open3d", "metashape", "gyroflow",
+    "anipose", "caliscope", "orb-slam", "vins", "basalt", "euroc", "open3d", "metashape", "gyroflow",
     "lensfun",
 ]  # fmt: skip
 

@@ -1,6 +1,8 @@
-"""``neurocal advise``: which views to photograph next."""
+"""``neurocal advise``: which views to photograph next, of one camera or of a rig."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import click
 
@@ -8,9 +10,12 @@ from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import plot_option, write_plot
 from neurocal_cli.commands.streams import ProgressBar, answer, suggest
 
+if TYPE_CHECKING:
+    from neurocal_cli.files.tree_fields import Field
+
 
 @click.command(cls=options.Command)
-@options.argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
+@options.argument("calibration", "FILE.yaml", "A camera or a rig that neurocal wrote; - is standard input.")
 @options.count("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
 @plot_option("the outlines of these views")
 @options.json
@@ -26,19 +31,32 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     camera that a motion of its frame compensates does not count. Systematic errors, such as a wrong
     distortion model, are not included; see the verdict of neurocal evaluate camera.
 
+    Of a rig, each view ties the pair of cameras that is weakest then: the one that knows least where the
+    second camera sees what the first one sees. It is described as the first camera sees it; the second one
+    sees most of the target at the same moment. The numbers after each view are the standard deviation of the
+    place without it and with it. --plot shows the views of the first pair, in the image of its first camera.
+
     \b
     Examples:
       neurocal sample sample_data
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
+      neurocal rig sample_data/rig_cam*.csv -o rig.yaml
+      neurocal advise rig.yaml --next 1
     """  # noqa: D301 - as in the group
     preparation.check((calibration,), plots=(plot,))
+    from neurocal_cli.files.file_storage import read_tree
+
+    root = read_tree(calibration)
+    if "stereo" in root or "rig" in root:
+        _advise_rig(root, count, plot, as_json)
+        return
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines
-    from neurocal_cli.files.calibration_tree import read_calibration
+    from neurocal_cli.files.calibration_tree import calibration_from_field
 
-    known = read_calibration(calibration)
+    known = calibration_from_field(root)
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
     answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
@@ -48,3 +66,19 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
         write_plot(plot, draw_advice, advice, known)
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
+
+
+def _advise_rig(root: Field, count: int, plot: str | None, as_json: bool) -> None:
+    """Advise views that tie the cameras of a rig."""
+    from neurocal_cli.calibration.rig.advice import advise_rig
+    from neurocal_cli.commands.show.advice import rig_advice_json, rig_advice_lines
+    from neurocal_cli.files.rig_yaml import rig_from_field
+
+    rig = rig_from_field(root)
+    with ProgressBar("comparing views"):
+        advice = advise_rig(rig, count)
+    answer(as_json, lambda: rig_advice_json(advice), lambda: "\n".join(rig_advice_lines(advice)))
+    if plot is not None:
+        from neurocal_cli.commands.show.advised_views import draw_rig_advice
+
+        write_plot(plot, draw_rig_advice, advice, rig)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 )
 @options.choice(
     "--to",
-    "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt nerfstudio anipose orb-slam vins basalt "
-    "euroc open3d metashape gyroflow lensfun",
+    "neurocal opencv ros kalibr colmap mrcal matlab json npz dlt nerfstudio anipose caliscope orb-slam "
+    "vins basalt euroc open3d metashape gyroflow lensfun",
     "Format to write.",
     without="required",
     to="target",
@@ -110,7 +110,8 @@ def convert(
     \b
       --to      the output
       neurocal  calibration or rig, which all commands of neurocal read
-      opencv    cv2.FileStorage: YAML, or XML or JSON if the name ends so
+      opencv    cv2.FileStorage: YAML, or XML or JSON if the name ends so;
+                of three cameras and more as its multi-view sample
       ros       camera_info; of a rig the folder with left.yaml and right.yaml
       kalibr    camchain, lengths in metres
       colmap    cameras.txt; of a rig, or with poses, a model's folder
@@ -120,15 +121,15 @@ def convert(
       npz       the same for NumPy
       dlt       11 rows of DLT coefficients, a column for each camera of a
                 rig (X, Y, Z as in the first view), or for each view
-      nerfstudio, anipose, orb-slam, vins, basalt, euroc, open3d,
-      metashape, gyroflow
+      nerfstudio, anipose, caliscope, orb-slam, vins, basalt, euroc,
+      open3d, metashape, gyroflow
                 the files of these programs
       lensfun   database of one lens, XML
 
     \b
     Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI,
     Middlebury, MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV,
-    multical, calib.io, EasyMocap, ZED, OAK, Azure Kinect, caliscope,
+    multical, calib.io, EasyMocap, ZED, OAK, Azure Kinect,
     freemocap, instant-ngp, Polycam, PhotonVision, RealSense, Bouguet's
     toolbox, and as the nearest fisheye OCamCalib and the FOV model.
 

@@ -62,7 +62,7 @@ class _Command(options.Command):
     help="The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
 )
 @estimation_options(files=False)
-@plot_option("the cameras and the boards in space")
+@plot_option("the cameras and the boards in space, and what pairs of cameras see together,")
 @html_option
 @options.lean
 @options.summary

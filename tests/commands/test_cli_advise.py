@@ -18,10 +18,10 @@ from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, read_
 from neurocal_cli.calibration.advice import (
     Candidate,
     _Known,
-    _target,
     advise,
     candidates,
     pixel_changes,
+    points_of_target,
     view_information,
     worst_std,
 )
@@ -57,7 +57,7 @@ def advised_over_random(seed: int) -> float:
 
 def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
     """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
-    known, world = _Known.of(calibration), _target(calibration)
+    known, world = _Known.of(calibration), points_of_target(calibration)
     told = [view_information(known.camera, known.free, view.pose, world) for view in views]
     return known.worst(), known.worst(np.sum(told, axis=0))
 

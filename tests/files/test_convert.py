@@ -125,7 +125,7 @@ def test_a_chain_of_four_cameras_goes_through_kalibr_colmap_and_mrcal(tmp_path: 
             same_pose(pose, expected)
     assert len(written(given, "mrcal", tmp_path / "mrcal")) == 4
     with pytest.raises(InputError, match="holds 2 cameras at most, and there are 4"):
-        adapt_cameras(given, FORMATS["opencv"], force=True)
+        adapt_cameras(given, FORMATS["ros"], force=True)
 
 
 @settings(max_examples=30, deadline=None)

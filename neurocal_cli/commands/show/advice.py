@@ -9,9 +9,10 @@ import numpy as np
 
 from neurocal_cli.calibration.advice import Advice, Candidate
 from neurocal_cli.calibration.calibration import Calibration, Verdict
+from neurocal_cli.calibration.rig.advice import RigAdvice
 from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
-from neurocal_cli.commands.show.text import number_or_none
+from neurocal_cli.commands.show.text import number_or_none, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,22 +66,58 @@ def _px(value: float) -> str:
     return f"{value:.3g} px" if value < float("inf") else "unknown, as the views do not determine the camera"
 
 
+def rig_advice_lines(advice: RigAdvice) -> list[str]:
+    """A line for each view that ties two cameras of a rig."""
+    unit = printable(advice.unit)
+    lines = [
+        "std of where one camera sees what another one sees, of the weakest pair: "
+        f"{100 * advice.share:.2g} % of the distance of the targets"
+    ]
+    for number, tie in enumerate(advice.views, start=1):
+        first, second = map(printable, tie.cameras)
+        lines.append(
+            f"{number}. {first} and {second}: in the image of {first} {_described(tie.view)}: "
+            f"{tie.before:.3g} -> {tie.after:.3g} {unit}"
+        )
+    return lines
+
+
+def rig_advice_json(advice: RigAdvice) -> dict[str, Any]:
+    """The same as values for JSON."""
+    return {
+        "weakest_share": number_or_none(advice.share),
+        "unit": advice.unit,
+        "views": [
+            {
+                "cameras": list(tie.cameras),
+                **_view_json(tie.view),
+                "std": number_or_none(tie.before),
+                "std_after": number_or_none(tie.after),
+            }
+            for tie in advice.views
+        ],
+    }
+
+
+def _view_json(view: Candidate) -> dict[str, Any]:
+    return {
+        "position": view.position.tolist(),
+        "width": view.width,
+        "tilt_deg": view.tilt,
+        "nearer_side_deg": view.way,
+        "roll_deg": view.roll,
+        "rotation": view.pose.R.tolist(),
+        "translation": view.pose.t.tolist(),
+        "outline": view.outline.tolist(),
+    }
+
+
 def advice_json(advice: Advice) -> dict[str, Any]:
     """The advice as values for JSON."""
     return {
         "worst_px": number_or_none(advice.before),
         "views": [
-            {
-                "position": view.position.tolist(),
-                "width": view.width,
-                "tilt_deg": view.tilt,
-                "nearer_side_deg": view.way,
-                "roll_deg": view.roll,
-                "rotation": view.pose.R.tolist(),
-                "translation": view.pose.t.tolist(),
-                "outline": view.outline.tolist(),
-                "worst_px": number_or_none(after),
-            }
+            {**_view_json(view), "worst_px": number_or_none(after)}
             for view, after in zip(advice.views, advice.after, strict=True)
         ],
     }

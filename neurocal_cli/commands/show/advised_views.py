@@ -10,9 +10,11 @@ import numpy as np
 
 from neurocal_cli.calibration.advice import Advice, Candidate
 from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.advice import RigAdvice
+from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.commands.show.camera_panels import outline_of
-from neurocal_cli.commands.show.figure import ACCENT, INK, picture, style
+from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +37,16 @@ def draw_advice(advice: Advice, calibration: Calibration, kind: str = "png") -> 
     views = [(view, f"then {after:.3g} px") for view, after in zip(advice.views, advice.after, strict=True)]
     title = f"Views to take next; now {advice.before:.3g} px. The thick side is near."
     return draw_views(calibration, views, title, kind)
+
+
+def draw_rig_advice(advice: RigAdvice, rig: Rig, kind: str = "png") -> bytes:
+    """Draw each view of the first advised pair of cameras, in the image of the first of them."""
+    cameras = advice.views[0].cameras
+    ties = [tie for tie in advice.views if tie.cameras == cameras]
+    (first, second), unit = map(plain, cameras), plain(advice.unit)
+    views = [(tie.view, f"then {tie.after:.3g} {unit}") for tie in ties]
+    title = f"Views for {first} and {second}, in the image of {first}; now {ties[0].before:.3g} {unit}"
+    return draw_views(rig.cameras[cameras[0]], views, title, kind)
 
 
 def draw_views(

@@ -281,7 +281,7 @@ def draw_poses(
             space.text(*_turned(outermost[None])[0], label, fontsize=8, color=INK, fontweight="bold")
     size = _SIZE * max(float(np.linalg.norm(np.ptp(np.vstack(extent), axis=0))), 1e-300)
     for number, (camera, pose) in enumerate([(calibration.camera, _HERE), *others]):
-        corners = (_frustum(camera, size) - pose.t) @ pose.R
+        corners = (frustum(camera, size) - pose.t) @ pose.R
         extent.append(corners)
         centre, *ends = _turned(corners)
         label = names[number] if names else "camera" if not others else ""
@@ -330,7 +330,7 @@ def outline_of(world: Array) -> Array:
         return world
 
 
-def _frustum(camera: Camera, size: float) -> Array:
+def frustum(camera: Camera, size: float) -> Array:
     """Centre and corners of a camera's frustum in its own frame."""
     width, height = camera.image_size or (2 * camera.intrinsics.u0, 2 * camera.intrinsics.v0)
     pixels = np.column_stack([_CORNERS * (width, height), np.ones(4)])

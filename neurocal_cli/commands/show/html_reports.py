@@ -36,6 +36,7 @@ from neurocal_cli.commands.show.html_page import (
     verdict_block,
 )
 from neurocal_cli.commands.show.plane_report import plane_table
+from neurocal_cli.commands.show.rig_panels import edge_coverage, rig_in_space
 from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
 from neurocal_cli.commands.show.rig_report import pose_rows
 from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
@@ -107,11 +108,17 @@ def rig_page(rig: Rig, origin: Origin) -> str:
             for camera in cameras
         ]
         frames.append([printable(name), *errors])
-    edges = [["cameras", "common frames", f"distance [{printable(rig.unit)}]"]]
+    edges = [["cameras", "common frames", "cover of their images", f"distance [{printable(rig.unit)}]"]]
+    covered, place = edge_coverage(rig).covered, {name: k for k, name in enumerate(cameras)}
     for (a, b), count in rig.edges.items():
-        pair = rig.pair(a, b)
+        pair, i, j = rig.pair(a, b), place[a], place[b]
         distance = with_std(pair.baseline, pair.std["baseline"])
-        edges.append([f"{printable(a)} - {printable(b)}", str(count), distance])
+        cover = f"{covered[i, j]:.0%}, {covered[j, i]:.0%}"
+        edges.append([f"{printable(a)} - {printable(b)}", str(count), cover, distance])
+    space = figure(
+        rig_in_space(rig),
+        f"The cameras and the boards of all frames, seen from above and from the right of {first}.",
+    )
     left_out = [["view", "reason"]]
     left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
     parts = [
@@ -119,6 +126,7 @@ def rig_page(rig: Rig, origin: Origin) -> str:
         verdict_block(rig.verdict),
         section(f"The poses of the cameras, relative to {first}", "".join(map(table, pose_rows(rig)))),
         section("The cameras", "".join(map(table, named_camera_rows(rig)))),
+        section("The rig in space", f'<div class="figures">{space}</div>' if space else ""),
         section("Pairs of cameras", table(edges, sortable=True)),
         section("Frames", table(frames, sortable=True)),
         section("Views left out of the rig", table(left_out)),

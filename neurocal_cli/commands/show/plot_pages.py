@@ -12,8 +12,9 @@ from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.space_error import SpaceError
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of, targets_of
+from neurocal_cli.commands.show.camera_panels import Subject, draw_poses, panels_of
 from neurocal_cli.commands.show.figure import ACCENT, INK, picture, plain, style
+from neurocal_cli.commands.show.rig_panels import draw_edges, targets_of_rig
 from neurocal_cli.errors import plural
 
 if TYPE_CHECKING:
@@ -67,20 +68,16 @@ def draw_stereo(rig: StereoRig, kind: str = "png", panel: str | None = None) -> 
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw the cameras of a rig, and the targets of all frames as one of the cameras saw them, in space."""
-    of_frames = {next(iter(views.items())) for views in rig.frames.values()}
-    targets = [
-        target
-        for name, camera in rig.cameras.items()
-        for target in targets_of(camera, rig.poses[name])
-        if (name, target[0]) in of_frames
-    ]
+    """Draw the cameras of a rig with the targets of all frames in space, and what pairs see together."""
     others = [(rig.cameras[name].camera, pose) for name, pose in list(rig.poses.items())[1:]]
-
-    def draw(axes: Axes) -> None:
-        draw_poses(axes, rig.cameras[rig.first], others, tuple(rig.cameras), targets)
-
-    return _alone("poses", draw, kind)
+    panels: dict[str, Draw] = {
+        "poses": lambda axes: draw_poses(
+            axes, rig.cameras[rig.first], others, tuple(rig.cameras), targets_of_rig(rig)
+        ),
+        "edges": lambda axes: draw_edges(axes, rig),
+    }
+    title = f"{len(rig.cameras)} cameras, {plural(len(rig.frames), 'frame')}, rms {rig.rmse_px:.4g} px"
+    return _page([list(panels)], (1,), panels, title, (2 * _PANEL[0], _PANEL[1]), kind)
 
 
 def _with_side(side: str, draw: Draw) -> Draw:

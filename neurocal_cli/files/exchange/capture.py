@@ -85,17 +85,42 @@ def _anipose_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": toml_text({**tables, "metadata": {"adjusted": False}})}
 
 
+def _caliscope_text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    tables = {}
+    for k, (camera, pose) in enumerate(zip(cameras.cameras, cameras.mounted, strict=True)):
+        fisheye = camera.distortion.model == "fisheye"
+        tree = (_ANIPOSE_FISHEYE if fisheye else _ANIPOSE).tree(camera)
+        tree.pop("name", None)
+        placed = {"translation": pose.t.tolist(), "rotation": pose.R.tolist()}
+        own = {"cam_id": k, "rotation_count": 0, "ignore": False, "fisheye": fisheye}
+        tables[f"cameras.{k}"] = {**own, **tree, **placed}
+    return {"": toml_text(tables)}
+
+
 ANIPOSE = Format(
     "anipose",
     ("none", "plumb_bob", "fisheye"),
     _anipose_text,
     lambda document: bool(_anipose_parts(document)),
     _read_anipose,
-    files="calibration.toml of anipose, freemocap, caliscope",
+    files="calibration.toml of anipose, freemocap",
     skew=True,
     most_cameras=99,
     needs_size=True,
     rig="`rotation, translation` from the world to each camera",
+)
+CALISCOPE = Format(
+    "caliscope",
+    ("none", "plumb_bob", "fisheye"),
+    _caliscope_text,
+    lambda document: "cameras" in document.tree and bool(_anipose_parts(document)),
+    _read_anipose,
+    files="camera_array.toml of caliscope",
+    skew=True,
+    most_cameras=99,
+    metres=True,
+    needs_size=True,
+    rig="`rotation, translation` [m] from the world to each camera",
 )
 
 # BoofCV, also its stereo rigs: ``rightToLeft`` maps the right camera's frame to the left one's.

@@ -23,6 +23,7 @@ from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vecto
 from neurocal_cli.files.exchange.dictionary_texts import entries, json_text, npz_bytes, opencv_text
 from neurocal_cli.files.exchange.document import UNKNOWN, Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.multiview import is_multiview, multiview_cameras
 from neurocal_cli.files.tree_fields import Field
 
 _DEEPEST = 4  # mappings within each other
@@ -53,6 +54,11 @@ def read(document: Document) -> CameraSet:
 
 def from_tree(root: Field, document: Document) -> CameraSet:
     """Read one camera or two from a dictionary, or those in it that have poses of their own."""
+    if is_multiview(root):
+        several = multiview_cameras(root)
+        for camera in several.cameras:
+            note_size(camera, document)
+        return several
     if (rig := _posed(root, document)) is not None:
         return rig
     root = _within(root, document.notes)
@@ -268,7 +274,8 @@ OPENCV = Format(
     read,
     files="cv2.FileStorage: YAML, XML, JSON, and what people save with its names",
     poses=True,
-    rig="`R, T`: `X_2 = R X_1 + T`",
+    most_cameras=99,
+    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
 )
 JSON = Format(
     "JSON",
@@ -277,7 +284,8 @@ JSON = Format(
     files="dictionary of the same names",
     skew=True,
     poses=True,
-    rig="`R, T`: `X_2 = R X_1 + T`",
+    most_cameras=99,
+    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
 )
 NPZ = Format(
     "NumPy",
@@ -286,5 +294,6 @@ NPZ = Format(
     files=".npz; .npy of the matrix, and of the coefficients",
     skew=True,
     poses=True,
-    rig="`R, T`: `X_2 = R X_1 + T`",
+    most_cameras=99,
+    rig="`R, T`: `X_2 = R X_1 + T`; of three cameras and more `rvecs, Ts`: `X_k = R X_0 + T`",
 )

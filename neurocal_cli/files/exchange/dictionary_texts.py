@@ -13,13 +13,16 @@ import numpy as np
 from neurocal_cli.calibration.rig.rectification import rectify
 from neurocal_cli.camera.opencv_names import to_ros
 from neurocal_cli.files.exchange.camera_set import CameraSet, to_vector
+from neurocal_cli.files.exchange.multiview import multiview_entries
 from neurocal_cli.files.exchange.neurocal import as_stereo
 from neurocal_cli.files.file_storage import storage_text
 from neurocal_cli.files.yaml_text import nested
 
 
 def entries(cameras: CameraSet) -> dict[str, Any]:
-    """Make the dictionary of one or two cameras: texts, numbers, lists of names and matrices."""
+    """Make the dictionary of cameras: texts, numbers, lists of names and matrices."""
+    if len(cameras.cameras) > 2:
+        return multiview_entries(cameras)
     first = cameras.cameras[0]
     tree: dict[str, Any] = {}
     sides = ("",) if len(cameras.cameras) == 1 else ("1", "2")
@@ -55,7 +58,7 @@ def entries(cameras: CameraSet) -> dict[str, Any]:
 def opencv_text(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
     """Write the dictionary for ``cv2.FileStorage``."""
     tree = entries(cameras)
-    if any(camera.distortion.model == "fisheye" for camera in cameras.cameras):
+    if "Ks" not in tree and any(camera.distortion.model == "fisheye" for camera in cameras.cameras):
         tree["fisheye_model"] = 1  # as in OpenCV's calibration sample
     return {"": storage_text(tree, ending)}
 

@@ -1,0 +1,222 @@
+"""Choose the views that tie the weakest pairs of cameras of a rig, one after the other.
+
+The covariance of the relative pose of two cameras gives the standard deviation of where the one sees what the
+other sees, at the distance of the boards so far. The pair that knows it least, over that distance, is the
+weakest. Of the views that show the whole target to the one camera and most of it to the other, that one is
+chosen after which this standard deviation is smallest. It needs no observed pixels: a view adds the normal
+matrix of both cameras and their poses, with the pose of the target eliminated.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration.advice import Candidate, candidates, points_of_target
+from neurocal_cli.calibration.calibration import Calibration
+from neurocal_cli.calibration.rig.adjust import RigFit
+from neurocal_cli.calibration.rig.assessment import fitted
+from neurocal_cli.calibration.rig.point_moves import shared_covariance
+from neurocal_cli.calibration.rig.rig import Rig
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.camera.geometry import Array, cross_matrix, median
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
+
+_MOST = 0.5  # least share of the target's points that the second camera has to see
+_FACING = 0.2  # least cosine between the normal of a flat target and the line of sight of the second camera
+_FLAT = 1e-6  # greatest ratio of thickness to size of a flat target
+
+
+@frozen_dataclass(eq=False)
+class TyingView:
+    """A view that ties two cameras."""
+
+    cameras: tuple[str, str]
+    view: Candidate  # in the image of the first of them
+    before: float  # standard deviation of where the second sees what the first sees [world unit]
+    after: float  # the same with this view
+
+
+@frozen_dataclass(eq=False)
+class RigAdvice:
+    """Views to take next, in this order."""
+
+    views: tuple[TyingView, ...]
+    unit: str
+    share: float  # standard deviation of the weakest pair so far, over the distance of the boards
+
+
+def advise_rig(rig: Rig, count: int = 3) -> RigAdvice:
+    """Choose views greedily, each for the pair of cameras that is the weakest then.
+
+    Raises
+    ------
+    InputError
+        The rig has no points, a camera has no image size, or no view shows the target to two cameras.
+    """
+    if not rig.frames or not all(len(camera.points) for camera in rig.cameras.values()):
+        raise InputError("the rig holds no points; give a file that was not written with --lean")
+    if any(camera.image_size is None for camera in rig.cameras.values()):
+        raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+    fit = fitted(rig)
+    names, covariance = list(rig.cameras), shared_covariance(fit)
+    pairs = [_Pair(rig, fit, names.index(a), names.index(b)) for a, b in rig.edges]
+    views: list[TyingView] = []
+    weakest = max(pairs, key=lambda pair: pair.share(covariance))
+    share = weakest.share(covariance)
+    for _ in range(count):
+        for pair in sorted(pairs, key=lambda pair: -pair.share(covariance)):
+            if pair.views:
+                break
+        else:
+            raise InputError("no view shows the whole target to one camera and most of it to another")
+        own = covariance[np.ix_(pair.columns, pair.columns)]
+        gains = [_gain(own, information) for information in pair.informations]
+        after = [pair.std(own - own @ gain @ own) for gain in gains]
+        best = int(np.argmin(after))
+        cameras = names[pair.indices[0]], names[pair.indices[1]]
+        views.append(TyingView(cameras, pair.views[best], pair.std(own), after[best]))
+        covariance = covariance - covariance[:, pair.columns] @ gains[best] @ covariance[pair.columns]
+    return RigAdvice(tuple(views), rig.unit, share)
+
+
+def _gain(covariance: Array, information: Array) -> Array:
+    """By which a covariance C falls with more information, C - C G C; some unknowns may be known."""
+    return np.asarray(information @ np.linalg.inv(np.eye(len(covariance)) + covariance @ information))
+
+
+@frozen_dataclass(eq=False)
+class _Side:
+    """One of two cameras."""
+
+    calibration: Calibration
+    camera: Camera
+    pose: Pose  # X_c = R X_rig + t
+    lens: NDArray[np.intp]  # columns of A's entries and the coefficients among the shared unknowns
+    mounted: NDArray[np.intp]  # (6,) or, for the first camera of the rig, (0,) columns of its pose
+    pixel_scale: float
+    sigma: float  # noise [px]
+    square: bool
+
+    def shown(self, in_rig: Array) -> NDArray[np.bool_]:
+        """(N,) which points (N, 3) in the rig are in the image."""
+        camera, points = self.camera, self.pose.to_camera(in_rig)
+        assert camera.image_size is not None
+        pixels, fine = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels <= np.array(camera.image_size) - 1)).all(axis=1)
+        return np.asarray(inside & fine & camera.sees(points))
+
+    def derivatives(self, in_rig: Array, unit: float) -> tuple[Array, Array]:
+        """Of pixels over their noise, by the camera (2 N, k) and by a motion of the target (2 N, 6)."""
+        by_lens, by_point = self.camera.project_jacobian(self.pose.to_camera(in_rig))
+        if self.square:
+            by_lens[:, :, 0] += by_lens[:, :, 2]
+        by_lens[:, :, :5] *= self.pixel_scale
+        by_target = by_point @ self.pose.R @ _moved(in_rig, 1.0)
+        parts = [by_lens]
+        if len(self.mounted):
+            parts.append(by_point @ _moved(in_rig @ self.pose.R.T, unit))
+        own = np.concatenate(parts, axis=2)
+        return own.reshape(-1, own.shape[2]) / self.sigma, by_target.reshape(-1, 6) / self.sigma
+
+
+class _Pair:
+    """Two cameras of a rig, by their index."""
+
+    def __init__(self, rig: Rig, fit: RigFit, first: int, second: int) -> None:
+        state, problem, columns = fit.state, fit.problem, fit.state.columns
+        cameras = list(rig.cameras.values())
+        self.indices, self.unit, self.variance = (first, second), problem.unit, fit.variance
+        self.sides = [
+            _Side(
+                cameras[side],
+                cameras[side].camera,
+                list(rig.poses.values())[side],
+                columns.cameras[side],
+                columns.rigs[side],
+                problem.observations[side].pixel_scale,
+                problem.observations[side].pixel_scale / float(np.sqrt(problem.observations[side].weight)),
+                state.cameras[side].square,
+            )
+            for side in self.indices
+        ]
+        self.columns = np.concatenate([part for side in self.sides for part in (side.lens, side.mounted)])
+        self.world = points_of_target(self.sides[0].calibration)
+        seen = np.zeros(len(problem.scale), dtype=bool)
+        for side in self.indices:
+            seen[problem.observations[side].view] = True
+        middles = (state.view_t * problem.scale[:, None])[seen & problem.together]
+        self.middle = np.array([median(column) for column in middles.T])  # of the boards, in the rig
+        self.distance = float(np.linalg.norm(self.sides[1].pose.to_camera(self.middle[None])))
+
+    @cached_property
+    def views(self) -> list[Candidate]:
+        """Views of the target by the first camera that the second one sees, too."""
+        return [view for view in candidates(self.sides[0].calibration) if self._is_seen(view)]
+
+    def share(self, covariance: Array) -> float:
+        """The standard deviation over the distance of the boards, by the covariance of all unknowns."""
+        return self.std(covariance[np.ix_(self.columns, self.columns)]) / self.distance
+
+    def std(self, own: Array) -> float:
+        """Largest std of where the second camera sees what the first one sees, by their own covariance."""
+        first, second = self.sides
+        R = second.pose.R @ first.pose.R.T
+        J = _moved(self.middle[None] @ second.pose.R.T, self.unit)[0]  # by a motion of the second camera
+        parts = [
+            np.zeros((3, len(first.lens))),
+            -J @ np.kron(np.eye(2), R),
+            np.zeros((3, len(second.lens))),
+            J,
+        ]
+        kept = [
+            parts[0],
+            *parts[1:2] * bool(len(first.mounted)),
+            parts[2],
+            *parts[3:] * bool(len(second.mounted)),
+        ]
+        by_own = np.concatenate(kept, axis=1)
+        return float(np.sqrt(max(np.linalg.eigvalsh(by_own @ own @ by_own.T)[-1], 0.0)))
+
+    @cached_property
+    def informations(self) -> list[Array]:
+        """Of each of the views: information on the unknowns of both cameras, without the target's pose."""
+        return [self._information(view) for view in self.views]
+
+    def _information(self, view: Candidate) -> Array:
+        in_rig, by_own, by_target = self._in_rig(view), [], []
+        for side in self.sides:
+            own, target = side.derivatives(in_rig[side.shown(in_rig)], self.unit)
+            by_own.append(own)
+            by_target.append(target)
+        (a, b), P = by_own, np.concatenate(by_target)
+        J = np.block([[a, np.zeros((len(a), b.shape[1]))], [np.zeros((len(b), a.shape[1])), b]])
+        C = J.T @ P
+        return np.asarray(J.T @ J - C @ np.linalg.pinv(P.T @ P, hermitian=True) @ C.T) / self.variance
+
+    def _in_rig(self, view: Candidate) -> Array:
+        pose = self.sides[0].pose
+        return np.asarray((view.pose.to_camera(self.world) - pose.t) @ pose.R)
+
+    def _is_seen(self, view: Candidate) -> bool:
+        in_rig = self._in_rig(view)
+        if self.sides[1].shown(in_rig).mean() < _MOST:
+            return False
+        _, size, axes = np.linalg.svd(in_rig - in_rig.mean(axis=0), full_matrices=False)
+        if size[2] > _FLAT * size[0]:
+            return True
+        # Both cameras have to be on the side of a flat target that the first one sees.
+        lines = [in_rig.mean(axis=0) + side.pose.R.T @ side.pose.t for side in self.sides]
+        first, second = (float(axes[2] @ line) / float(np.linalg.norm(line)) for line in lines)
+        return first * second > 0 and abs(second) > _FACING
+
+
+def _moved(points: Array, unit: float) -> Array:
+    """(N, 3, 6) derivatives of points by a turn about the origin and by a shift in some unit."""
+    shift = np.broadcast_to(unit * np.eye(3), (len(points), 3, 3))
+    return np.concatenate([-cross_matrix(points), shift], axis=2)
