@@ -77,7 +77,7 @@ def calibration_report(calibration: Calibration) -> str:
 
 
 def parameter_rows(calibration: Calibration) -> Table:
-    """Rows of the intrinsic parameters, and of the pose if there is only one view."""
+    """Rows of the intrinsic parameters, and of pose and position if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
     for name, value in parameters(calibration).items():
         if name not in rich_lens.NAMES:
@@ -86,12 +86,24 @@ def parameter_rows(calibration: Calibration) -> Table:
     if calibration.distortion_model == "rich":
         rows.append(_displacement_row(calibration))
     if len(calibration.views) == 1:
-        (view,) = calibration.views.values()
+        ((label, view),) = calibration.views.items()
         values = [*view.pose.euler, *view.pose.t]
         for name, value in zip(POSE_NAMES, values, strict=True):
             unit = "rad" if name.startswith("R") else printable(calibration.unit)
             rows.append(_parameter_row(name, unit, float(value), view.std[name], view.fixed))
+        if not view.fixed and len(calibration.points):
+            for name, value, std in _position(calibration, label):
+                own = labelled(f"camera's {name}", printable(calibration.unit))
+                rows.append([own, *rounded(value, std), ""])
     return rows
+
+
+def _position(calibration: Calibration, view: str) -> list[tuple[str, float, float]]:
+    """X, Y and Z of the camera in the world, with their std: it is known where the origin is far away, too."""
+    found = calibration.position(view)
+    if found.covariance is None:
+        return []
+    return list(zip("XYZ", found.point.tolist(), found.std.tolist(), strict=True))
 
 
 def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
@@ -179,8 +191,22 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
             for name, second in calibration.second_poses.items()
         },
         "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
+        "positions": _positions_json(calibration),
         "target": target_json(calibration.target, calibration.unit),
         **outcome_json(calibration),
+    }
+
+
+def _positions_json(calibration: Calibration) -> dict[str, Any]:
+    """Of a single view: the position of the camera in the world, with its std."""
+    if len(calibration.views) != 1 or not len(calibration.points):
+        return {}
+    return {
+        view: {
+            name: {"value": value, "std": number_or_none(std)}
+            for name, value, std in _position(calibration, view)
+        }
+        for view in calibration.views
     }
 
 
