@@ -99,7 +99,7 @@ def parameter_rows(calibration: Calibration) -> Table:
 
 
 def _position(calibration: Calibration, view: str) -> list[tuple[str, float, float]]:
-    """X, Y and Z of the camera in the world, with their std: it is known where the origin is far away, too."""
+    """X, Y and Z of the camera in the world, with their std."""
     found = calibration.position(view)
     if found.covariance is None:
         return []
