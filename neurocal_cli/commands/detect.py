@@ -164,6 +164,7 @@ def detect(
       neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
       neurocal board --board charuco:8x6:28:21 --dpi 100 -o print.png
       neurocal detect print.png --board charuco:8x6:28:21 -o points.csv
+      neurocal detect print.png --board charuco:8x6:28:21 --board-name A -o a.csv
     """  # noqa: D301 - as in the group
     preparation.check_one_stdin(*images, board.file)
     preparation.check_summary(as_json, output)
