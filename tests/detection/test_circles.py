@@ -79,6 +79,14 @@ def test_circles_around_found_ones_are_measured_too() -> None:
     assert _missed(plane, every[:8])[:, 1].max() == 2  # not far from these
 
 
+def test_a_part_that_looks_the_same_after_a_turn_is_refused() -> None:
+    plane = plane_of(ASYMMETRIC)
+    assert isinstance(plane, CirclePlane)
+    seen = plane.spread(plane.midpoint_grid()[plane.cols :]) * 30.0 + 50
+    with pytest.raises(NoBoardError, match="which may be several parts of the board"):
+        place_circles(plane, Blobs(seen, np.full(len(seen), 300.0)))
+
+
 def test_a_hidden_circle_is_left_out() -> None:
     scene = marked_scene(plane_of(ASYMMETRIC), 3, square=22.0)
     (u, v) = taken(scene, 3).truth.planes[0].vertices[3, 1]

@@ -187,7 +187,8 @@ def _placed(
     # Those of a board that looks the same after a turn contain the same places, turned about its middle.
     whole = len(index) == plane.cols * plane.rows
     turns = {tuple(map(tuple, np.unique(one, axis=0))) for one in names}
-    if not whole and len(turns) > 1 and not _are_turns(plane, names):
+    alike = len(turns) == 1 or _are_turns(plane, names)
+    if not whole and not (alike and _is_symmetric(plane)):
         raise NoBoardError(
             f"the image shows {len(index)} circles, which may be several parts of the board; show all of it"
         )
@@ -225,6 +226,13 @@ def _are_turns(plane: CirclePlane, names: list[NDArray[np.int64]]) -> bool:
     middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
     radius = np.hypot(*(places[0] - middle).T)
     return all(np.allclose(np.hypot(*(one - middle).T), radius) for one in places[1:])
+
+
+def _is_symmetric(plane: CirclePlane) -> bool:
+    """Whether the whole board looks the same after half a turn; else only a part of it does."""
+    places = plane.spread(plane.midpoint_grid())
+    turned = places.min(axis=0) + places.max(axis=0) - places
+    return {tuple(one) for one in places.tolist()} == {tuple(one) for one in turned.tolist()}
 
 
 def _rightwards(place: NDArray[np.int64], centre: Array) -> float:
