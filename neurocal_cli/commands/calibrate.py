@@ -16,6 +16,7 @@ _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 @click.command(cls=options.Command)
 @options.points
 @estimation_options()
+@options.board_of_corners
 @options.camera_name
 @panel_option("the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS)
 @html_option
@@ -25,6 +26,7 @@ _STRAIGHTEN = "undistort {} IMAGE... -o DIR"
 def calibrate(
     points: tuple[str, ...],
     estimation: Estimation,
+    board: str | None,
     camera_name: str,
     plots: Plots,
     html: str | None,
@@ -74,14 +76,17 @@ def calibrate(
           -o linear.yaml
       neurocal calibrate sample_data/points.csv --trainer backprop \\
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          --points vertices | neurocal convert - --to mrcal -o corners.vnl
+      neurocal calibrate corners.vnl --board chessboard:9x6:25 -o vnl.yaml
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     estimation.check()
     inputs = *points, estimation.intrinsics, estimation.extrinsics
     options.check_camera_name(camera_name)
-    preparation.check(inputs, (output, html), plots=files_of(plots), as_json=as_json)
-    given, arguments = estimation.prepare(preparation.given_points(*points))
+    preparation.check((*inputs, board), (output, html), plots=files_of(plots), as_json=as_json)
+    given, arguments = estimation.prepare(preparation.given_points(*points, board=board))
 
     from neurocal_cli.calibration.calibrate import calibrate as learn
     from neurocal_cli.commands.show.camera_report import calibration_json, calibration_report

@@ -378,20 +378,26 @@ class BoardOptions:
             raise UsageError(f"--unit is {unit!r}, which cannot be written; name it in a word, such as mm")
 
 
+_BOARD_FILE = (
+    "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
+    "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
+    "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
+    "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
+    "and ROWS count squares, tags or circles; of a chessboard, inner vertices."
+)
+
+
+def board_of_corners(command: F) -> F:
+    """Add ``--board``, for points of other programs without their places, a command's keyword ``board``."""
+    what = f"Board of corners whose file does not have their places, such as mrcal's. {_BOARD_FILE}"
+    return path("--board", "BOARD.yaml", what)(command)
+
+
 def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     """Add the options of `BoardOptions`, a command's keyword ``board``."""
     size = partial(count, without="none", least=2, most=1000)
     added = (
-        path(
-            "--board",
-            "BOARD.yaml",
-            "Board file, of neurocal, Kalibr, OpenCV, PhotonVision or caliscope, or a board in short: "
-            "chessboard:COLSxROWS:SQUARE, charuco:COLSxROWS:SQUARE:MARKER[:DICTIONARY], "
-            "aprilgrid:COLSxROWS:TAG:SPACING[:FAMILY], circles:COLSxROWS:DISTANCE[:DIAMETER], "
-            "asymmetric_circles:COLSxROWS:DISTANCE[:DIAMETER]. COLS "
-            "and ROWS count squares, tags or circles; of a chessboard, inner vertices.",
-            to="file",
-        ),
+        path("--board", "BOARD.yaml", _BOARD_FILE, to="file"),
         size("--cols", "C", "Number of inner vertices in a row of the board."),
         size("--rows", "R", "Number of rows of inner vertices."),
         number(

@@ -91,19 +91,26 @@ def compute_in_one_thread() -> None:
         os.environ.setdefault(name, "1")
 
 
-def given_points(*names: str) -> Correspondences:
-    """Read points, also those of other programs with their places, and report rows that were left out."""
+def given_points(*names: str, board: str | None = "") -> Correspondences:
+    """Read points, also those of other programs, and report rows that were left out.
+
+    Corners without their places need a board, its file or a short form; "" is that of a command without one.
+    """
     from neurocal_cli.files.points_csv import POINTS, ids_at_two_places, read_points
     from neurocal_cli.files.reading import repeatable_stdin
 
     notes: list[str] = []
     with repeatable_stdin() if "-" in names else nullcontext():
         points = None
-        if not names[0].lower().endswith((".csv", ".txt", ".tsv")):
+        if board or not names[0].lower().endswith((".csv", ".txt", ".tsv")):
+            from neurocal_cli.commands.options import BoardOptions
             from neurocal_cli.files.exchange.corners import read_corners
 
-            advice = POINTS.instead.removeprefix("; ")
-            points = read_corners(names, None, notes, what="points", advice=advice)
+            advice = "give --board chessboard:COLSxROWS:SQUARE"
+            if board == "":
+                advice = POINTS.instead.removeprefix("; ")
+            target = BoardOptions(board, None, None, None, None).read() if board else None
+            points = read_corners(names, target, notes, what="points", advice=advice)
         if points is None:
             points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))

@@ -318,6 +318,19 @@ def test_calibrate_takes_the_points_that_convert_takes(
     assert "missing from the header" not in result.stderr
 
 
+def test_calibrate_takes_corners_without_places_with_their_board(
+    real_files: RealFiles, tmp_path: Path
+) -> None:
+    (path,) = real_files("other_programs/corners_missing.vnl")
+    words = "calibrate", path, "--method", "linear"
+    refused = run(*words)
+    assert refused.exit_code == 1
+    assert "not their places on the board; give --board chessboard:COLSxROWS:SQUARE" in refused.stderr
+    result = run(*words, "--board", "chessboard:9x6:25", "-o", tmp_path / "camera.yaml")
+    assert result.exit_code in (0, 3), result.stderr
+    assert "378 points" in result.stderr
+
+
 def test_a_file_of_a_camera_and_points_gives_either(real_files: RealFiles) -> None:
     (path,) = real_files("other_programs/all_in_one.npz")
     result = run("convert", path, "--to", "json")
