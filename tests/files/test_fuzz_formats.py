@@ -131,7 +131,7 @@ def test_damaged_files_of_all_formats_are_read_or_refused(share: float, tmp_path
     given = [contents(target, cameras) for target in READ for _, cameras in sets(target)]
     given += [{"": text.encode()} for text in DIALECTS]
     kept = [*(content for content, *_ in MET.values()), *(content for content, *_ in RIGS.values())]
-    given += [{"": (one if isinstance(one, str) else json.dumps(one)).encode()} for one in kept]
+    given += [{"": (one if isinstance(one, str) else json.dumps(one, indent=1)).encode()} for one in kept]
     for trial in range(int(share * COUNT)):
         rng = np.random.default_rng([trial, 45])
         files = dict(given[int(rng.integers(len(given)))])

@@ -97,7 +97,10 @@ def _camera(field: Field, name: str) -> Camera:
     distortion = Distortion(_MODELS[model, lens], np.concatenate([own, k]))
     size = None
     if "resolution" in field:
-        width, height = (entry.integer(1) for entry in field["resolution"].items())
+        width, height = (
+            Field(side, field.source, f"{name}.resolution").integer(1)
+            for side in field["resolution"].array(2).tolist()
+        )
         size = width, height
     return Camera(Intrinsics(fu, fv, pu, pv), distortion, size, name)
 

@@ -187,7 +187,7 @@ _ALICEVISION = CameraKeys(
 
 
 def _read_alicevision(document: Document) -> CameraSet:
-    version = [int(word) for word in document.root["version"].texts()]
+    version = document.root["version"].array(3).astype(int).tolist()
     cameras: dict[str, Camera] = {}
     for entry in document.root["intrinsics"].items():
         size = int(entry["width"].number()), int(entry["height"].number())

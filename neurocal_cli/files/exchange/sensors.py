@@ -69,6 +69,8 @@ _OAK = CameraKeys(
 def _read_oak(document: Document) -> CameraSet:
     parts = {}
     for entry in document.root["cameraData"].items():
+        if not isinstance(entry.value, list) or len(entry.value) != 2:
+            entry.fail("a socket and its camera")
         socket, camera = entry.items()
         if np.any(camera["intrinsicMatrix"].array(3, 3)):
             parts[socket.integer()] = camera
