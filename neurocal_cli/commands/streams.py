@@ -279,12 +279,13 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     def close(self) -> None:
         """Remove the bar."""
         with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-                self._timer = None
+            timer, self._timer = self._timer, None
             if self._bar is not None:
                 self._bar.stop()
                 self._bar = None
+        if timer is not None:
+            timer.cancel()
+            timer.join()  # a thread that still loads modules when Python ends would crash it
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
