@@ -18,7 +18,7 @@ from neurocal_cli.files.failures import one_line, reading_failures
 from neurocal_cli.files.writing import held_back
 
 _IMAGES = (b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*")  # how PNG, JPEG, BMP and TIFF begin
-_POINTS_HEADER = re.compile(r"\s*(?:#[^\n]*\n\s*)*[^\n:]*\bX[,;\t ]\s*Y[,;\t ]\s*Z\b").match
+_POINTS_HEADER = re.compile(r"\s*(?:#[^\n]*\n\s*)*(?!#)[^\n:]*\bX[,;\t ]\s*Y[,;\t ]\s*Z\b").match
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # must come first, because it begins with the mark of UTF-16
     (b"\x00\x00\xfe\xff", "UTF-32"),
