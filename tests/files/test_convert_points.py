@@ -261,9 +261,8 @@ def test_calibrate_says_what_to_do_with_corners_of_other_programs(tmp_path: Path
     for name in ("corners.npz", "corners.vnl"):
         result = run("calibrate", tmp_path / name)
         assert result.exit_code == 1
-        assert result.stderr.endswith(
-            "neurocal convert --to neurocal makes one of another program's corners\n"
-        )
+        assert "but not their places on the board" in result.stderr
+        assert result.stderr.endswith("give --board chessboard:COLSxROWS:SQUARE\n")
 
 
 def test_the_wrong_board_is_named(tmp_path: Path) -> None:
