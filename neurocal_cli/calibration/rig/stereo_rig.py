@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
-from functools import cached_property
 
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration, Verdict
-from neurocal_cli.calibration.presented import Presented
+from neurocal_cli.calibration.rig.fixed_cameras import FixedCameras
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, cross_matrix
-from neurocal_cli.camera.late_import import late
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.camera.plane_points import PlaneErrors
 
 
 @frozen_dataclass(eq=False)
-class StereoRig(Presented):
+class StereoRig(FixedCameras):
     """Two calibrated cameras on one rig.
 
     Attributes
@@ -77,21 +74,6 @@ class StereoRig(Presented):
             f"of views, rms {self.rmse_px:.4g} px\n"
             f"  baseline {self.baseline:.6g} +- {std:.2g} {self.unit}; see .left, .right and .summary()"
         )
-
-    @cached_property
-    def verdict(self) -> Verdict | None:
-        """Verdict on this rig, computed when it is first read; None without points of its own."""
-        return self.judgement(self) if callable(self.judgement) else self.judgement
-
-    def errors_at(self, distance: float) -> PlaneErrors:
-        """How well points and lengths are triangulated at a distance from the left camera [world unit].
-
-        Of points that two cameras or more see, with the shares of the calibration, which is correlated
-        between all points, and of the noise of the pixels. Raises InputError for a distance at which there
-        are none, or that is not positive, and for a rig without points or image size.
-        """
-        found: PlaneErrors = late("calibration.rig.space_measurement", "errors_at")(self, distance)
-        return found
 
     @property
     def lean(self) -> StereoRig:
