@@ -8,6 +8,7 @@ at their top that needs NumPy, so that ``--help`` is fast.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -16,6 +17,7 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
+from neurocal_cli.commands.screen import HelpContext, wrapped
 from neurocal_cli.commands.streams import (
     NEXT,
     TYPED,
@@ -59,6 +61,8 @@ _SUMMARIES = {
 
 class _LazyGroup(click.Group):
     """A group that imports a command's module only when it is used; a hidden command has no summary."""
+
+    context_class = HelpContext
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_SUMMARIES)
@@ -112,6 +116,9 @@ def _one_line_errors() -> Iterator[None]:
     try:
         yield
         return
+    except click.UsageError as error:  # click shows it, but breaks lines anywhere
+        told = wrapped(f"Error: {error.format_message()}", sys.stderr).removeprefix("Error: ")
+        raise click.UsageError(told, error.ctx) from None
     except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
         raise  # click's own, and a reader that has seen enough
     except KeyboardInterrupt:

@@ -64,6 +64,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
         from neurocal_cli.commands.show.advised_views import draw_advice
 
         write_plot(plot, draw_advice, advice, known)
+        suggest(calibration, "photograph these views, and calibrate from all images again")
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
 

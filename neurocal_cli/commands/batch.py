@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import ProgressBar, complain, note, print_summary, say, warn
+from neurocal_cli.commands.streams import ProgressBar, complain, note, print_summary, say, suggest, warn
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -116,7 +116,8 @@ def batch(
           --against first/summary.csv -o second
       # with the extra fleet:
       # neurocal batch sample_data/fleet.csv --workers 2 -o third
-      # neurocal batch sample_data/fleet.csv --scheduler tcp://host:8786 --ship -o third
+      # neurocal batch sample_data/fleet.csv --scheduler tcp://host:8786 \\
+      #     --ship -o third
     """  # noqa: D301 - as in the group
     preparation.compute_in_one_thread()
     chosen = [
@@ -341,6 +342,7 @@ class _Batch:
         if verdicts:
             say(f"verdicts: {', '.join(f'{count} {word}' for word, count in verdicts.most_common())}")
         say(f"summary: {os.path.join(self._shown, _CSV)} and {os.path.join(self._shown, _HTML)}")
+        suggest(os.path.join(self._shown, _HTML), "open {} in a browser")
 
 
 def _named(row: dict[str, Any]) -> str:

@@ -42,11 +42,11 @@ def calibrate(
     the coefficients of the lens distortion. Use --type to give what is known already:
 
     \b
-      type  known                     option              estimated
-      1     nothing                                       all parameters
-      2     the image centre          --image-center      all others
-      3     the intrinsic parameters  --intrinsics        the poses
-      4     the poses                 --extrinsics        the intrinsic parameters
+      type  known           estimated
+      1     nothing         all parameters
+      2     --image-center  all others
+      3     --intrinsics    the poses
+      4     --extrinsics    the intrinsic parameters
 
     Types 1 and 2 need several views of a flat board, or one view of a target that is not flat.
 

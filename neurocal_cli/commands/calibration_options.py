@@ -220,6 +220,7 @@ _FILES = [
     ),
 ]
 
+_LENSES = f"auto {options.MODELS} rich plumb-line"
 _OPTIONS = [
     options.choice(
         "--type",
@@ -278,9 +279,9 @@ _OPTIONS = [
     ),
     options.choice(
         "--distortion",
-        f"auto {options.MODELS} rich plumb-line",
-        f"Distortion model, with coefficients as in OpenCV: auto, {options.MODELS.replace(' ', ', ')}, rich "
-        "or plumb-line. none is a pinhole camera. thin_prism and tilted are OpenCV's models of 12 and 14 "
+        _LENSES,
+        f"Distortion model, with coefficients as in OpenCV: {options.one_of(_LENSES)}. "
+        "none is a pinhole camera. thin_prism and tilted are OpenCV's models of 12 and 14 "
         "coefficients. fisheye, omnidir, double_sphere and eucm are for wide lenses, also beyond 180 "
         "degrees. rich is a fisheye with a smooth displacement of the image, for lenses that no other model "
         "describes. "

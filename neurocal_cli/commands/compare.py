@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import ProgressBar, answer, note
+from neurocal_cli.commands.streams import ProgressBar, answer, note, suggest
 
 
 @click.command(cls=options.Command)
@@ -94,3 +95,5 @@ def compare(
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
     note(*found.notes)
     answer(as_json, lambda: comparison_json(found), lambda: comparison_report(found))
+    step = "calibrate {} -o camera.yaml" if right is None else f"stereo {{}} {shlex.quote(right)} -o rig.yaml"
+    suggest(points, f"neurocal {step}")

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     "vins basalt euroc open3d metashape gyroflow lensfun",
     "Format to write.",
     without="required",
-    to="target",
+    to="form",
     required=True,
 )
 @options.choice(
@@ -90,7 +90,7 @@ if TYPE_CHECKING:
 @options.output("FILE|DIR", "Write to this file; to this folder if the format needs several files.")
 def convert(
     files: tuple[str, ...],
-    target: str,
+    form: str,
     model: str | None,
     distortion: str | None,
     what: str | None,
@@ -126,12 +126,10 @@ def convert(
                 the files of these programs
       lensfun   database of one lens, XML
 
-    \b
-    Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI,
-    Middlebury, MVSNet, OpenMVG, Meshroom, OpenSfM, OpenDroneMap, BoofCV,
-    multical, calib.io, EasyMocap, ZED, OAK, Azure Kinect,
-    freemocap, instant-ngp, Polycam, PhotonVision, RealSense, Bouguet's
-    toolbox, and as the nearest fisheye OCamCalib and the FOV model.
+    Read as well: OpenVINS, OpenVSLAM, OKVIS, SVO, vikit, DSO, KITTI, Middlebury, MVSNet, OpenMVG, Meshroom,
+    OpenSfM, OpenDroneMap, BoofCV, multical, calib.io, EasyMocap, ZED, OAK, Azure Kinect, freemocap,
+    instant-ngp, Polycam, PhotonVision, RealSense, Bouguet's toolbox, and as the nearest fisheye OCamCalib and
+    the FOV model.
 
     If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
     differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs
@@ -182,15 +180,15 @@ def convert(
     with repeatable_stdin() if "-" in files else nullcontext():
         found = _read(files, target_board, board.unit, image_size, distortion, what)
     if isinstance(found, CameraSet):
-        if target == "lensfun" and focal_length is crop_factor is None:
+        if form == "lensfun" and focal_length is crop_factor is None:
             raise UsageError("--to lensfun needs --focal-length, --crop-factor, or both")
-        if target not in ("lensfun", "gyroflow"):
-            options.note_unused(f"with --to {target}", "focal_length", "crop_factor")
+        if form not in ("lensfun", "gyroflow"):
+            options.note_unused(f"with --to {form}", "focal_length", "crop_factor")
         found = replace(found, focal_mm=focal_length, crop_factor=crop_factor)
-        summary = _write_cameras(found, target, model, force, output)
+        summary = _write_cameras(found, form, model, force, output)
     elif model is None:
         options.note_unused("on points", "force")
-        summary = _write_points(found, target, output)
+        summary = _write_points(found, form, output)
     else:
         raise UsageError("FILE holds points, which have no distortion model; leave out --model")
     if as_json:

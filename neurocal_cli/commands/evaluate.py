@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Distance = tuple[float, str]  # a number and its unit
 
 
-class _Group(click.Group):
+class _Group(options.Group):
     """A group that also takes a file, and judges it as what it is."""
 
     def resolve_command(

@@ -27,7 +27,7 @@ _LENS = options.argument(
 )
 
 
-@click.group()
+@click.group(cls=options.Group)
 def lens() -> None:
     """Calibrate a zoom lens, whose zoom and focus change.
 
@@ -297,6 +297,7 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
         from neurocal_cli.commands.show.zoom_plots import draw_evaluation
 
         write_plot(plot, draw_evaluation, evaluation, learnt.controls)
+    suggest(lens_file, "neurocal report {} -o report.html")
 
 
 def _judge(lens_file: str, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurocal_cli.calibration.verdict.findings import two_digits
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.streams import end_waiting, note, print_summary, say, warn
 from neurocal_cli.errors import InputError, plural
 from neurocal_cli.files.calibration_tree import read_calibration
 from neurocal_cli.files.plane_csv import Batch, format_plane_points, read_pixels
@@ -53,6 +53,7 @@ def points_on_plane(
             variances = np.concatenate([variances, np.column_stack([of_camera, of_pixel])[found.seen]])
             yield found, labels
 
+    end_waiting()
     write_chunks(output, format_plane_points(located(batches), view=view, unit=calibration.unit, sigma=sigma))
     of_camera, of_pixel = np.sqrt(np.median(variances, axis=0)).tolist() if len(variances) else [np.nan] * 2
     if as_json:

@@ -17,6 +17,7 @@ from click.core import ParameterSource
 from click.types import FloatParamType
 
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
+from neurocal_cli.commands.screen import HelpContext
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.reading import detect_line
@@ -51,6 +52,7 @@ COMMON_MODELS = f"auto {_USUAL} fisheye"
 
 _OF_THE_GROUP = ("-q", "--quiet", "-v", "--verbose")
 _FEW = 10  # options that need no headings
+_LONG_CHOICE = 40  # characters
 _REST = "Options"
 # Headings of options in the help of commands that have many, and the parameters below each.
 _GROUPS = {
@@ -61,7 +63,7 @@ _GROUPS = {
     "Output": "output plot plots html lean as_json camera_name ros alpha overlay save_board cache help",
     "Research": "method trainer starts seed epochs rate rate_gamma training hidden",
 }
-_NOISE = re.compile(r"default: \((none|no)\)|(\S+<=?)?x(<=?|>=?)\S+").fullmatch
+_NOISE = re.compile(r"default: \((none|no|required)\)|(\S+<=?)?x(<=?|>=?)\S+").fullmatch
 
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 """Those of `simulation.comparison`, which a test compares."""
@@ -77,6 +79,8 @@ class Argument(click.Argument):
 
 class Command(click.Command):
     """A command whose help lists its arguments before its options."""
+
+    context_class = HelpContext
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse, and explain what new users mistake."""
@@ -126,6 +130,12 @@ class Command(click.Command):
             records = [record for option in options if (record := option.get_help_record(ctx))]
             with formatter.section(title):
                 formatter.write_dl([(names, _without_noise(text)) for names, text in records])
+
+
+class Group(click.Group):
+    """A group of such commands."""
+
+    context_class = HelpContext
 
 
 def _images(words: Iterable[str]) -> list[str]:
@@ -217,8 +227,18 @@ def count(
 
 
 def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:
-    """An option with a choice of words."""
-    return _option(name, help, without, type=click.Choice(words.split()), **more)
+    """An option with a choice of words; its help names them, where its usage has no room for them."""
+    told = help
+    if len(words) > _LONG_CHOICE and "metavar" not in more:
+        more["metavar"] = "FORMAT" if name == "--to" else "MODEL"
+        told += f" {more['metavar']} is {one_of(words)}."
+    return _option(name, told, without, type=click.Choice(words.split()), **more)
+
+
+def one_of(words: str) -> str:
+    """Words of a choice in a sentence."""
+    *others, last = words.split()
+    return f"{', '.join(others)} or {last}"
 
 
 def flag(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F], F]:

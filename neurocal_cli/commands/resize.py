@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.streams import note, print_summary, say, suggest, warn
 from neurocal_cli.files.failures import source_of, value_failures
 
 if TYPE_CHECKING:
@@ -83,6 +83,8 @@ def resize(
     else:
         for camera in cameras:
             say(_line(camera))
+        if len(cameras) == 1:
+            suggest(output, "neurocal undistort {} IMAGE... -o DIR")
 
 
 def _doubts(change: Resizing, camera: Camera) -> list[str]:

@@ -10,11 +10,16 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TextIO
 
+import click
+
 _HANGING = "  "  # how much farther than its first line the rest of a wrapped line is indented
 _NARROWEST = 20  # columns; below, nothing is legible
 # Blanks between a number and its unit, or the two numbers of a size, where a line is not broken.
 _UNIT = r"(?:px|mm|cm|m|s|rad|degrees|%)(?:[\s,;.:)]|$)"
 _KEPT = re.compile(rf"(?<=\d) (?={_UNIT})|(?<=\d) (?=x \d)|(?<=\d x) (?=\d)")
+_TYPED = re.compile(r"`[^`]+`")  # what to type, which is not broken either
+# Words of a line of a shell; an option and its value are one.
+_WORDS = re.compile(r"""(?:(?:--?\w[\w-]*|[|>])\s+(?![-|>\\]))?(?:[^\s"']|"[^"]*"|'[^']*')+""")
 _UNBROKEN = "\xa0"
 
 # The width of the terminal for which text is being made; None: there is none.
@@ -64,8 +69,49 @@ def _wrapped(line: str, width: int) -> list[str]:
     if len(line) <= width:
         return [line]
     indent = line[: len(line) - len(line.lstrip(" "))] + _HANGING
-    words = _KEPT.sub(_UNBROKEN, line)
+    words = _TYPED.sub(lambda typed: typed[0].replace(" ", _UNBROKEN), _KEPT.sub(_UNBROKEN, line))
     lines = textwrap.wrap(
         words, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
     return [one.replace(_UNBROKEN, " ") for one in lines] or [line]
+
+
+class _Help(click.HelpFormatter):
+    """Help in which examples and tables, which click leaves as they are, fit on the screen, too."""
+
+    def write_text(self, text: str) -> None:
+        """Write paragraphs; lines of examples that are too long go on below, as a shell reads them."""
+        paragraphs = re.split(r"\n\s*\n", text)
+        super().write_text("\n\n".join(self._fitted(p) if p.startswith("\b") else p for p in paragraphs))
+
+    def _fitted(self, paragraph: str) -> str:
+        room, fitted, before = self.width - self.current_indent, list[str](), ""
+        for line in paragraph.split("\n"):
+            if len(line) <= room:
+                fitted.append(line)
+            elif paragraph.startswith("\b\nExamples:"):
+                fitted += _continued(line, room, "" if before.endswith("\\") else 2 * _HANGING)
+            else:  # a row of a table, whose last column is wrapped
+                start = re.match(r"\s*(?:\S+\s{2,})?", line)
+                indent = " " * (start.end() if start else 0)
+                fitted += textwrap.wrap(line, room, subsequent_indent=indent)
+            before = line
+        return "\n".join(fitted)
+
+
+def _continued(line: str, room: int, hanging: str) -> list[str]:
+    """Lines of a shell that are one for it: all but the last end in a backslash."""
+    indent = line[: len(line) - len(line.lstrip(" "))]
+    lines, last = [indent], " \\" * line.endswith("\\")
+    for word in _WORDS.findall(line.removesuffix("\\")):
+        if lines[-1].strip() and len(lines[-1]) + len(word) + 3 > room:
+            lines[-1] += "\\"
+            lines.append(indent + hanging)
+        lines[-1] += f"{word} "
+    return [*lines[:-1], lines[-1].rstrip() + last]
+
+
+class HelpContext(click.Context):
+    """A context whose help fits on the screen."""
+
+    formatter_class = _Help

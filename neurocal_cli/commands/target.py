@@ -76,7 +76,8 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
         from neurocal_cli.observations.found_planes import with_found_points
 
         board = with_found_points(described, *known)
-    write_board(board, output)
+    if not preparation.is_for_the_eye(output, "board.yaml"):
+        write_board(board, output)
     suggest(output, "neurocal detect IMAGE... --board {} -o points.csv")
     if as_json:
         print_summary(target_json(calibration.target, calibration.unit) or {})

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import note, print_summary, say, warn
+from neurocal_cli.commands.streams import end_waiting, note, print_summary, say, warn
 from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
@@ -155,6 +155,7 @@ def triangulate(
     matches = read_matches(inputs[-1], notes)
     matches = chain([next(matches)], matches)
     note(*notes)
+    end_waiting()
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
@@ -190,6 +191,7 @@ def _triangulate_many(
     found = triangulate_many(rig, seen.point, seen.camera, seen.pixels, limit=limit)
     names = list(rig.cameras)
     text = format_many_points(found, seen.names, names, unit=rig.unit, sigma=sigma, limit=limit)
+    end_waiting()
     write_chunks(output, iter([text]))
     off = int((~found.behind & ~(found.error <= limit)).sum())
     behind, without = int(found.behind.sum()), int((found.contradicts >= 0).sum())

@@ -112,7 +112,7 @@ def detect_line(image: str) -> str:
     folder, name = os.path.split(stem)
     start = name.rstrip("0123456789")
     images = f"{shlex.quote(os.path.join(folder, start))}*{ending}" if start != name else shlex.quote(image)
-    return f"neurocal detect {images} --square 25 -o points.csv, with the side of your squares in mm"
+    return f"`neurocal detect {images} --square 25 -o points.csv`, with the side of your squares in mm"
 
 
 def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:

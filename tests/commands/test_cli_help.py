@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -77,6 +78,19 @@ def examples(command: click.Command) -> str:
     """The examples of a command, as they are pasted into a shell."""
     text = inspect.cleandoc(command.help or "").partition("\b\nExamples:\n")[2]
     return "".join(f"{line.removeprefix('  ')}\n" for line in text.splitlines())
+
+
+@pytest.mark.parametrize(("words", "command"), COMMANDS)
+def test_help_fits_on_a_terminal_and_its_examples_can_still_be_pasted(
+    words: list[str], command: click.Command
+) -> None:
+    context = command.context_class(command, info_name=" ".join(["neurocal", *words]), terminal_width=60)
+    shown = command.get_help(context)
+    for line in shown.splitlines():
+        quoted = re.search(r"'.*'|\".*\"", line)
+        assert len(line) <= 60 or quoted or " " not in line.strip(), line
+    pasted = shown.partition("Examples:\n")[2].partition("\n\n")[0].replace("\\\n", " ")
+    assert pasted.split() == examples(command).replace("\\\n", " ").split()
 
 
 @pytest.mark.parametrize(("words", "command"), COMMANDS)

@@ -106,7 +106,9 @@ def test_the_shell_can_complete(shell: str) -> None:
 def test_images_instead_of_points_are_recognised(command: str) -> None:
     result = run(command, *(SAMPLES / f"board0{k}.png" for k in range(1, 5)))
     assert result.exit_code == 2
-    assert "these are images; find the points in those of each camera first: neurocal detect" in result.stderr
+    assert (
+        "these are images; find the points in those of each camera first: `neurocal detect" in result.stderr
+    )
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_tables_that_are_too_wide_are_continued_below(
 ) -> None:
     shown, status, _ = at_terminal(width, tmp_path, *command)
     assert status == 0
-    assert all(len(line) <= width for line in shown.splitlines())
+    assert all(len(line) <= width or line.startswith("next: ") for line in shown.splitlines())
     assert shown.count("alpha_v ") == (2 if width == 60 else 1)
 
 
@@ -103,9 +103,28 @@ def test_without_a_file_a_terminal_gets_the_summary_and_a_pipe_the_calibration(t
 def test_errors_are_wrapped_too(tmp_path: Path) -> None:
     shown, status, _ = at_terminal(60, tmp_path, "calibrate", SAMPLES / "board01.png")
     assert status == 1
-    assert "neurocal detect" in " ".join(shown.split())
+    # The line to type can be copied: the terminal alone breaks it.
+    (line,) = (line for line in shown.splitlines() if "neurocal detect" in line)
+    assert line.startswith("  `")
+    assert line.endswith(" -o points.csv`,")
     # A path may be longer than any line.
-    assert all(len(line) <= 60 or " " not in line.strip() for line in shown.splitlines())
+    others = [other for other in shown.splitlines() if other != line]
+    assert all(len(other) <= 60 or " " not in other.strip() for other in others)
+
+
+def test_wrong_usage_breaks_no_word(tmp_path: Path) -> None:
+    shown, status, _ = at_terminal(60, tmp_path, "calibrate", "points.csv", "--distortion", "rationl")
+    assert status == 2
+    assert max(map(len, shown.splitlines())) <= 60
+    assert "'double_sphere'" in shown
+
+
+def test_points_on_a_terminal_stand_on_lines_of_their_own(tmp_path: Path) -> None:
+    rig = "stereo", SAMPLES / "stereo_left.csv", SAMPLES / "stereo_right.csv", "-o", "rig.yaml"
+    at_terminal(80, tmp_path, *rig)
+    shown, status, _ = at_terminal(80, tmp_path, "triangulate", "rig.yaml", SAMPLES / "matches.csv")
+    assert status == 0
+    assert "# frame: " in shown  # not behind a bar, whose line `at_terminal` leaves out
 
 
 @pytest.mark.slow

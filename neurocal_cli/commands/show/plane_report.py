@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from neurocal_cli.calibration.verdict.findings import two_digits
 from neurocal_cli.camera.camera_position import CameraPosition
 from neurocal_cli.camera.plane_points import PlaneErrors, Spread
-from neurocal_cli.commands.show.text import Table, number_or_none, printable, with_std
+from neurocal_cli.commands.show.text import Table, number_or_none, printable, rounded, with_std
 
 
 def plane_table(errors: PlaneErrors, unit: str) -> Table:
@@ -23,7 +22,8 @@ def plane_table(errors: PlaneErrors, unit: str) -> Table:
     ):
         if spread is None:
             continue
-        rows.append([what, *map(two_digits, (spread.std, spread.by_calibration, spread.by_pixel))])
+        told = spread.std, spread.by_calibration, spread.by_pixel
+        rows.append([what, *(rounded(std, std)[0] for std in told)])
     return rows
 
 
