@@ -82,7 +82,9 @@ class _Help(click.HelpFormatter):
     def write_text(self, text: str) -> None:
         """Write paragraphs; lines of examples that are too long go on below, as a shell reads them."""
         paragraphs = re.split(r"\n\s*\n", text)
-        super().write_text("\n\n".join(self._fitted(p) if p.startswith("\b") else p for p in paragraphs))
+        fitted = "\n\n".join(self._fitted(p) if p.startswith("\b") else p for p in paragraphs)
+        indent = " " * self.current_indent
+        self.write(f"{click.wrap_text(fitted, self.width, indent, indent, preserve_paragraphs=True)}\n")
 
     def _fitted(self, paragraph: str) -> str:
         room, fitted, before = self.width - self.current_indent, list[str](), ""

@@ -27,12 +27,13 @@ _WORDS = ("good", "usable", "poor")
 
 # Columns of the table: heading, key and format. Those that no row has are left out.
 _COLUMNS = (
-    ("verdict", "verdict", ""), ("drift", "drift", ""), ("drift rms", "drift_px", ".2g"),
-    ("its std", "drift_std_px", ".2g"), ("alpha_u", "alpha_u", ".2f"), ("std", "alpha_u_std", ".2g"),
-    ("alpha_v", "alpha_v", ".2f"), ("u0", "u0", ".2f"), ("v0", "v0", ".2f"), ("baseline", "baseline", ".6g"),
-    ("model", "distortion", ""), ("rms", "rmse_px", ".3g"), ("held out", "held_out_px", ".3g"),
+    ("verdict", "verdict", ""), ("drift", "drift", ""), ("drift rms [px]", "drift_px", "#.2g"),
+    ("its std [px]", "drift_std_px", "#.2g"), ("alpha_u [px]", "alpha_u", ".2f"),
+    ("its std [px]", "alpha_u_std", "#.2g"), ("alpha_v [px]", "alpha_v", ".2f"), ("u0 [px]", "u0", ".2f"),
+    ("v0 [px]", "v0", ".2f"), ("baseline", "baseline", ".6g"), ("distortion model", "distortion", ""),
+    ("rms [px]", "rmse_px", "#.3g"), ("cross-validation error [px]", "held_out_px", "#.3g"),
     ("views", "n_views", ""), ("points", "n_points", ""), ("outliers", "n_rejected", ""),
-    ("s", "seconds", ".2g"),
+    ("time [s]", "seconds", "#.2g"),
 )  # fmt: skip
 
 
@@ -90,7 +91,7 @@ def _table(rows: Sequence[Row]) -> str:
 def _cell(value: Any, form: str) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
-    return escape(format(value, form) if form else str(value))
+    return escape(format(value, form).rstrip(".") if form else str(value))
 
 
 def _histograms(rows: Sequence[Row]) -> list[str]:

@@ -31,7 +31,7 @@ p,li{max-width:75ch}.soft{color:var(--soft)}
 .verdict b{font-size:1.3rem}.good{border-color:var(--good)}.good b{color:var(--good)}
 .usable{border-color:var(--usable)}.usable b{color:var(--usable)}
 .poor{border-color:var(--poor)}.poor b{color:var(--poor)}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
+.wide{overflow-x:auto}.wide+.wide{margin-top:1rem}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .8rem .25rem 0;text-align:right;vertical-align:top;white-space:nowrap;
 border-bottom:1px solid var(--edge)}.text{text-align:left}td.text{white-space:normal;min-width:12rem}
 th:first-child,td:first-child{text-align:left}
@@ -50,7 +50,7 @@ image~.dots{stroke:#00b7ff}image~.lines,image~.out{stroke:#ff1f4b}
 dialog{width:min(96vw,1200px);border:1px solid var(--edge);background:var(--paper);color:var(--ink)}
 dialog::backdrop{background:#000a}dl{display:grid;grid-template-columns:auto 1fr;gap:.2rem 1rem}
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}code{font-size:.9em}
-@media (max-width:480px){th{white-space:normal}th,td{padding-right:.5rem}
+@media (max-width:480px){th,td{white-space:normal}th,td{padding-right:.5rem}
 dl{grid-template-columns:1fr}dd{margin-bottom:.5rem}}
 @media print{:root{--ink:#000;--paper:#fff;--card:#f4f6f9;--edge:#bbb;--soft:#444;--accent:#2b5fb3}
 body{max-width:none;padding:0;font-size:10pt}h2,h2+p{break-after:avoid}tr{break-inside:avoid}

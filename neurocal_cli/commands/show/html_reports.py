@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from operator import itemgetter
 
@@ -41,7 +41,7 @@ from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_ro
 from neurocal_cli.commands.show.rig_report import pose_rows
 from neurocal_cli.commands.show.stereo_report import camera_rows, pair_name, rig_rows
 from neurocal_cli.commands.show.text import printable, with_std
-from neurocal_cli.commands.show.zoom_report import lens_report
+from neurocal_cli.commands.show.zoom_report import lens_words, network_rows
 from neurocal_cli.errors import InputError
 
 _MOST_REJECTED = 200  # rows
@@ -142,9 +142,11 @@ def rig_page(rig: Rig, origin: Origin) -> str:
 def lens_page(lens: ZoomLens, origin: Origin) -> str:
     """Make the page of a zoom lens; see `calibration_page`."""
     command = f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml"
+    head, lines = lens_words(lens)
     parts = [
+        f'<p class="soft">{escape(head)}</p>',
         verdict_block(judge_lens(lens)),
-        section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
+        section("Networks", table(network_rows(lens)), _listed(lines)),
         section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
         section("How to repeat it", _origin(command, origin, {})),
     ]
@@ -246,10 +248,8 @@ def _board(calibration: Calibration) -> str:
                 "disc is the height, and its colour the side.",
             )
         )
-    words = "".join(f"<li>{escape(line)}</li>" for line in target_lines(target, unit))
-    return section(
-        "The board as it was found", f"<ul>{words}</ul>", f'<div class="figures">{"".join(drawings)}</div>'
-    )
+    drawn = f'<div class="figures">{"".join(drawings)}</div>'
+    return section("The board as it was found", _listed(target_lines(target, unit)), drawn)
 
 
 def _measurements(calibration: Calibration) -> str:
@@ -310,7 +310,7 @@ def _view_parts(
         tilt = float(np.degrees(np.arccos(np.clip(abs(view.pose.R[2, 2]), 0, 1))))
         rows.append(
             [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
-             f"{distance:.5g}", f"{tilt:.1f}"]
+             f"{distance:#.5g}".rstrip("."), f"{tilt:.1f}"]
         )  # fmt: skip
         crosses = None
         if rejected is not None and name in rejected.view_names:
@@ -349,8 +349,11 @@ def _rejected(calibration: Calibration) -> str:
 
 
 def _warnings(warnings: tuple[str, ...]) -> str:
-    entries = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
-    return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
+    return section("Warnings", _listed(warnings))
+
+
+def _listed(texts: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>" if texts else ""
 
 
 def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:

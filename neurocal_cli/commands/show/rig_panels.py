@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _CELLS = 6  # across and down, as in the verdict
 _MOST_NUMBERS = 14  # cameras with room for a number in each cell
 _SIZE = 0.12  # of a drawn camera, relative to the scene
+_LABEL = (190.0, 24.0)  # room of a camera's name in the drawing
 # The direction of the view of the drawing: from above, and from the right.
 _VIEW = euler_to_rotation(np.radians(22.0), 0.0, 0.0) @ euler_to_rotation(0.0, np.radians(30.0), 0.0)
 
@@ -99,10 +100,13 @@ def rig_in_space(rig: Rig) -> str:
         return np.asarray(1000.0 * (points - low) / (high - low).max())
 
     boards = "".join(_path(placed(part), closed=True) for part in flat[0])
-    lines, labels = "", ""
+    lines, labels, taken = "", "", list[Array]()
     for (name, _), part in zip(cameras, flat[1], strict=True):
         centre, *ends = placed(part)
         lines += _path(np.array(ends), closed=True) + "".join(_path(np.array([centre, end])) for end in ends)
+        while any((np.abs(centre - other) < _LABEL).all() for other in taken):
+            centre = centre + np.array([0.0, _LABEL[1]])  # below the name of a camera beside it
+        taken.append(centre)
         labels += f'<text x="{centre[0]:.1f}" y="{centre[1]:.1f}" font-size="22">{escape(name[-16:])}</text>'
     return (
         f'<svg viewBox="-20 -20 {width + 40:.0f} {height + 40:.0f}" role="img" '

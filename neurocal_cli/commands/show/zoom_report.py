@@ -37,6 +37,12 @@ _TRAININGS = {
 
 def lens_report(lens: ZoomLens) -> str:
     """Summary of a lens: its data, its networks, its errors and the verdict."""
+    head, tail = lens_words(lens)
+    return joined([head], align(network_rows(lens)), tail, verdict_lines(judge_lens(lens)))
+
+
+def lens_words(lens: ZoomLens) -> tuple[str, list[str]]:
+    """What a lens was learnt from, and lines about its errors, its target and its networks."""
     kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
     points = "" if lens.known else f", {int(lens.counts.sum())} points"
     head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
@@ -56,7 +62,7 @@ def lens_report(lens: ZoomLens) -> str:
         f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}",
         "converged" if lens.converged else "not converged: training stopped before the error settled",
     ]
-    return joined([head], align(_network_rows(lens)), tail, verdict_lines(judge_lens(lens)))
+    return head, tail
 
 
 def _camera_errors(lens: ZoomLens) -> str:
@@ -67,7 +73,7 @@ def _camera_errors(lens: ZoomLens) -> str:
     return ", ".join([f"alpha_u {share:.2g} %", *others[2:]])
 
 
-def _network_rows(lens: ZoomLens) -> Table:
+def network_rows(lens: ZoomLens) -> Table:
     """What each network learnt: its hidden units, and the range and the uncertainty of its parameter."""
     prediction = lens.predict(lens.settings)
     rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
