@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _CSV, _HTML = "summary.csv", "summary.html"
 _MOST_TOLD = 10  # problems of jobs
 _STOPPED = 20  # jobs that the machine made fail, after which the batch ends
-_FINISHED = ("done", "unchanged")
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[tuple[Any, Any]]]
 
 
@@ -209,7 +208,7 @@ class _Batch:
             raise
         rows = self._write(changes)
         self._tell(rows, as_json)
-        if any(outcome.record.get("status") != "done" for outcome in self._outcomes.values()):
+        if any(outcome.status != "done" for outcome in self._outcomes.values()):
             click.get_current_context().exit(1)
 
     def _do_jobs(self) -> None:
@@ -220,7 +219,7 @@ class _Batch:
         for job in self._jobs:
             task = Task(job, os.path.join(self._folder, job.name), self._force)
             if job.problem:
-                self._outcomes[job.name] = Outcome("failed", {}, job.problem)
+                self._outcomes[job.name] = Outcome("failed", job.problem)
             elif (outcome := unchanged(task)) is not None:
                 self._outcomes[job.name] = outcome
             else:
@@ -235,7 +234,7 @@ class _Batch:
                 self._outcomes[task.job.name] = outcome
                 stopped = stopped + 1 if outcome.status == "stopped" else 0
                 if stopped >= _STOPPED:
-                    done = sum(o.status in _FINISHED for o in self._outcomes.values())
+                    done = sum(o.status == "done" for o in self._outcomes.values())
                     raise NeurocalError(
                         f"{outcome.problem}; {done} of {len(self._jobs)} jobs are done, and the same command "
                         "goes on there"
@@ -260,7 +259,7 @@ class _Batch:
         from neurocal_cli.commands.batch_run import receive
 
         if result is None:
-            return Outcome("failed", {}, "its process was killed twice, perhaps for lack of memory")
+            return Outcome("failed", "its process was killed twice, perhaps for lack of memory")
         return receive(task, result) if self._ship else result
 
     def _compared(self, former: dict[tuple[str, str], str]) -> dict[tuple[str, str], dict[str, Any]]:
@@ -274,7 +273,7 @@ class _Batch:
         pairs = [
             Pair(job.name, row["camera"], old, os.path.join(self._folder, job.name, job.result))
             for job in self._jobs
-            for row in self._outcomes[job.name].record.get("rows", ())
+            for row in self._recorded(job)
             if (old := former.get((job.name, row["camera"])))
         ]
         missing = len(former) - len(pairs)
@@ -288,6 +287,17 @@ class _Batch:
                 progress(f"{len(found)} of {len(pairs)} cameras compared", len(found) / len(pairs))
         return found
 
+    def _recorded(self, job: Job) -> list[dict[str, Any]]:
+        """The rows of a job, read from its record when they are needed: those of a large fleet are large."""
+        from neurocal_cli.files.job_files import read_record
+
+        outcome = self._outcomes.get(job.name)
+        known = outcome is not None and outcome.seconds is not None
+        rows: list[dict[str, Any]] = (
+            read_record(os.path.join(self._folder, job.name)).get("rows", []) if known else []
+        )
+        return rows
+
     def _write(self, changes: dict[tuple[str, str], dict[str, Any]]) -> list[dict[str, Any]]:
         """Write the summary of what is done, at once, and return its rows."""
         from neurocal_cli.commands.batch_rows import fleet_rows
@@ -295,7 +305,7 @@ class _Batch:
         from neurocal_cli.files.fleet_csv import format_fleet
         from neurocal_cli.files.writing import write_at_once
 
-        rows = fleet_rows(self._jobs, self._outcomes, changes)
+        rows = fleet_rows(self._jobs, self._outcomes, changes, self._recorded)
         write_at_once(os.path.join(self._folder, _CSV), format_fleet(rows))
         write_at_once(os.path.join(self._folder, _HTML), fleet_page(rows, os.path.basename(self._folder)))
         return rows
@@ -305,12 +315,12 @@ class _Batch:
         from neurocal_cli.commands.batch_rows import drift_text
 
         outcomes = self._outcomes
-        failed = {name: one.problem for name, one in outcomes.items() if one.record.get("status") != "done"}
+        failed = {name: one.problem for name, one in outcomes.items() if one.status != "done"}
         for name, problem in list(failed.items())[:_MOST_TOLD]:
             complain(f"{name}: {problem}")
         if len(failed) > _MOST_TOLD:
             complain(f"and {len(failed) - _MOST_TOLD} more; see {os.path.join(self._shown, _CSV)}")
-        n_unchanged = sum(one.status == "unchanged" for one in outcomes.values())
+        n_unchanged = sum(one.unchanged for one in outcomes.values())
         verdicts = Counter(row["verdict"] for row in rows if row.get("verdict"))
         outliers = [row for row in rows if row["outlier"]]
         changed = {_named(row): text for row in rows if (text := drift_text(row))}

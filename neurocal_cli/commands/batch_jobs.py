@@ -51,13 +51,15 @@ class Job:
 
 @frozen_dataclass(eq=False)
 class Outcome:
-    """What became of a job."""
+    """What became of a job; its record, in the folder of its results, says more."""
 
-    # "unchanged" for one that was done before; "stopped" if the machine, not the data, made it fail.
-    status: str
-    record: dict[str, Any]  # as in its file; empty if it was stopped
+    status: str  # "done", "not converged", "failed"; "stopped" if the machine, not the data, made it fail
     problem: str = ""
-    files: Mapping[str, bytes] | None = None  # results to be written by the client
+    seconds: float | None = None  # None if there is no record
+    unchanged: bool = False  # done before
+    sent: tuple[dict[str, Any], Mapping[str, bytes]] | None = (
+        None  # record and results, for the client to write
+    )
 
 
 def job_of(one: DataSet, common: Mapping[str, str], output: str) -> Job:

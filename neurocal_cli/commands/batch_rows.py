@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from neurocal_cli.calibration.drift import SHARE
 from neurocal_cli.calibration.fleet import FAR, fleet_sigmas
-
-if TYPE_CHECKING:
-    from neurocal_cli.commands.batch_jobs import Job, Outcome
+from neurocal_cli.commands.batch_jobs import Job, Outcome
 
 Row = dict[str, Any]
 
@@ -28,6 +26,7 @@ _OF_FLEET = (
 _FALSE = 0.1  # share of batches with any unchanged camera that is said to have changed
 # What has happened if the chance of an unchanged camera, and of an unchanged pose, is too small.
 _SHARES = {"drift_share": "changed", "pose_share": "moved"}
+_NOT_DONE = Outcome("not done")
 _MEASURES = {"held_out_px": "held_out_px", "projection_px": "std_px"}
 
 
@@ -77,18 +76,22 @@ def fleet_rows(
     jobs: Iterable[Job],
     outcomes: Mapping[str, Outcome],
     changes: Mapping[tuple[str, str], Mapping[str, Any]],
+    recorded: Callable[[Job], Sequence[Row]],
 ) -> list[Row]:
-    """All rows in the order of the jobs, with the outliers of the fleet and the cameras that have changed."""
+    """All rows in the order of the jobs, with the outliers of the fleet and the cameras that have changed.
+
+    `recorded` gives the rows of a job, if it has any.
+    """
     rows: list[Row] = []
     for job in jobs:
-        outcome = outcomes.get(job.name)
-        record = {} if outcome is None else outcome.record
-        status = record.get("status", "not done" if outcome is None else "failed")
-        common = {"name": job.name, "status": status, "seconds": record.get("seconds"), "log": bool(record)}
-        common["problem"] = "" if outcome is None else outcome.problem
-        for row in record.get("rows") or [{"camera": ""}]:
+        outcome = outcomes.get(job.name, _NOT_DONE)
+        status = "failed" if outcome.status == "stopped" else outcome.status
+        common: Row = {"name": job.name, "status": status, "seconds": outcome.seconds}
+        common |= {"log": outcome.seconds is not None, "problem": outcome.problem}
+        for row in recorded(job) or [{"camera": ""}]:
             file = {"file": f"{job.name}/{job.result}"} if "verdict" in row else {}
-            rows.append(common | row | file | {"drift": ""} | changes.get((job.name, row["camera"]), {}))
+            change = changes.get((job.name, row["camera"]), {})
+            rows.append({**common, **row, **file, "drift": "", **change})
     _mark_outliers(rows)
     shares = [row[key] for row in rows for key in _SHARES if row.get(key) is not None]
     limit = min(SHARE, _FALSE / max(len(shares), 1))

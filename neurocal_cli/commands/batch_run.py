@@ -61,7 +61,7 @@ def do_job(task: Task) -> Outcome:
             return Context().run(_done if task.shipped is None else _done_elsewhere, task)
         except Exception as error:
             text = f"{type(error).__name__}: {error}"
-            return Outcome("stopped" if is_of_machine(error) else "failed", {}, one_line(text))
+            return Outcome("stopped" if is_of_machine(error) else "failed", one_line(text))
 
 
 def unchanged(task: Task) -> Outcome | None:
@@ -71,7 +71,11 @@ def unchanged(task: Task) -> Outcome | None:
     if list(inputs) != list(task.job.inputs) or not unread_since(task.results, inputs):
         return None
     key = key_of(task.job.steps, [entry["sha256"] for entry in inputs.values()])
-    return Outcome("unchanged", record, record["problem"]) if record.get("key") == key else None
+    return replace(_recorded(record), unchanged=True) if record.get("key") == key else None
+
+
+def _recorded(record: Mapping[str, Any]) -> Outcome:
+    return Outcome(record["status"], record["problem"], record["seconds"])
 
 
 def with_inputs(task: Task) -> Task:
@@ -85,20 +89,21 @@ def with_inputs(task: Task) -> Task:
 
 def receive(task: Task, outcome: Outcome) -> Outcome:
     """Write the results that a worker sent, and their record."""
-    if outcome.files is None:
+    if outcome.sent is None:
         return outcome
     inputs = fingerprints(task.results, task.job.inputs, {})
     key = key_of(task.job.steps, [entry["sha256"] for entry in inputs.values()])
-    record = {"key": key, "inputs": inputs} | outcome.record
+    record, files = outcome.sent
+    record = {"key": key, "inputs": inputs} | record
     try:
         work = work_folder(task.results)
-        for name, content in outcome.files.items():
+        for name, content in files.items():
             write_at_once(os.path.join(work, name), content)
         write_at_once(os.path.join(work, RECORD), json.dumps(record, indent=1) + "\n")
         publish(work, task.results)
     except (NeurocalError, OSError) as error:
-        return Outcome("stopped", {}, one_line(str(error)))
-    return replace(outcome, record=record, files=None)
+        return Outcome("stopped", one_line(str(error)))
+    return replace(outcome, sent=None)
 
 
 def _done(task: Task) -> Outcome:
@@ -107,14 +112,13 @@ def _done(task: Task) -> Outcome:
     inputs = fingerprints(results, job.inputs, former.get("inputs", {}))
     key = key_of(job.steps, [entry["sha256"] for entry in inputs.values()])
     if former.get("key") == key:
-        return Outcome("unchanged", former, former["problem"])
+        return replace(_recorded(former), unchanged=True)
     work = work_folder(results)
     try:
-        outcome = _worked(job, work, {"key": key, "inputs": inputs})
-        if outcome.status == "stopped":
-            return outcome
-        publish(work, results)
-        return outcome
+        record = _worked(job, work, {"key": key, "inputs": inputs})
+        if record["status"] != "stopped":
+            publish(work, results)
+        return _recorded(record)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -131,14 +135,14 @@ def _done_elsewhere(task: Task) -> Outcome:
             os.makedirs(os.path.dirname(path), exist_ok=True)
             write_at_once(path, content)
         before = set(os.listdir(work))
-        outcome = _worked(task.job, work, {})
+        record = _worked(task.job, work, {})
         made = sorted(set(os.listdir(work)) - before - {RECORD})
         files = {name: read_bytes(os.path.join(work, name))[0] for name in made}
-        return Outcome(outcome.status, outcome.record, outcome.problem, files)
+        return replace(_recorded(record), sent=None if record["status"] == "stopped" else (record, files))
 
 
-def _worked(job: Job, work: str, record: dict[str, Any]) -> Outcome:
-    """Run the commands in a folder, and write the log and the record there."""
+def _worked(job: Job, work: str, record: dict[str, Any]) -> dict[str, Any]:
+    """Run the commands in a folder, and write the log and the record there; return the record."""
     start, lines = time.perf_counter(), list[str]()
     summaries: list[dict[str, Any]] = []
     status, problem, former = "done", "", os.getcwd()
@@ -148,7 +152,7 @@ def _worked(job: Job, work: str, record: dict[str, Any]) -> Outcome:
             lines.append(f"$ {shlex.join(('neurocal', *words))}")
             code, problem, machine = _run(words, lines, summaries)
             if machine:
-                return Outcome("stopped", {}, problem)
+                return {"status": "stopped", "problem": problem, "seconds": None}
             if code == 3:
                 status, problem = "not converged", "training did not converge"
             elif code:
@@ -168,7 +172,7 @@ def _worked(job: Job, work: str, record: dict[str, Any]) -> Outcome:
         "outputs": sizes_of(work),
     }
     write_at_once(os.path.join(work, RECORD), json.dumps(record, indent=1) + "\n")
-    return Outcome(status, record, problem)
+    return record
 
 
 def _run(words: Words, lines: list[str], summaries: list[dict[str, Any]]) -> tuple[int, str, bool]:

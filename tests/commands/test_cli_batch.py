@@ -201,7 +201,7 @@ def test_cameras_of_other_images_are_no_outliers() -> None:
     large = [{**small[k], "image_size": "1280 x 960", "alpha_u": 1600.0 + k} for k in range(6)]
     kinds = of_one_kind([*small, *large])
     assert [len(alike) for alike in kinds.values()] == [9, 6]
-    rows = fleet_rows([Job("a", "", (), (), "")], {"a": Outcome("done", {"rows": [*small, *large]})}, {})
+    rows = fleet_rows([Job("a", "", (), (), "")], {"a": Outcome("done")}, {}, lambda job: [*small, *large])
     assert [row["outlier"] for row in rows] == [""] * 15
 
 
@@ -212,7 +212,8 @@ def test_a_rig_is_compared_with_its_poses(place: Path) -> None:
     assert cells["right"]["pose_share"] == 1.0
     record = json.loads((place / "out" / "pair" / ".job.json").read_text())
     knocked = {("pair", "right"): cells["right"] | {"pose_share": 1e-9, "turn_rad": 0.004}}
-    rows = fleet_rows([Job("pair", "", (), (), "rig.yaml")], {"pair": Outcome("done", record)}, knocked)
+    jobs, outcomes = [Job("pair", "", (), (), "rig.yaml")], {"pair": Outcome("done")}
+    rows = fleet_rows(jobs, outcomes, knocked, lambda job: record["rows"])
     assert [row["drift"] for row in rows] == ["", "moved"]
     assert rows[1]["baseline"] == pytest.approx(119.3, abs=1)
     assert "has moved, turned by 4 mrad (std " in drift_text(rows[1])
