@@ -27,6 +27,8 @@ _TOGETHER = 0.1  # seconds in which results are collected
 _CHUNK, _LARGEST = 0.5, 32  # seconds that a worker has to do at a time, and tasks at most
 _WAIT = 30  # seconds for the first worker
 _GONE = 10  # seconds without the scheduler, after which it will not come back
+# What a connection remembers of its messages: without a limit that is small, all tasks of a fleet.
+_FORGET = {"distributed.admin.low-level-log-length": 10}
 _LOST = "the scheduler is gone; start it, then the same command goes on"
 
 
@@ -49,11 +51,12 @@ def local_cluster(workers: int) -> Iterator[Client]:
         "distributed.worker.profile.enabled": False,
         "distributed.worker.memory.monitor-interval": "500ms",
         "distributed.admin.tick.interval": "500ms",
+        "distributed.admin.system-monitor.log-length": 10,
         # Without Dask's MALLOC_TRIM_THRESHOLD_, with which all large arrays are new pages of the system.
         "distributed.nanny.pre-spawn-environ": {},
     }
     _silence()
-    with dask.config.set(settings), interrupts_held():
+    with dask.config.set(settings | _FORGET), interrupts_held():
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -63,7 +66,9 @@ def local_cluster(workers: int) -> Iterator[Client]:
             silence_logs=logging.CRITICAL,
         )
     try:
-        with Client(cluster, set_as_default=False) as client:
+        with dask.config.set(_FORGET):
+            client = Client(cluster, set_as_default=False)
+        with client:
             yield client
     finally:
         with interrupts_held():
@@ -76,11 +81,13 @@ def running_cluster(address: str) -> Iterator[Client]:
 
     Raises NeurocalError if there is no scheduler or no worker, or a worker has another version.
     """
+    import dask
     from distributed import Client
 
     _silence()
     try:
-        client = Client(address, set_as_default=False, timeout=_WAIT)
+        with dask.config.set(_FORGET):
+            client = Client(address, set_as_default=False, timeout=_WAIT)
     except (OSError, ValueError, TimeoutError) as error:
         raise NeurocalError(
             f"--scheduler {address}: no scheduler answers there; start one with `dask scheduler`"
