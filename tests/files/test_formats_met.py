@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from test_other_programs import POINT, check, rotated
 
 from neurocal_cli.camera.geometry import Array
@@ -429,6 +430,115 @@ MET: dict[str, tuple[Any, list[float], list[Any], tuple[int, int] | None]] = {
     ),
 }
 
+DUMP = "[800.5, 0, 321.3;\n 0, 801.25, 238.7;\n 0, 0, 1]\n"
+STREAM = (
+    ' Intrinsic of "{}" / 640x480 / {{YUYV/RGB8}}\n  Width:      \t640\n  Height:     \t480\n'
+    "  PPX:        \t321.3\n  PPY:        \t238.7\n  Fx:         \t800.5\n  Fy:         \t801.25\n"
+    "  Distortion: \t{}\n  Coeffs:     \t{}\n"
+    "  FOV (deg):  \t44 x 33\n\n"
+)
+RADIAL, TANGENTIAL = [D5[0], D5[1], D5[4]], D5[2:4]
+HALVED = (np.array(K) * [[0.5], [0.5], [1]]).tolist()
+ECHO = lines(
+    "height: 480\nwidth: 640\ndistortion_model: plumb_bob\n", "", D=D5, K=FLAT, R=np.ravel(np.eye(3)).tolist()
+)
+ECHO += lines("", "", P=[0.0] * 12, binning_x=0, binning_y=0)
+MET |= {
+    "mmpose": (
+        {"R": R, "T": [[0], [0], [1]], "f": [[800.5], [801.25]], "c": [[321.3], [238.7]], "name": "a"}
+        | {"k": [[k] for k in RADIAL], "p": [[p] for p in TANGENTIAL]},
+        E,
+        D5,
+        None,
+    ),
+    "VoxelPose": (
+        {"0": {"K": K, "R": R, "T": [[0], [0], [1]], **FXY, "k": [[k] for k in RADIAL], "p": TANGENTIAL}},
+        E,
+        D5,
+        None,
+    ),
+    "Nerfies": (
+        {"orientation": R, "position": [0, 0, 1], "focal_length": 800.5, "principal_point": [321.8, 239.2]}
+        | {"skew": 0.0, "pixel_aspect_ratio": 801.25 / 800.5, "radial_distortion": RADIAL}
+        | {"tangential_distortion": TANGENTIAL, "image_size": [640, 480]},
+        E,
+        D5,
+        S,
+    ),
+    "A2D2": (
+        {"CamMatrix": HALVED, "CamMatrixOriginal": K, "Distortion": [D5], "Lens": "Telecam"},
+        E,
+        D5,
+        None,
+    ),
+    "Waymo": ({"name": "FRONT", "intrinsic": [800.5, 801.25, 321.3, 238.7, *D5], **WH}, E, D5, S),
+    "MASt3R-SLAM": (
+        f"width: 640\nheight: 480\n# fx, fy, cx, cy, k1\ncalibration: {[*FXY.values(), *D5]}\n",
+        E,
+        D5,
+        S,
+    ),
+    "names with one beginning": ({"color_intrinsics": FXY, "color_distortion": NAMED}, E, D5, None),
+    "Orbbec": (
+        lines("[ColorIntrinsic]\n", "", **FXY, **WH).replace(": ", "=")
+        + lines("[ColorDistortion]\n", "", **NAMED).replace(": ", "="),
+        E,
+        D5,
+        S,
+    ),
+    "arrays of JavaScript": (
+        {key: {str(k): v for k, v in enumerate(value)} for key, value in (("K", FLAT), ("D", D5))},
+        E,
+        D5,
+        None,
+    ),
+    "OpenCV's text of matrices": (f"CameraMatrix:\n{DUMP}DistCoeffs:\n{D5}\n", E, D5, None),
+    "a script of Python": (
+        f"import numpy as np\nmtx = np.array({K})\ndist = np.array([{D5}])\n",
+        E,
+        D5,
+        None,
+    ),
+    "text of NumPy's arrays": (f"mtx = {np.array(K)!r}\ndist = {np.array([D5])!r}\n", E, D5, None),
+    "a script of MATLAB": (f"% of tuesday\nK = {DUMP.strip()};\ndist = {D5};\n", E, D5, None),
+    "a row of a table": (
+        "fx_px,fy_px,cx_px,cy_px,k1,k2,p1,p2,k3,height_px,width_px\n"
+        f"800.5,801.25,321.3,238.7,{','.join(map(str, D5))},480,640\n",
+        E,
+        D5,
+        S,
+    ),
+    "names without sections": (lines("", "", **FXY, **NAMED).replace(": ", "="), E, D5, None),
+    "rs-enumerate-devices": (STREAM.format("Color", "Brown Conrady", "  \t".join(map(str, D5))), E, D5, S),
+    "text of a RealSense": (
+        "[ 640x480  p[321.3 238.7]  f[800.5 801.25]  Inverse Brown Conrady [0 0 0 0 0] ]\n",
+        E,
+        [],
+        S,
+    ),
+    "a struct of MATLAB with K": (
+        {"K": [[800.5, 0, 322.3], [0, 801.25, 239.7], [0, 0, 1]], "RadialDistortion": RADIAL}
+        | {"TangentialDistortion": TANGENTIAL, "ImageSize": [480, 640]},
+        E,
+        D5,
+        S,
+    ),
+    "messages of ROS": ("".join(f"header:\n  seq: {k}\n{ECHO}---\n" for k in range(2)), E, D5, S),
+    "R3LIVE": (
+        lines(
+            "r3live_vio:\n",
+            "  ",
+            image_width=640,
+            image_height=480,
+            camera_intrinsic=FLAT,
+            camera_dist_coeffs=D5,
+        ),
+        E,
+        D5,
+        S,
+    ),
+}
+
 
 def written(content: Any, folder: Path) -> Path:
     place = folder / "camera"
@@ -454,6 +564,12 @@ def oak(socket: int, to: int, t: list[float]) -> list[Any]:
         "extrinsics": link,
     }
     return [socket, one]
+
+
+def calib_io(r: list[float], t: list[float]) -> Any:
+    (one,) = MET["calib.io"][0]["Calibration"]["cameras"]
+    turn, shift = dict(zip(("rx", "ry", "rz"), r, strict=True)), dict(zip("xyz", t, strict=True))
+    return {**one, "transform": {"rotation": turn, "translation": shift}}
 
 
 ONE = {"K": K, "dist": [D5], "image_size": [640, 480], "model": "standard"}
@@ -483,6 +599,16 @@ RIGS: dict[str, tuple[Any, list[float], list[Array]]] = {
     ),
     "entries of two sides": (
         {f"{side}_intrinsics": {**FXY, **NAMED} for side in ("left", "right")} | {"R": R, "T": SHIFT},
+        D5,
+        [TURNED],
+    ),
+    "calib.io": (
+        {"Calibration": {"cameras": [calib_io([0, 0, 0], [0, 0, 0]), calib_io(TURN, SHIFT)]}},
+        D8,
+        [TURNED],
+    ),
+    "sides in mappings": (
+        {"left": {"mtx": K, "dist": D5}, "right": {"mtx": K, "dist": D5}, "stereo": {"R": R, "T": SHIFT}},
         D5,
         [TURNED],
     ),
@@ -589,6 +715,28 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "nuScenes": (MANY, "holds several cameras (0, 1, 2)"),
     "no size": ({"camera_angle_x": 0.69, "frames": [frame(1)]}, "give --image-size W H"),
     "VINS-Fusion": ('%YAML:1.0\ncam0_calib: "a.yaml"\nbody_T_cam0: 1\n', "names the files of its cameras"),
+    "one focal length and a ratio": (
+        {"focal_length": 800.5, "aspect_ratio": 1.01, "principal_point": [320, 240], **WH},
+        "which programs take as fy / fx or fx / fy",
+    ),
+    "coefficients beside it": ({"rgb": {"K": K}, "rgb_distortion": NAMED}, "may be the distortion"),
+    "a coefficient with another name": ({"K": K, "lens_k1": -0.3}, "'lens_k1' may be the distortion"),
+    "an unknown coefficient": ({"K": K, "distortion": {"k1": -0.3, "m2": 0.1}}, "'m2' may be the distortion"),
+    "packed numbers": ({"K": K, "lens_distortion_table": "AbCd" * 40}, "may be the distortion"),
+    "several streams": (
+        STREAM.format("Color", "None", "0 0 0 0 0")
+        + STREAM.format("Fisheye", "Kannala Brandt4", "0.1 0 0 0"),
+        "holds several cameras of RealSense (Color 640x480, Fisheye 640x480)",
+    ),
+    "a stream that is undistorted": (
+        STREAM.format("Color", "Inverse Brown Conrady", "0.1 0 0 0 0"),
+        "Inverse Brown Conrady of RealSense is not known",
+    ),
+    "an old pickle": ("(dp0\nVmtx\np1\n(lp2\nF1.0\nas.", "is a pickle of Python"),
+    "messages that differ": (
+        "".join(f"header:\n  seq: {k}\n{ECHO.replace('480', str(480 + k))}---\n" for k in range(2)),
+        "a second YAML document begins",
+    ),
     "transposed": ({"camera_matrix": np.array(K).T.tolist()}, "is transposed, as MATLAB writes it"),
     "mm": (
         {"focal_length": 35, "principal_point": [320, 240], "image_size": [640, 480]},
@@ -637,3 +785,25 @@ def test_what_cannot_be_read_is_named(kind: str, tmp_path: Path) -> None:
         read_cameras([written(content, tmp_path)])
     assert message in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("tree", [{"mtx": K, "dist": [D5]}, {"cameraMatrix": K, "distCoeffs": [D5], "fx": 3}])
+def test_matrices_that_python_saved_for_matlab_begin_at_zero_with_a_warning(
+    tree: Any, tmp_path: Path
+) -> None:
+    savemat(tmp_path / "camera.mat", tree)
+    warnings: list[str] = []
+    check(read_cameras([tmp_path / "camera.mat"], warnings=warnings).cameras[0], E, D5)
+    assert "its first pixel is taken as 0" in warnings[0]
+
+
+def test_the_parameters_of_dannce_are_matlab_s(tmp_path: Path) -> None:
+    shifted = np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    savemat(tmp_path / "a.mat", {"K": shifted.T, "RDistort": D5[:2], "TDistort": D5[2:4], "r": R, "t": SHIFT})
+    check(read_cameras([tmp_path / "a.mat"]).cameras[0], E, D4)
+
+
+def test_an_array_that_is_no_camera_matrix_is_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "D.npy", [D5])
+    with pytest.raises(FormatError, match="is an array of 1 x 5 numbers; give the camera matrix"):
+        read_cameras([tmp_path / "D.npy"])

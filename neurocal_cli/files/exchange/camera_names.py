@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import re
 
+# Of the images as they were taken, where a file has the matrix of undistorted ones as well.
+ORIGINAL = (
+    "cammatrixoriginal", "cameramatrixoriginal", "originalcameramatrix", "originalcammatrix", "koriginal",
+    "korig", "originalk", "mtxoriginal",
+)  # fmt: skip
 # The first are written here and by ROS and OpenCV; in OpenCV's stereo sample the left camera has M1 and D1.
 MATRIX = (
     "cameramatrix", "k", "mtx", "m", "intrinsicmatrix", "intrinsicsmatrix", "cameraintrinsics", "intrinsics",
@@ -18,15 +23,19 @@ COEFFICIENTS = (
     "distortionparameters", "distortionparams", "distparams", "distortionvector", "distortionmatrix",
     "distvec", "lensdistortion", "cameradistortion", "distmtx", "distmatrix", "camdist", "disto", "distcof",
     "distcoffs", "distortioncoefficents", "distortionvalues", "opencvdistortion", "d1",
+    "cameradistcoeffs", "camdistcoeffs", "cameradistcoeff", "camdistcoeff", "cameradistortioncoefficients",
+    "lensdistortioncoefficients", "distortioncoeficients", "distcoefficient",
 )  # fmt: skip
 ENTRIES = (
-    ("fx", "flx", "focalx", "fu", "focallengthx"),
-    ("fy", "fly", "focaly", "fv", "focallengthy"),
-    ("cx", "ppx", "u0", "pu", "principalpointx"),
-    ("cy", "ppy", "v0", "pv", "principalpointy"),
+    ("fx", "flx", "focalx", "fu", "focallengthx", "fxpx", "focallengthxpx"),
+    ("fy", "fly", "focaly", "fv", "focallengthy", "fypx", "focallengthypx"),
+    ("cx", "ppx", "u0", "pu", "principalpointx", "cxpx", "focalcenterxpx"),
+    ("cy", "ppy", "v0", "pv", "principalpointy", "cypx", "focalcenterypx"),
 )
-FOCAL = ("focallength", "focallengths", "focal", "focalpx", "focallengthpx")  # of both axes, or one for both
-CENTRE = ("principalpoint", "principlepoint", "opticalcenter", "princpt", "imagecenter")
+# Of both axes, or one for both.
+FOCAL = ("focallength", "focallengths", "focal", "focalpx", "focallengthpx", "f")
+CENTRE = ("principalpoint", "principlepoint", "opticalcenter", "princpt", "imagecenter", "c")
+ASPECT = ("aspectratio", "pixelaspectratio", "pixelratio", "pixelaspect")
 RADIAL = ("radialdistortion", "radial", "radialcoefficients", "radialdistortioncoefficients", "radialcoeffs")
 TANGENTIAL = (
     "tangentialdistortion", "tangential", "tangentialcoefficients", "tangentialdistortioncoefficients",
@@ -34,9 +43,11 @@ TANGENTIAL = (
 )  # fmt: skip
 WIDTH = (
     "imagewidth", "width", "w", "imgwidth", "imgw", "framewidth", "resolutionx", "imgsizex", "resx",
+    "widthpx",
 )  # fmt: skip
 HEIGHT = (
     "imageheight", "height", "h", "imgheight", "imgh", "frameheight", "resolutiony", "imgsizey", "resy",
+    "heightpx",
 )  # fmt: skip
 SIZE = (
     "imagesize", "imgsize", "resolution", "size", "dim", "dims", "imageresolution", "imagedimensions",
@@ -44,6 +55,8 @@ SIZE = (
     "capturedimagesize",
 )  # fmt: skip
 SHAPE = ("imageshape", "imgshape", "shape")  # NumPy's: height and width
+# Of all numbers in one list: fx, fy, cx, cy, and the coefficients.
+PARAMETERS = (*MATRIX, "calibration", "calib", "cameraparams", "cameraparameters", "params")
 NAME = ("cameraname",)
 
 # Keys whose text names the distortion model; an unknown word is refused in the first, ignored in the others.
@@ -73,7 +86,8 @@ ALIKE = ("plumb_bob", "rational_polynomial", "thin_prism", "tilted", "pinhole")
 
 # Names of numbers that may be a distortion, and of some that are none.
 SUSPECT = re.compile(r"dist(?!an|rib)|^kc|coef|radial|tangent")
-SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")
+SUSPECT_NUMBER = re.compile(r"[kps]\d|xi|kc\d")  # of the plain name, whole
+SUSPECT_WORD = re.compile(r"(?:^|[\W_])[kp]_?[1-6](?:[\W_]|$)", re.IGNORECASE)  # of the name as it is
 HARMLESS = re.compile(
     r"std|err|undist|newcam|uncert|sigma|limit|rms|perview|roi|optimal|thresh|flag|aspect|fix|rect|^est|valid"
 )

@@ -225,7 +225,7 @@ _CALIB_IO = CameraKeys(
 
 
 def _read_calib_io(document: Document) -> CameraSet:
-    cameras = []
+    cameras, poses = [], []
     for k, one in enumerate(document.root["Calibration"]["cameras"].items()):
         model = one["model"]
         data = model["ptr_wrapper"]["data"]
@@ -235,7 +235,13 @@ def _read_calib_io(document: Document) -> CameraSet:
         word = model.get("polymorphic_name", "libCalib::CameraModelOpenCV").text()
         tree = {**parameters.value, "fy": fy, "imageSize": size, "model": word}
         cameras.append(_CALIB_IO.camera(Field(tree, data.source, data.path), f"cam{k}"))
-    return CameraSet(tuple(cameras), program="calib.io")
+        pose = None
+        if "transform" in one:
+            r, t = ([one["transform"][part][axis].number() for axis in axes]
+                    for part, axes in (("rotation", ("rx", "ry", "rz")), ("translation", "xyz")))  # fmt: skip
+            pose = Pose(from_vector(np.array(r)), np.array(t))
+        poses.append(pose)
+    return mounted(cameras, poses if len(poses) > 1 else [None], "calib.io", None)
 
 
 CALIB_IO = Format(
@@ -243,7 +249,9 @@ CALIB_IO = Format(
     _CALIB_IO.models,
     matches=lambda document: "Calibration" in document.tree and "libCalib" in document.text[:100_000],
     read=_read_calib_io,
-    files="Calibrator's JSON of one camera",
+    files="Calibrator's JSON",
+    most_cameras=99,
+    rig="`transform` from the first camera",
 )
 
 # EasyMocap: intri.yml with K and dist of each name, extri.yml with the poses, both from the world.

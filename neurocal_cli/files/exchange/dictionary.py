@@ -18,11 +18,12 @@ from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.files.camera_tree import matrix_data
-from neurocal_cli.files.exchange.camera_names import plain
+from neurocal_cli.files.exchange.camera_names import PARAMETERS, plain
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector, mounted
 from neurocal_cli.files.exchange.dictionary_texts import entries, json_text, npz_bytes, opencv_text
-from neurocal_cli.files.exchange.document import UNKNOWN, Document
+from neurocal_cli.files.exchange.document import FROM_ZERO, UNKNOWN, Document
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.exchange.loose_values import plain_lists
 from neurocal_cli.files.exchange.multiview import is_multiview, multiview_cameras
 from neurocal_cli.files.tree_fields import Field
 
@@ -35,7 +36,7 @@ _SIDES = (
     ("camera0", "camera1"), ("camera1", "camera2"), ("cameraleft", "cameraright"),
 )  # fmt: skip
 _ROTATIONS = ("r", "rstereo", "stereor", "rotation", "rotationmatrix", "rot")
-_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector", "trans")
+_TRANSLATIONS = ("t", "tstereo", "stereot", "translation", "translationvector", "trans", "trns")
 
 
 def is_part(document: Document) -> bool:
@@ -49,11 +50,15 @@ def is_part(document: Document) -> bool:
 
 def read(document: Document) -> CameraSet:
     """Read one camera or two."""
-    return from_tree(document.root, document)
+    found = from_tree(document.root, document)
+    if document.is_script:
+        document.warnings.append(f"{document.source}: {FROM_ZERO}")
+    return found
 
 
 def from_tree(root: Field, document: Document) -> CameraSet:
     """Read one camera or two from a dictionary, or those in it that have poses of their own."""
+    root = Field(plain_lists(root.value), root.source, root.path)
     if is_multiview(root):
         several = multiview_cameras(root)
         for camera in several.cameras:
@@ -171,7 +176,16 @@ def _within(root: Field, notes: list[str]) -> Field:
                 )
             notes.append(f"{root.source}: holds the same camera {len(parts)} times")
         if isinstance(value, dict):
-            others |= {key: entry for key, entry in value.items() if str(key) != name}
+            # color_distortion belongs to color_intrinsics.
+            own = next((word for word in PARAMETERS if plain(name).endswith(word) and len(word) > 2), "")
+            stem = plain(name).removesuffix(own) if own else ""
+            others |= {
+                plain(str(key)).removeprefix(stem)
+                if stem and plain(str(key)).startswith(stem)
+                else key: entry
+                for key, entry in value.items()
+                if str(key) != name
+            }
         root = Field(part, root.source)
     if not isinstance(root.value, dict):
         raise InputError(UNKNOWN)

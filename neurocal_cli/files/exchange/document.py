@@ -30,10 +30,23 @@ _DAMAGED = (
     ValueError, OSError, EOFError, KeyError, MemoryError, SyntaxError, TokenError, NotImplementedError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
+FROM_ZERO = (
+    "its first pixel is taken as 0, as OpenCV has it; if MATLAB calibrated the camera, subtract 1 from the "
+    "principal point"
+)
+_MATLAB = re.compile(r"=\s*\[[^\]\n]*;|^\s*%", re.MULTILINE).search
+_MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
+_HEAD = re.compile(r"\A\s*header:.*?^(?=height:)", re.MULTILINE | re.DOTALL)
 UNKNOWN = "is not a camera file; give one of the formats that neurocal convert --help lists"
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers
 _SECTION = re.compile(r"\A(?:\s*[#;][^\n]*\n|\s*\n)*\s*\[[^\]\n,]+\]\s*(?:[#;][^\n]*)?(?:\n|\Z)").match
 _ASSIGNMENT = re.compile(r"(?:^|;)\s*([A-Za-z]\w*)\s*=\s*(\[[^\]]*\]|[-+.\dEe]+)\s*(?=;|$)", re.MULTILINE)
+# name = numbers or name: numbers, as programs print them and scripts state them.
+_STATED = re.compile(
+    r"^[ \t]*([A-Za-z][\w. ]*?)[ \t]*(?:[:=]|\n)\s*(?:[\w.]+\()?\s*"
+    r"(\[[-+.\deE,;\s\[\]]*\]|[-+]?\.?\d[-+.\deE]*(?=[ \t;,]*(?:[#%/][^\n]*)?(?:\n|\Z)))",
+    re.MULTILINE,
+)
 # A matrix as NumPy prints it, without commas.
 _PRINTED = re.compile(r"\[\[[-+.\deE\s\[\]]+\]\]")
 
@@ -69,6 +82,7 @@ class Document:
         self.data, self.source = read_bytes(name)
         self.notes, self.warnings = notes, warnings
         self.distortion, self.size = distortion, size
+        self.is_script = False  # of MATLAB or Octave, perhaps
 
     def joined(self, other: Document) -> Document:
         """The document with the keys of another as well."""
@@ -94,22 +108,38 @@ class Document:
         if self.data.startswith(b"PK\x03\x04"):
             return Field(arrays_of(self.data, self.source, self.notes), self.source)
         if self.array is not None:
+            shape = " x ".join(map(str, self.array.shape))
+            if self.array.size != 9 and self.array.shape != (4, 4):
+                raise FormatError(
+                    f"is an array of {shape} numbers; give the camera matrix of 3 x 3, and its coefficients "
+                    "as a second file",
+                    self.source,
+                )
             return Field({"K": self.array.tolist()}, self.source)
         text = decode(self.data, self.source, "a camera file")
         if is_point_table(text):
             raise FormatError("is a table of points; give a camera file here", self.source)
         if _SECTION(text):
             return Field(sections(text, self.source), self.source)
+        parts = [part for part in _MARK.split(text) if part.strip()]
+        if len(parts) > 1 and len({_HEAD.sub("", part) for part in parts}) == 1 and _HEAD.search(parts[0]):
+            text = parts[0]  # rostopic echo repeats a message
+        failed = None
         try:
             root = parse_tree(text, self.source)
-        except FormatError:
+        except FormatError as error:
+            failed, root = error, Field("", self.source)
+        if isinstance(root.value, str) and (tree := stated(text)) is not None:
+            self.is_script = bool(_MATLAB(text))
+            return Field(tree, self.source)
+        if failed is not None:
             if (plain := _PRINTED.sub(_with_commas, text)) != text:
                 return parse_tree(plain, self.source)
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             alike = sum(":" in line or line[0] in "-#{}[]<," for line in lines)
             if lines and not lines[0].startswith(("%YAML", "---")) and 2 * alike < len(lines):
-                raise FormatError(UNKNOWN, self.source) from None
-            raise
+                raise FormatError(UNKNOWN, self.source)
+            raise failed
         if isinstance(root.value, list) and (K := camera_matrix(root.value)) is not None:
             return Field({"K": K.tolist()}, self.source)
         return root
@@ -236,6 +266,31 @@ def sections(text: str, source: str) -> dict[str, Any]:
         line = getattr(error, "lineno", None)
         raise FormatError("is neither TOML nor sections of key = value; correct it", source, line) from error
     return {name: {key: _value(value) for key, value in parser[name].items()} for name in parser.sections()}
+
+
+def stated(text: str) -> dict[str, Any] | None:
+    """Numbers and matrices by the names before them, or in the row below those of a table; None without."""
+    lines = [re.split(r"[ \t]*[,;\t][ \t]*", line.strip()) for line in text.splitlines() if line.strip()]
+    if len(lines) == 2 and len(lines[0]) == len(set(lines[0])) == len(lines[1]) > 3:
+        tree: dict[str, Any] = dict(zip(lines[0], map(_value, lines[1]), strict=True))
+        return None if any(map(is_number, lines[0])) else tree
+    tree = {}
+    text = re.sub(r"(?:[%#]|//)[^\n]*", "", text)
+    if re.search(r"[\[\]]|\d\.\d", _STATED.sub("", text)):  # numbers without a name
+        return None
+    for name, value in _STATED.findall(text):
+        name = name if value.startswith("[") else name.split()[-1]  # double fx = 800.5;
+        if name in tree:
+            return None
+        if not value.startswith("["):
+            tree[name] = float(value) if is_number(value) else value
+            continue
+        nested = re.findall(r"\[([^\[\]]+)\]", value) if "[[" in re.sub(r"\s", "", value) else None
+        rows = [row.replace(",", " ").split() for row in nested or value.strip("[]").split(";")]
+        if all(is_number(word) for row in rows for word in row):
+            numbers = [[float(word) for word in row] for row in rows if row]
+            tree[name] = numbers if nested or len(numbers) > 1 else (numbers or [[]])[0]
+    return tree if len(tree) > 1 else None
 
 
 def assignments(text: str) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.camera_tree import from_ros, matrix_data
 from neurocal_cli.files.exchange.camera_names import (
     ALIKE,
+    ASPECT,
     CENTRE,
     COEFFICIENTS,
     ENTRIES,
@@ -37,11 +38,13 @@ from neurocal_cli.files.exchange.camera_names import (
     MODEL,
     NAME,
     NO_LIST,
+    ORIGINAL,
     RADIAL,
     SHAPE,
     SIZE,
     SUSPECT,
     SUSPECT_NUMBER,
+    SUSPECT_WORD,
     TANGENTIAL,
     UNKNOWN,
     WIDTH,
@@ -55,12 +58,14 @@ from neurocal_cli.files.exchange.loose_values import (
     is_matrix,
     is_numbers,
     matrix_of,
+    parameters_apart,
 )
 from neurocal_cli.files.failures import one_line, value_failures
 from neurocal_cli.files.tree_fields import Field
 
 # A smaller focal length [px, share of the image's width] whose name tells no unit may be in mm.
 _LEAST_FOCAL, _LEAST_SHARE = 200.0, 0.2
+_LONG = 40  # characters
 
 
 class LooseKeys:
@@ -70,10 +75,10 @@ class LooseKeys:
     """
 
     def __init__(self, root: Field, distortion: str | None = None, notes: list[str] | None = None) -> None:
-        self.root, self.distortion = root, distortion
+        self.root, self.distortion = Field(parameters_apart(root.value), root.source, root.path), distortion
         self.notes = [] if notes is None else notes
         self.names: dict[str, list[str]] = {}
-        for key in root.value:
+        for key in self.root.value:
             self.names.setdefault(plain(str(key)), []).append(key)
         self.read: set[str] = set()
 
@@ -104,7 +109,7 @@ class LooseKeys:
         matrix = any(
             is_matrix(self.root.value[key])
             or (len(key) > 1 and (has_entries(self.root.value[key]) or is_four(self.root.value[key])))
-            for name in MATRIX
+            for name in (*ORIGINAL, *MATRIX)
             for form in ((name + side, side + name) if side else (name,))
             for key in self.names.get(form, [])
         )
@@ -113,9 +118,7 @@ class LooseKeys:
     def camera(self, side: str = "", name: str = "camera") -> Camera:
         """Read the camera, or that of one side."""
         inside = self.find(MATRIX, side, has_entries)
-        if (
-            inside is not None and inside is not self.root
-        ):  # it may hold the coefficients and the size as well
+        if inside is not None:  # it may hold the coefficients and the size as well
             own = {f"{key}_{side}" if side else key: value for key, value in inside.value.items()}
             if not own.keys() <= self.root.value.keys():
                 root = Field({**self.root.value, **own}, self.root.source)
@@ -168,19 +171,27 @@ class LooseKeys:
         with value_failures(self.root.source):
             return checked_size(size)
 
-    def refuse_unread(self) -> None:
-        """Refuse numbers that may be the distortion and were not read."""
+    def refuse_unread(self, every: bool = False) -> None:
+        """Refuse numbers that may be the distortion and were not read; `every` number of a mapping of it."""
         for key, value in self.root.value.items():
             name = plain(str(key))
-            if key in self.read or HARMLESS.search(name) or not is_numbers(value):
+            if key in self.read or HARMLESS.search(name):
                 continue
-            numbers = flat(value)
+            if isinstance(value, str) and not is_numbers(value):  # a long text may hold packed numbers
+                numbers, value = [1.0] * (len(value) >= _LONG and " " not in value), []
+            elif isinstance(value, dict) and not is_numbers(value):
+                numbers = [n for entry in value.values() if is_numbers(entry) for n in flat(entry)]
+            elif is_numbers(value):
+                numbers = flat(value)
+            else:
+                continue
             if isinstance(value, (list, dict)):
                 listed = len(numbers) in LENGTHS and not NO_LIST.search(name)
                 guess = not self.coefficients_read and listed and any(n != int(n) for n in numbers)
                 suspect = guess or SUSPECT.search(name) is not None
             else:
-                suspect = SUSPECT_NUMBER.fullmatch(name) is not None
+                word = SUSPECT_WORD.search(str(key)) is not None or every
+                suspect = SUSPECT_NUMBER.fullmatch(name) is not None or (word and numbers[0] % 1 != 0)
             if suspect and any(numbers):
                 raise InputError(
                     f"the key {str(key)[:60]!r} may be the distortion, and is not a known name of it; rename "
@@ -190,7 +201,9 @@ class LooseKeys:
     coefficients_read = False
 
     def _intrinsics(self, side: str) -> Intrinsics:
-        field = self.find(MATRIX, side, lambda value: is_matrix(value) or has_entries(value))
+        field = self.find(ORIGINAL, side, is_matrix)
+        if field is None:
+            field = self.find(MATRIX, side, lambda value: is_matrix(value) or has_entries(value))
         if field is None and not side and has_entries(self.root.value):
             field = self.root
         if field is None:
@@ -239,6 +252,12 @@ class LooseKeys:
             assert centre is not None  # `has_entries`
             four = [*(2 * flat(focal.value))[:2], *flat(centre.value)]
             size = self.image_size()
+            ratio = self.find(ASPECT, "", is_numbers)
+            if len(flat(focal.value)) == 1 and ratio is not None and ratio.number() not in (0, 1):
+                raise InputError(
+                    f"has one focal length and {ratio.path}, which programs take as fy / fx or fx / fy; give "
+                    "fx and fy"
+                )
             if len(four) != 4 or four[0] < (_LEAST_FOCAL if size is None else _LEAST_SHARE * size[0]):
                 raise InputError(
                     f"{focal.path} is not told to be in pixels; give a file with fx, fy, cx and cy in pixels"
@@ -319,12 +338,16 @@ class LooseKeys:
             if isinstance(field.value, dict) and "data" not in field.value:
                 inner = LooseKeys(field)
                 found = inner._coefficients("")
-                inner.refuse_unread()
+                inner.refuse_unread(every=True)
                 return found
             return matrix_data(field, -1), False
-        radial = self.find(RADIAL, side, is_numbers)
+        radial, tangential = (self.find(names, side, is_numbers) for names in (RADIAL, TANGENTIAL))
+        if radial is None and not side:  # mmpose and VoxelPose
+            radial, tangential = (
+                self.find((name,), "", counts)
+                for name, counts in (("k", lambda v: _count(v) in (2, 3, 6)), ("p", lambda v: _count(v) == 2))
+            )
         if radial is not None:
-            tangential = self.find(TANGENTIAL, side, is_numbers)
             k = (
                 matrix_data(radial, -1)
                 if not isinstance(radial.value, (int, float))
@@ -346,6 +369,10 @@ class LooseKeys:
             return np.array([values.get(f"k{n}", 0.0) for n in range(1, 5)]), False
         full = [values.get(name, 0.0) for name in names]
         return np.array(full if any(full[5:]) else full[:5]), True
+
+
+def _count(value: Any) -> int:
+    return len(flat(value)) if isinstance(value, list) else 0
 
 
 def _omnidirectional(xi: Field, coefficients: Array, model: str) -> Distortion:

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.camera.geometry import Array
-from neurocal_cli.files.exchange.camera_names import CENTRE, ENTRIES, FOCAL, plain
+from neurocal_cli.files.exchange.camera_names import CENTRE, ENTRIES, FOCAL, PARAMETERS, plain
 from neurocal_cli.files.tree_fields import is_number
+
+_MOST = 100.0  # of a coefficient
 
 
 def is_numbers(value: Any) -> bool:
@@ -47,6 +49,29 @@ def has_entries(value: Any) -> bool:
     return all(not names.isdisjoint(entry) for entry in ENTRIES) or not (
         pairs.isdisjoint(FOCAL) or pairs.isdisjoint(CENTRE)
     )
+
+
+def plain_lists(tree: Any, depth: int = 5) -> Any:
+    """The tree with lists for the mappings 0, 1, ... of JavaScript's arrays."""
+    if not isinstance(tree, dict) or depth == 0:
+        return tree
+    if tree and all(key == str(k) and is_numbers(value) for k, (key, value) in enumerate(tree.items())):
+        return list(tree.values())
+    return {key: plain_lists(value, depth - 1) for key, value in tree.items()}
+
+
+def parameters_apart(tree: dict[str, Any]) -> dict[str, Any]:
+    """The tree with fx, fy, cx, cy and the coefficients of a list of all as keys of their own."""
+    for key, value in tree.items():
+        if not (isinstance(value, list) and len(value) in (4, 8, 9, 12) and plain(str(key)) in PARAMETERS):
+            continue
+        four, k = value[:4], value[4:]
+        if all(type(n) in (int, float) for n in value) and min(four) > 1 and all(abs(n) < _MOST for n in k):
+            named = dict(zip(("fx", "fy", "cx", "cy"), four, strict=True))
+            if not named.keys() & tree.keys():
+                own = {**named, **({"distortion_coefficients": k} if k else {})}
+                return {**{name: entry for name, entry in tree.items() if name != key}, **own}
+    return tree
 
 
 def matrix_of(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:

@@ -24,13 +24,18 @@ from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.exchange import dictionary
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, from_vector
-from neurocal_cli.files.exchange.document import Document, assignments
+from neurocal_cli.files.exchange.document import FROM_ZERO, Document, assignments
+from neurocal_cli.files.exchange.loose_keys import LooseKeys
+from neurocal_cli.files.tree_fields import Field
 
 FIRST_PIXEL = 1.0  # MATLAB's coordinate of the first pixel
 _INTRINSICS = {"FocalLength", "PrincipalPoint", "RadialDistortion"}  # of cameraIntrinsics
+_CAMERAS = ({"IntrinsicMatrix"}, _INTRINSICS, {"K", "RadialDistortion"})
 STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
+_SCRIPT = re.compile(r"^\s*fc(_left)?\s*=\s*\[", re.MULTILINE).search
 _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -46,8 +51,8 @@ def matches(document: Document) -> object:
     struct = document.tree.get("cameraParams", document.tree)
     return (
         document.data.startswith(b"MATLAB 5.0 MAT-file")
-        or re.search(r"^\s*fc(_left)?\s*=\s*\[", document.text, re.MULTILINE)
-        or (isinstance(struct, dict) and ("IntrinsicMatrix" in struct or set(struct) >= _INTRINSICS))
+        or _SCRIPT(document.text)
+        or (isinstance(struct, dict) and any(keys <= set(struct) for keys in _CAMERAS))
     )
 
 
@@ -55,10 +60,10 @@ def read(document: Document) -> CameraSet:
     """Read the cameras of a ``.mat`` file of up to version 7; only MATLAB can read objects of its classes."""
     if document.data.startswith(b"MATLAB"):
         tree = read_variables(document.data, document.source)
-    elif document.tree:
-        tree = dict(document.tree)
-    else:
+    elif _SCRIPT(document.text):
         tree = assignments(document.text)
+    else:
+        tree = dict(document.tree)
     for name in STRUCTS:
         if isinstance(tree.get(name), dict):
             tree = tree[name]
@@ -74,17 +79,30 @@ def read(document: Document) -> CameraSet:
         parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
         cameras = _camera(parts[0]), _camera(parts[1])
         return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
-    if "IntrinsicMatrix" in tree or "K" in tree or set(tree) >= _INTRINSICS:
+    if {"K", "RDistort", "TDistort"} <= set(tree):  # DANNCE's Label3D
+        tree = {"IntrinsicMatrix": tree["K"], "RadialDistortion": tree["RDistort"],
+                "TangentialDistortion": tree["TDistort"]}  # fmt: skip
+    if any(keys <= set(tree) for keys in _CAMERAS):
         return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
     if any(re.fullmatch(r"x_\d+", name) for name in tree):
         raise InputError(
             "holds points of Bouguet's toolbox, and no camera; give it to convert without --what"
         )
+    plain = Field({name: _plain(value) for name, value in tree.items()}, document.source)
+    if LooseKeys(plain).has_camera():  # saved by Python, or of mexopencv
+        document.warnings.append(f"{document.source}: {FROM_ZERO}")
+        return dictionary.from_tree(plain, document)
     raise InputError(
         "holds no camera that can be read, and objects of MATLAB's classes can be read by MATLAB only; "
         "there, save a struct: cameraParams = toStruct(cameraParams); "
         "save('camera.mat', 'cameraParams', '-v7')"
     )
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, np.ndarray):
+        return value
+    return float(value.item()) if value.size == 1 else value.tolist()
 
 
 def _camera(tree: dict[str, Any]) -> Camera:

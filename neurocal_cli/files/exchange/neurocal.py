@@ -167,7 +167,10 @@ def matches(document: Document) -> bool:
     """Whether this is a calibration or a rig of neurocal."""
     tree = document.tree
     rig = "cameras" in tree and "rig" in tree
-    return "neurocal" in tree or rig or ("stereo" in tree and "left" in tree) or "neurocal_lens" in tree
+    left, stereo = tree.get("left"), tree.get("stereo")
+    others = isinstance(left, dict) and left and "neurocal" not in left and "format" not in (stereo or ())
+    pair = "left" in tree and "stereo" in tree and not others
+    return "neurocal" in tree or rig or pair or "neurocal_lens" in tree
 
 
 def read(document: Document) -> CameraSet:

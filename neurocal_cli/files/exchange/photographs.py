@@ -106,6 +106,45 @@ NERFSTUDIO = Format(
     first_pixel=0.5,
 )
 
+# Nerfies, HyperNeRF and the data of DyCheck: fy is the focal length times the aspect, and the pose is that of
+# the camera in the world.
+_NERFIES = CameraKeys(
+    "Nerfies",
+    ("focal_length", "fy", "principal_point/0", "principal_point/1"),
+    (
+        Lens(
+            ("",),
+            "plumb_bob",
+            tuple(f"{name}_distortion/{k}" for name, k in zip(("radial", "radial", "tangential", "tangential",
+                  "radial"), "01012", strict=True)),
+        ),
+    ),
+    size=("image_size",),
+    skew="skew",
+    first_pixel=0.5,
+)  # fmt: skip
+
+
+def _read_nerfies(document: Document) -> CameraSet:
+    root = document.root
+    fy = root["focal_length"].number() * root["pixel_aspect_ratio"].number()
+    lens = root.first(("tangential_distortion", "tangential"))
+    tree = {**root.value, "fy": fy, "tangential_distortion": None if lens is None else lens.value}
+    R = root["orientation"].array(3, 3)
+    pose = Pose(R, -R @ root["position"].array(3))
+    return mounted([_NERFIES.camera(Field(tree, root.source))], [pose], "Nerfies", None, "world")
+
+
+NERFIES = Format(
+    "Nerfies",
+    _NERFIES.models,
+    matches=lambda document: {"orientation", "position", "pixel_aspect_ratio"} <= set(document.tree),
+    read=_read_nerfies,
+    files="camera of Nerfies, HyperNeRF, DyCheck: JSON",
+    skew=True,
+    first_pixel=0.5,
+)
+
 # Gyroflow's lens profiles.
 _GYROFLOW = CameraKeys(
     "Gyroflow",

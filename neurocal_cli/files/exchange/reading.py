@@ -72,6 +72,7 @@ READ: tuple[Format, ...] = (
     capture.EASYMOCAP,
     sensors.ZED,
     sensors.OAK,
+    sensors.REALSENSE,
     sensors.KINECT,
     datasets.KITTI,
     datasets.MIDDLEBURY,
@@ -89,6 +90,7 @@ READ: tuple[Format, ...] = (
     odometry.SVO,
     direct_odometry.VIKIT,
     photographs.NERFSTUDIO,
+    photographs.NERFIES,
     reconstruction.METASHAPE,
     reconstruction.OPENMVG,
     reconstruction.ALICEVISION,
@@ -113,7 +115,10 @@ _REFUSED: tuple[tuple[bytes | str | Callable[[Document], object], str], ...] = (
     ),
     (b"\x89HDF", "is an HDF5 file, as MATLAB writes in its version 7.3; in MATLAB save it with -v7"),
     (
-        lambda d: re.match(rb"\x80[\2-\5]", d.data) and d.data.endswith(b"."),
+        lambda d: (
+            re.match(rb"\x80[\2-\5]|\(?[dl]p?\d|c(?:numpy|copy_reg|collections)", d.data)
+            and d.data.rstrip().endswith(b".")
+        ),
         "is a pickle of Python, which can run code and is not read; in Python load it, and save its numbers "
         "by numpy.savez('camera.npz', K=matrix, D=coefficients)",
     ),

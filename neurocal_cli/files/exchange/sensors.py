@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.files.exchange.camera_keys import CameraKeys, Lens
 from neurocal_cli.files.exchange.camera_set import CameraSet, Format, after, from_vector, inverse, mounted
 from neurocal_cli.files.exchange.document import Document
+from neurocal_cli.files.exchange.reconstruction import only
 from neurocal_cli.files.exchange.tree_texts import EIGHT, FIVE
 from neurocal_cli.files.tree_fields import Field
 
@@ -53,6 +55,57 @@ ZED = Format(
     read=_read_zed,
     files="SN*.conf of Stereolabs",
     rig="R of the vector (RX, CV, RZ), T = -(Baseline, TY, TZ)",
+)
+
+# RealSense, as rs-enumerate-devices -c lists its streams, and as Python prints intrinsics.
+_REALSENSE = CameraKeys(
+    "RealSense",
+    ("fx", "fy", "cx", "cy"),
+    (Lens(("None", "Brown Conrady", "Modified Brown Conrady", "Inverse Brown Conrady"), "plumb_bob", ("D",)),
+     Lens(("Kannala Brandt4",), "fisheye", ("D",))),
+    model="model",
+    size=("size",),
+)  # fmt: skip
+_STREAM = re.compile(
+    r'Intrinsics? of "(?P<name>[^"]+)" / *[^\n]*\n\s*Width:\s*(?P<w>\d+)\s*Height:\s*(?P<h>\d+)'
+    r"\s*PPX:\s*(?P<cx>\S+)\s*PPY:\s*(?P<cy>\S+)\s*Fx:\s*(?P<fx>\S+)\s*Fy:\s*(?P<fy>\S+)\s*Distortion:\s*"
+    r"(?P<model>[\w ]+?)\s*\n\s*Coeffs:(?P<k>[^\n]*)"
+)
+_PRINTED = re.compile(
+    r"\A\W*(?P<w>\d+)x(?P<h>\d+)\s+p\[(?P<cx>\S+) (?P<cy>\S+)\]\s+f\[(?P<fx>\S+) (?P<fy>\S+)\]\s+"
+    r"(?P<model>[A-Z][\w ]+?) \[(?P<k>[^\]]*)\]"
+)
+
+
+def _streams(document: Document) -> list[re.Match[str]]:
+    return list(_STREAM.finditer(document.text[:200_000])) or list(_PRINTED.finditer(document.text[:1000]))
+
+
+def _read_realsense(document: Document) -> CameraSet:
+    cameras = {}
+    for found in _streams(document):
+        size = [int(found["w"]), int(found["h"])]
+        if document.size not in (None, tuple(size)):
+            continue
+        k = Field(found["k"].split(), document.source, "Coeffs").array(-1)
+        if found["model"].startswith(("Inverse", "Modified")) and k.any():
+            raise InputError(
+                f"the model {found['model']} of RealSense is not known here; calibrate its images, or use "
+                "streams that the camera undistorts"
+            )
+        values = {key: found[key] for key in ("fx", "fy", "cx", "cy", "model")}
+        tree = {**values, "D": k.tolist(), "size": size}
+        name = found.groupdict().get("name") or "camera"
+        cameras[f"{name} {size[0]}x{size[1]}"] = _REALSENSE.camera(Field(tree, document.source), name)
+    return only(cameras.values(), cameras, "RealSense")
+
+
+REALSENSE = Format(
+    "RealSense",
+    _REALSENSE.models,
+    matches=_streams,
+    read=_read_realsense,
+    files="list of rs-enumerate-devices -c, and Python's text of intrinsics",
 )
 
 # DepthAI's boards: a socket and its camera in turn, lengths in cm. The extrinsics map a camera's frame to
