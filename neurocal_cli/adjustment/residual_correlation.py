@@ -57,10 +57,17 @@ def _other_way(views: Views, across: Array) -> NDArray[np.int64]:
     return np.asarray(np.abs(nu * np.cos(lie) + nv * np.sin(lie)) > np.sqrt(0.5), dtype=np.int64)
 
 
-def effective_number(n: float, rho: float) -> float:
-    """Effective number of independent points among n correlated ones in the plane."""
+def effective_number(n: float, rho: float, side: float = np.inf) -> float:
+    """Effective number of independent points among n correlated ones in the plane.
+
+    `side` is the number of points along the sides of independent areas, as views are: however strong the
+    correlation, it ends there.
+    """
     rho = min(max(rho, 0.0), 0.99)
-    return max(n * ((1 - rho) / (1 + rho)) ** 2, 1.0)
+    mean = (1 + rho) / (1 - rho)  # variance of the mean of a row, times its points
+    if np.isfinite(side):
+        mean -= 2 * rho * (1 - rho**side) / (side * (1 - rho) ** 2)
+    return max(n / mean**2, 1.0)
 
 
 def point_residuals(views: Views, state: CameraState) -> Array:

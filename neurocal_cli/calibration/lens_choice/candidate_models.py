@@ -99,9 +99,12 @@ class Candidate:
         """Sum of squared errors of data that are held out."""
         return float(self.lost.sum())
 
-    def criterion(self, n: float) -> float:
-        """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
-        penalty = max(np.log(n), _LEAST_PENALTY) * self.coefficients
+    def criterion(self, n: float, least: float = _LEAST_PENALTY) -> float:
+        """Bayesian information criterion (Schwarz 1978) for n independent residuals.
+
+        `least` is the lowest penalty of a coefficient.
+        """
+        penalty = max(np.log(n), least) * self.coefficients
         return float(n * np.log(max(self.cost, 1e-300)) + penalty)
 
 
@@ -342,7 +345,8 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
     if not fitted:
         return 1.0
     closest = min(fitted, key=lambda candidate: candidate.cost).adjusted.state
-    return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)))
+    side = float(np.sqrt(np.mean(views.counts)))
+    return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)), side)
 
 
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:

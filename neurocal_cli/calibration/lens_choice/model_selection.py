@@ -180,13 +180,14 @@ def _best(
     The second result is all models that no other one predicts decidedly better than.
 
     Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
-    models, but among many models one is the best by chance.
+    models, but among many models one is the best by chance. The least penalty does not count here: where the
+    residuals are worth few independent ones, it would exclude any lens.
     """
     eligible = _eligible(fitted, views.n_views > 1)
     n = worth(views, eligible.values()) * repeated.worth
     sound = _eligible(_without_wide(fitted, n), views.n_views > 1)
     criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
-    most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + MORE
+    most = min(sound.values(), key=lambda c: c.criterion(n, least=0.0)).coefficients + MORE
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
     few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
     if not few:

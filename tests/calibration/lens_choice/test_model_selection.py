@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from support.campaign import scene as campaign_scene
 from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
+from support.marked import plane_of
+from support.real_data import RealFiles
 from support.scenes import Scene, random_solid, table_1
 from support.slow_cases import slow_but
 
-from neurocal_cli import Calibration, calibrate
+from neurocal_cli import Board, Calibration, Correspondences, calibrate, detect_points, read_image
 from neurocal_cli.calibration.lens_choice.candidate_models import _Chain
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import DegenerateGeometryError
@@ -69,6 +71,18 @@ def test_no_lens_is_found_where_there_is_none_in_one_view(seed: int) -> None:
     while len(scene.world) < 40:
         scene = random_solid(rng, 1, False)
     assert chosen(scene, seed).distortion_model == "none"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [slice(0, None, 2), slice(1, None, 2), slice(0, 6), slice(6, None)])
+def test_views_of_a_board_that_bends_have_their_lens(real_files: RealFiles, half: slice) -> None:
+    # Neighbours err alike, as the board bends in the hands: these few views are worth about 40 residuals.
+    board = Board((plane_of("charuco:8x8:25.4:19.05"),))
+    paths = real_files("charuco_lifecam/legacy*.jpg")[half]
+    found = {path.stem: detect_points(read_image(path).grey, board, "vertices") for path in paths}
+    camera = calibrate(Correspondences.from_detections(found))
+    assert camera.distortion_model in ("plumb_bob", "rational")  # the other half: 0.31 to 0.42, else 0.5 px
+    assert camera.rmse_px < 0.3
 
 
 def test_a_strong_lens_whose_boards_leave_a_pinhole_open_is_chosen() -> None:
