@@ -35,11 +35,7 @@ from neurocal_cli.calibration.calibration import (
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
 from neurocal_cli.calibration.verdict.findings import SPARE, Finding, pixel_spread, verdict_of
-from neurocal_cli.calibration.verdict.given_parameters import (
-    Reestimated,
-    reestimate_centre,
-    reestimate_centre_and_target,
-)
+from neurocal_cli.calibration.verdict.given_parameters import hidden_by_lens, hidden_by_target
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
 from neurocal_cli.calibration.verdict.projection_uncertainty import (
@@ -52,7 +48,7 @@ from neurocal_cli.calibration.verdict.proportions import Proportions, proportion
 from neurocal_cli.calibration.verdict.rules import reach_verdict
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import xi_is_flat
-from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.geometry import Array, cross_matrix, median
 from neurocal_cli.camera.state import CameraState
 from neurocal_cli.observations.points import Correspondences
@@ -245,8 +241,8 @@ class _AtMinimum:
             poses=self.repeated.n_poses,
             # Sigmas that are wrong give single points the weight that all this is computed with.
             contest=self._contest() if causes and not stated else None,
+            of_given=tuple(self._of_given()),
             mirrored=tuple(seen_from_behind(views, self.state)),
-            reestimated=self._reestimated(),
             noise=(
                 *stated,
                 *self._survey(),
@@ -255,24 +251,6 @@ class _AtMinimum:
             stated=bool(stated),
             proportions=self._proportions(contradiction),
         )
-
-    def _reestimated(self) -> tuple[Reestimated, ...]:
-        """A given centre as the points have it, of several estimates the farthest one."""
-        given, rich = self.calibration.fixed, self.state.model == "rich"
-        if self.calibration.type != 2 or self._is_exact():
-            return ()
-        target, p = self.calibration.target, {"p1", "p2"} - given
-        points, views = self._as_given()
-        found: tuple[Reestimated, ...] = ()
-        if not rich and not (target is None and p.isdisjoint(coefficient_names(self.state.model))):
-            state = normalised(self.given, views)
-            found = reestimate_centre(views, state, given, self.free_poses, self.variance)
-        found += reestimate_centre_and_target(points, views, self.given, given, self.variance)
-        farthest: dict[str, Reestimated] = {}
-        for a in found:
-            if a.name not in farthest or abs(a.found - a.given) > abs(farthest[a.name].found - a.given):
-                farthest[a.name] = a
-        return tuple(farthest.values())
 
     def _residuals(self) -> Array:
         """(N, 2) predicted minus observed [px], in the order of the points."""
@@ -356,11 +334,15 @@ class _AtMinimum:
         variance = np.diagonal(self.pose_covariance, axis1=1, axis2=2)
         return held and replace(held, std_of_poses=np.sqrt(np.maximum(variance, 0.0)))
 
-    def _as_given(self) -> tuple[Correspondences, Views]:
-        """The points at the coordinates of the given target, also arranged by views."""
+    def _of_given(self) -> list[Finding]:
+        """What the points say against a given centre that the lens or the target hides."""
         target = self.calibration.target
+        if self.calibration.type != 2 or self._is_exact():
+            return []
+        if target is None and self.state.model != "rich":
+            return hidden_by_lens(self.calibration, self.views, self.given, self.free, self.repeated.worth)
         points = self.points if target is None else target.as_given(self.points)
-        return points, self.views if target is None else self._arranged(points)
+        return hidden_by_target(self.calibration, points, self._arranged(points), self.given)
 
     def _proportions(self, contradiction: float) -> Proportions | None:
         given = self.calibration.target is None and self.calibration.type in (1, 2)

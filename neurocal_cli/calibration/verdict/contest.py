@@ -63,18 +63,19 @@ def contest(
     *,
     named_lens: bool = True,
     worth: float = 1.0,
+    more: tuple[Rival, ...] = (),
 ) -> Contest | None:
     """Let the rivals compete at the minimum of a camera; None if its views do not determine it.
 
     The state is normalised, and `free` (5 + K,) tells which of A's entries and the coefficients are
     estimated. A lens that was selected is not too simple. `worth` is the effective share of the views if they
-    repeat poses.
+    repeat poses. Rivals of this case alone may be given as `more`.
     """
     if not free_poses or views.n_equations <= int(free.sum()) + 6 * views.n_views:
         return None
     lin = linearised(views, state, free, free_poses, EFFECTS, image_size, named_lens)
     try:
-        return _held(lin, RIVALS, worth)
+        return _held(lin, (*RIVALS, *more), worth)
     except np.linalg.LinAlgError:
         return None
 

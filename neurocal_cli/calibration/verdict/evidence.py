@@ -10,7 +10,6 @@ import numpy as np
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.verdict.contest import Contest
 from neurocal_cli.calibration.verdict.findings import Finding
-from neurocal_cli.calibration.verdict.given_parameters import Reestimated
 from neurocal_cli.calibration.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.calibration.verdict.proportions import Proportions
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -86,7 +85,7 @@ class Evidence:
     projection: ProjectionUncertainty | None
     repeated: tuple[str, ...]  # views that are copies of others
     mirrored: tuple[str, ...]  # views that show the target mirrored
-    reestimated: tuple[Reestimated, ...]  # a given centre, estimated from the points
+    of_given: tuple[Finding, ...]  # against a given centre that the lens or the target hides
     noise: tuple[Finding, ...]  # residuals unlike measurement noise, or that contradict the stated noise
     stated: bool  # whether the residuals contradict the stated standard deviations of the pixels
     poses: int  # number of different poses among the views (`repeated_poses`)

@@ -16,7 +16,10 @@ _CHANGED = Limit(0.001, 0.05)  # of the focal length
 _APART = Limit(0.01, 0.05)  # of the focal length
 # Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 %.
 _OFF = Limit(0.005, 0.05)  # of the focal length
-_GIVEN = Limit(0.002, 0.05)  # of the focal length
+GIVEN = Limit(0.002, 0.05)
+"""Limits of the change of a given focal length or centre, over the focal length."""
+SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
+"""Advice where it is wrong."""
 _LENS = Limit(0.0002, 0.002)  # of the image's diagonal: 0.16 px and 1.6 px of 640 x 480
 _MOVED = Limit(0.0012, 0.02)  # of the image's diagonal; photographs taken by hand move by up to 0.001
 _BLOCKS = (8, 16)  # sizes of the blocks of video codecs [px]
@@ -43,9 +46,9 @@ RIVALS: tuple[Rival, ...] = (
     Rival(
         "a wrong given parameter",
         "the given focal length or centre, moved, takes the residuals away",
-        "check that what is given is of the same camera at the same zoom, focus and image size",
+        SAME,
         words.wrongly_given,
-        _GIVEN,
+        GIVEN,
         patterns.common,
         steps=effects.given,
         of_given=True,
@@ -53,7 +56,7 @@ RIVALS: tuple[Rival, ...] = (
     Rival(
         "a wrong given distortion",
         "other coefficients than the given ones take the residuals away",
-        "check that what is given is of the same camera at the same zoom, focus and image size",
+        SAME,
         words.wrongly_given_lens,
         DISPLACED,
         patterns.common,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -25,10 +25,8 @@ from neurocal_cli.calibration.verdict.findings import (
     two_digits,
     verdict_of,
 )
-from neurocal_cli.calibration.verdict.given_parameters import Reestimated, told_apart
 from neurocal_cli.calibration.verdict.odd_points import are_normalised, odd_pixels, odd_points
 from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, unlike_axes
-from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import plural
 from neurocal_cli.observations.board import is_flat
 from neurocal_cli.observations.target import Target
@@ -44,7 +42,6 @@ _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
-_GIVEN = Limit(0.002, 0.05)  # difference over alpha
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
 _CROPPED = 0.02  # share of the image's size: three std of a centre that is well known
@@ -56,7 +53,6 @@ _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED_POOR = 0.025  # stretch of one side against the other
 _SPACING = 0.004  # rms over rms; of nine boards of photographs none is off by more than 0.0017
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
-_SAME = "check that what is given is of the same camera at the same zoom, focus and image size"
 _TOLD = 3.0  # standard deviations
 
 
@@ -93,7 +89,7 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         yield 2, f"training did not converge: {calibration.stop_reason}", more
     yield from _redundancy(calibration)
     # A given camera that is wrong explains the errors, so it is reported before them.
-    given = list(given_parameters(evidence.reestimated, calibration.intrinsics, calibration.std))
+    given = evidence.of_given
     yield from given
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # A cause explains the other errors, so it is reported first even if it hardly biases the camera.
@@ -190,17 +186,6 @@ def _by_flexing(e: Evidence, diagonal: float) -> bool:
 def _is_unknown(e: Evidence) -> bool:
     """Whether no known cause explains the residuals best."""
     return e.contest is not None and bool(e.contest.causes) and e.contest.causes[0].rival.unknown
-
-
-def given_parameters(
-    reestimated: tuple[Reestimated, ...], given: Intrinsics, std: Mapping[str, float]
-) -> Iterator[Finding]:
-    """Finding about given parameters, with these standard deviations, that the points contradict."""
-    told = told_apart(reestimated, std)
-    if told:
-        off = max(abs(a.found - a.given) for a in told) / given.alpha_u
-        texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
-        yield _GIVEN.grade(off), ", ".join(texts), _SAME
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -105,9 +107,8 @@ def test_a_wrong_centre_and_a_board_off_its_file_are_told_together(
     assert found.verdict is not None
     assert found.verdict.word != "good"
     (given,) = [reason for reason in found.verdict.reasons if "is given, but the points give" in reason]
-    told = {a.name: a.found for a in gather_evidence(found).reestimated}
-    assert np.abs([told["u0"] - centre[0], told["v0"] - centre[1]]).max() < 3.0
-    assert "v0" in given
+    told = dict(re.findall(r"(.0) = [0-9.]+ is given, but the points give ([0-9.]+)", given))
+    assert np.abs([float(told["u0"]) - centre[0], float(told["v0"]) - centre[1]]).max() < 3.0
 
 
 def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
@@ -123,7 +124,8 @@ def test_the_middle_of_the_image_is_not_taken_for_the_centre() -> None:
 def test_one_flat_view_does_not_tell_what_it_would_ask_for() -> None:
     points = flat().select(np.arange(3 * 93, 4 * 93))
     found = calibrate(points, type=2, skew=False, image_center=(318.0, 243.0))
-    assert gather_evidence(found).reestimated == ()
+    assert found.verdict is not None
+    assert not any("is given, but" in reason for reason in found.verdict.reasons)
 
 
 def test_a_camera_that_is_given_without_its_distortion_is_named() -> None:
