@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.rig.combine import stereo_problem
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.relative_poses import in_order
+from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.camera.pinhole import Pose
@@ -104,7 +104,7 @@ def all_shifted(problem: RigProblem) -> str:
 
 def neighbours(pairs: Sequence[Pair], word: str) -> list[Pair]:
     """Each left view with the right view of the next, or of the previous, pair."""
-    ordered = in_order(pairs)
+    ordered = [pairs[k] for k in in_sequence(tuple(a for a, _ in pairs))]
     first, second = (ordered[:-1], ordered[1:]) if word == "next" else (ordered[1:], ordered[:-1])
     return [(a, b) for (a, _), (_, b) in zip(first, second, strict=True)]
 

@@ -26,9 +26,8 @@ from neurocal_cli.calibration.rig.consensus import (
     with_shifted,
 )
 from neurocal_cli.calibration.rig.frames import groups
-from neurocal_cli.calibration.rig.odd_pairs import MEDIAN, SUSPECT, odd_pairs
+from neurocal_cli.calibration.rig.odd_pairs import MEDIAN, SUSPECT, odd_pairs, relative_poses
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.relative_poses import relative_poses
 from neurocal_cli.calibration.verdict.findings import name_some
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import median, nearest_rotation
@@ -103,9 +102,9 @@ def _edge(problem: RigProblem, pair: Pair) -> Edge:
     poses = relative_poses(two, consensus.rig)
     if poses is not None:
         faults = {one: why for one, why in faults.items() if why != UNSYNCHRONISED}
-        used = np.array([name not in faults for name in poses.names])
+        used = np.array([pair not in faults for pair in two.pairs])
         if used.any():
-            odd = zip(poses.names, odd_pairs(poses, used), strict=True)
+            odd = zip(two.pairs, odd_pairs(poses, used), strict=True)
             faults |= {one: UNSYNCHRONISED for one, is_odd in odd if is_odd}
     return Edge(pair, two, consensus, faults)
 

@@ -152,18 +152,14 @@ def _without_contradictions(
         )
 
     fit, warnings = fitted()
-    suspects = [view for view, why in left_out.items() if is_suspect(why)]
-    if suspects:
+    if suspects := _suspects(left_out):
         # The others tell whether the suspects have a cause in common, or which of them fit after all.
         still = at_fit(_detached(problem, _named(left_out), names), fit)
         found = named_cause(still, names, free=of_rig(still))[0]
-        if found is not None and evidence_by_parts(still, fit, found) > evidence_of_odd(
-            still, fit, len(suspects)
-        ):
-            held = set(suspects)
-        else:
-            held = set(_views(problem, fitting(still))) & set(suspects)
-        if held:
+        common = found is not None and (
+            evidence_by_parts(still, fit, found) > evidence_of_odd(still, fit, len(suspects))
+        )
+        if held := suspects if common else suspects & set(_views(problem, fitting(still))):
             left_out = {view: why for view, why in left_out.items() if view not in held}
             fit, warnings = fitted()
     for _ in names:
@@ -179,6 +175,11 @@ def _without_contradictions(
             if again.text == found.text:
                 break
             found = again
+    if left_out.keys() > (suspects := _suspects(left_out)):  # without the others, some may fit
+        still = at_fit(_detached(problem, _named(left_out), names), fit)
+        if held := suspects & set(_views(problem, fitting(still))):
+            left_out = {view: why for view, why in left_out.items() if view not in held}
+            fit, warnings = fitted()
     return fit, left_out, warnings
 
 
@@ -223,6 +224,11 @@ def _views(problem: RigProblem, chosen: Sequence[NDArray[np.bool_]]) -> list[tup
         for view, is_in in zip(own, which, strict=True)
         if is_in
     ]
+
+
+def _suspects(left_out: Mapping[tuple[int, str], str]) -> set[tuple[int, str]]:
+    """The other ones."""
+    return {view for view, why in left_out.items() if is_suspect(why)}
 
 
 def _named(left_out: Mapping[tuple[int, str], str]) -> dict[tuple[int, str], str]:

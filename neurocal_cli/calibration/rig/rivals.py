@@ -84,7 +84,7 @@ def _ranked(
     step = inverse @ g
     squares = max(squares - float(g @ step), 0.0)
     sides = range(len(names))
-    seen = [_of_camera(fit, side, free) for side in sides]
+    seen = [seen_by(fit, side, free) for side in sides]
     for cause in causes:
         for subject in _subjects(cause, len(names)):
             members = sides if subject < 0 else (subject,)
@@ -92,7 +92,7 @@ def _ranked(
             if not any(part.any() for part in Z):
                 continue
             frames, labels = _frames_of(problem, members)
-            A, X, r = _along(arrow, frames, [seen[side] for side in members], Z)
+            A, X, r = along(arrow, frames, [seen[side] for side in members], Z)
             A, X, r = (_sums(part, cause.is_change, not len(free)) for part in (A, X, r))
             if not len(A):
                 continue
@@ -175,7 +175,7 @@ def _sums(of_frames: Array, is_change: bool, either: bool) -> Array:
 
 
 @frozen_dataclass(eq=False)
-class _Seen:
+class SeenBy:
     """What a camera's views say about what moves in them, by alpha_u, alpha_v and the pose of each."""
 
     frame: NDArray[np.intp]  # (V_c,)
@@ -185,7 +185,8 @@ class _Seen:
     right: Array  # (V_c, 8)
 
 
-def _of_camera(fit: RigFit, side: int, free: NDArray[np.intp]) -> _Seen:
+def seen_by(fit: RigFit, side: int, free: NDArray[np.intp]) -> SeenBy:
+    """What the views of a camera say, with these free shared unknowns (f,)."""
     problem, state = fit.problem, fit.state
     observed = problem.observations[side]
     N = observed.weight * normal_blocks(observed.batches, problem.camera(state, side))[0]
@@ -195,7 +196,7 @@ def _of_camera(fit: RigFit, side: int, free: NDArray[np.intp]) -> _Seen:
         :, _FREE[:, None], camera_columns(len(state.cameras[side].k))
     ]
     shared[:, :, of_rig] = N[:, _FREE[:, None], POSE_COLUMNS] @ by_rig
-    return _Seen(
+    return SeenBy(
         observed.view,
         N[:, _FREE[:, None], _FREE],
         np.swapaxes(by_pose, 1, 2) @ N[:, POSE_COLUMNS[:, None], _FREE],
@@ -204,8 +205,8 @@ def _of_camera(fit: RigFit, side: int, free: NDArray[np.intp]) -> _Seen:
     )
 
 
-def _along(
-    arrow: Arrowhead, frames: NDArray[np.intp], seen: Sequence[_Seen], Z: Sequence[Array]
+def along(
+    arrow: Arrowhead, frames: NDArray[np.intp], seen: Sequence[SeenBy], Z: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
     """What some frames say about the unknowns of a cause, with the poses of the frames eliminated.
 

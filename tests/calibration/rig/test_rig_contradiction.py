@@ -17,12 +17,12 @@ from neurocal_cli.calibration.rig.causes import Named
 from neurocal_cli.calibration.rig.combine import stereo_problem
 from neurocal_cli.calibration.rig.consensus import find_consensus
 from neurocal_cli.calibration.rig.covariance import not_smaller
-from neurocal_cli.calibration.rig.odd_pairs import odd_pairs
+from neurocal_cli.calibration.rig.odd_pairs import RelativePoses, odd_pairs, relative_poses
 from neurocal_cli.calibration.rig.pairing import pair_views
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.rig.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.calibration.rig.rivals import named_cause
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
+from neurocal_cli.calibration.verdict.findings import in_sequence
 from neurocal_cli.camera.geometry import rotation_step, rotation_vector
 from neurocal_cli.errors import DegenerateGeometryError
 
@@ -68,7 +68,7 @@ def test_the_vector_of_a_rotation_leads_back_to_it() -> None:
 
 def test_names_count_numbers_as_numbers() -> None:
     names = ["v10", "v9", "v²", "v1b2", "v1b11", "7"]
-    ordered = [a for a, _ in in_order([(name, name) for name in names])]
+    ordered = [names[k] for k in in_sequence(tuple(names))]
     assert ordered == ["7", "v1b2", "v1b11", "v9", "v10", "v²"]
 
 
