@@ -54,16 +54,15 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
         return
     from neurocal_cli.calibration.advice import advise as weigh
     from neurocal_cli.commands.show.advice import advice_json, advice_lines
+    from neurocal_cli.commands.show.advised_views import draw_advice
     from neurocal_cli.files.calibration_tree import calibration_from_field
 
     known = calibration_from_field(root)
     with ProgressBar("comparing views"):
         advice = weigh(known, count)
     answer(as_json, lambda: advice_json(advice), lambda: "\n".join(advice_lines(advice, known.verdict)))
+    write_plot(plot, draw_advice, advice, known)
     if plot is not None:
-        from neurocal_cli.commands.show.advised_views import draw_advice
-
-        write_plot(plot, draw_advice, advice, known)
         suggest(calibration, "photograph these views, and calibrate from all images again")
     elif not as_json:
         suggest(calibration, "neurocal advise {} --plot next.png")
@@ -73,13 +72,11 @@ def _advise_rig(root: Field, count: int, plot: str | None, as_json: bool) -> Non
     """Advise views that tie the cameras of a rig."""
     from neurocal_cli.calibration.rig.advice import advise_rig
     from neurocal_cli.commands.show.advice import rig_advice_json, rig_advice_lines
+    from neurocal_cli.commands.show.advised_views import draw_rig_advice
     from neurocal_cli.files.rig_yaml import rig_from_field
 
     rig = rig_from_field(root)
     with ProgressBar("comparing views"):
         advice = advise_rig(rig, count)
     answer(as_json, lambda: rig_advice_json(advice), lambda: "\n".join(rig_advice_lines(advice)))
-    if plot is not None:
-        from neurocal_cli.commands.show.advised_views import draw_rig_advice
-
-        write_plot(plot, draw_rig_advice, advice, rig)
+    write_plot(plot, draw_rig_advice, advice, rig)

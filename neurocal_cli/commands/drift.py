@@ -8,7 +8,7 @@ import click
 
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import plot_option, write_plot
-from neurocal_cli.commands.streams import note, print_summary
+from neurocal_cli.commands.streams import answer, note
 from neurocal_cli.errors import FormatError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
         drift_lines,
         drift_tables,
     )
-    from neurocal_cli.commands.show.terminal import show
+    from neurocal_cli.commands.show.text import tabulated
 
     before, after = _read(old), _read(new)
     found = find_drift(before, after)
@@ -71,10 +71,11 @@ def drift(old: str, new: str, plot: str | None, as_json: bool) -> None:
             f"the distortion models differ ({models[0]} and {models[1]}), which may be all that changed; "
             "calibrate both with the same --distortion"
         )
-    if as_json:
-        print_summary(drift_json(found) | details_json(before, after, found))
-    else:
-        show(drift_tables(before, after, found), drift_lines(found))
+    answer(
+        as_json,
+        lambda: drift_json(found) | details_json(before, after, found),
+        lambda: tabulated(drift_tables(before, after, found), drift_lines(found)),
+    )
     if found.different:
         click.get_current_context().exit(_DIFFERENT)
 

@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.pages import Plots, files_of, panel_option, write_plots
 from neurocal_cli.commands.show import CAMERA_PANELS, SPACE_PANELS
-from neurocal_cli.commands.streams import first_of, note, print_summary, suggest, warn
+from neurocal_cli.commands.streams import answer, first_of, note, suggest, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -178,12 +178,11 @@ def camera(
     from neurocal_cli.commands.show.drift_report import drift_json, since_line
     from neurocal_cli.commands.show.plane_report import (
         plane_json,
-        plane_table,
-        position_table,
+        plane_tables,
+        position_tables,
         positions_json,
     )
-    from neurocal_cli.commands.show.terminal import show
-    from neurocal_cli.commands.show.text import verdict_lines
+    from neurocal_cli.commands.show.text import tabulated, verdict_lines
 
     judged, seen = preparation.calibration_or_camera(calibration, given)
     own = judged if isinstance(judged, Calibration) else None
@@ -213,16 +212,16 @@ def camera(
     if evaluation.on_target:
         note("the points are taken where the calibration found them, not where their file has them")
     warn(*evaluation.warnings)
-    if as_json:
-        since = {} if drift is None else {"drift": drift_json(drift)}
-        work = {} if on_plane is None else {"at": plane_json(on_plane)}
-        where = {"positions": positions_json(places)} if positions else {}
-        print_summary(evaluation_json(evaluation, verdict) | since | work | where)
-    else:
-        tables = [*evaluation_tables(evaluation)]
-        tables += [] if on_plane is None or own is None else [plane_table(on_plane, own.unit)]
-        tables += [position_table(places, own.unit)] if places and own is not None else []
-        show(tables, [*([since_line(drift)] if anew else []), *verdict_lines(verdict)])
+    since = {} if drift is None else {"drift": drift_json(drift)}
+    where = {"positions": positions_json(places)} if positions else {}
+    unit = "" if own is None else own.unit
+    tables = *evaluation_tables(evaluation), *plane_tables(on_plane, unit), *position_tables(places, unit)
+    lines = [*([since_line(drift)] if anew else []), *verdict_lines(verdict)]
+    answer(
+        as_json,
+        lambda: evaluation_json(evaluation, verdict) | since | plane_json(on_plane) | where,
+        lambda: tabulated(tables, lines),
+    )
     if plots:
         from neurocal_cli.commands.show.camera_panels import Subject
         from neurocal_cli.commands.show.plot_pages import draw_camera
@@ -315,14 +314,13 @@ def stereo(
     if at is not None and rig is None:
         raise UsageError("--at needs a rig; give one that neurocal stereo wrote")
     space = _errors_at(at, rig)
-    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
+    from neurocal_cli.commands.show.plane_report import plane_json, plane_tables
     from neurocal_cli.commands.show.stereo_report import (
         stereo_evaluation_json,
         stereo_evaluation_tables,
         views_alone,
     )
-    from neurocal_cli.commands.show.terminal import show
-    from neurocal_cli.commands.show.text import verdict_lines
+    from neurocal_cli.commands.show.text import tabulated, verdict_lines
 
     note(*views_alone(evaluation.alone))
     if evaluation.fitted:
@@ -331,12 +329,12 @@ def stereo(
             "the cameras fixed"
         )
     warn(*evaluation.warnings)
-    if as_json:
-        work = {} if space is None else {"at": plane_json(space)}
-        print_summary(stereo_evaluation_json(evaluation) | work)
-    else:
-        more = () if space is None else (plane_table(space, evaluation.unit),)
-        show((*stereo_evaluation_tables(evaluation), *more), verdict_lines(evaluation.verdict))
+    tables = *stereo_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
+    answer(
+        as_json,
+        lambda: stereo_evaluation_json(evaluation) | plane_json(space),
+        lambda: tabulated(tables, verdict_lines(evaluation.verdict)),
+    )
     if plots:
         from neurocal_cli.commands.show.plot_pages import draw_points_in_space
 
@@ -384,10 +382,9 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     named = [named_file(word) for word in points]
     preparation.check((file, *(name for _, name in named)))
     from neurocal_cli.calibration.rig.rig_evaluation import evaluate_rig
-    from neurocal_cli.commands.show.plane_report import plane_json, plane_table
+    from neurocal_cli.commands.show.plane_report import plane_json, plane_tables
     from neurocal_cli.commands.show.rig_report import rig_evaluation_json, rig_evaluation_tables
-    from neurocal_cli.commands.show.terminal import show
-    from neurocal_cli.commands.show.text import verdict_lines
+    from neurocal_cli.commands.show.text import tabulated, verdict_lines
     from neurocal_cli.files.rig_points import read_rig_points
     from neurocal_cli.files.rig_yaml import read_rig
 
@@ -397,13 +394,14 @@ def rig(file: str, points: tuple[str, ...], at: Distance | None, as_json: bool) 
     evaluation, space = evaluate_rig(found, given), _errors_at(at, found)
     if evaluation.n_behind:
         warn(f"{evaluation.n_behind} points came out behind a camera and are left out of all averages")
-    if as_json:
-        work = {} if space is None else {"at": plane_json(space)}
-        print_summary(rig_evaluation_json(evaluation) | work)
-        return
-    more = () if space is None else (plane_table(space, evaluation.unit),)
-    show((*rig_evaluation_tables(evaluation), *more), verdict_lines(evaluation.verdict))
-    suggest(file, "neurocal report {} -o report.html")
+    tables = *rig_evaluation_tables(evaluation), *plane_tables(space, evaluation.unit)
+    answer(
+        as_json,
+        lambda: rig_evaluation_json(evaluation) | plane_json(space),
+        lambda: tabulated(tables, verdict_lines(evaluation.verdict)),
+    )
+    if not as_json:
+        suggest(file, "neurocal report {} -o report.html")
 
 
 def _evaluate_stereo(

@@ -10,7 +10,7 @@ from neurocal_cli.commands.streams import (
     ProgressBar,
     answer,
     concluding,
-    note,
+    noted,
     print_summary,
     say,
     suggest,
@@ -145,13 +145,12 @@ def fit(
     preparation.compute_in_one_thread()
     preparation.check(points, (output,), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.zoom.fit import LensCameras, fit_lens, fit_lens_cameras
+    from neurocal_cli.commands.show.zoom_plots import draw_lens
     from neurocal_cli.commands.show.zoom_report import lens_json, lens_report
     from neurocal_cli.files.lens_points import read_lens_data
     from neurocal_cli.files.lens_yaml import write_lens
 
-    notes: list[str] = []
-    data = read_lens_data(points, notes=notes)
-    note(*notes)
+    data = noted(read_lens_data, points)
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
@@ -173,10 +172,7 @@ def fit(
     with concluding(learnt, as_json, lens_json, lens_report):
         if not preparation.is_for_the_eye(output, "lens.yaml"):
             write_lens(learnt, output)
-        if plot is not None:
-            from neurocal_cli.commands.show.zoom_plots import draw_lens
-
-            write_plot(plot, draw_lens, learnt)
+        write_plot(plot, draw_lens, learnt)
         settings = " ".join(f"--{name} {name[0].upper()}" for name in learnt.controls)
         suggest(output, f"neurocal lens camera {{}} {settings} -o camera.yaml")
 
@@ -277,14 +273,13 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
         return
     from neurocal_cli.calibration.zoom.evaluation import evaluate_lens
     from neurocal_cli.calibration.zoom.judgement import judge_lens
+    from neurocal_cli.commands.show.zoom_plots import draw_evaluation
     from neurocal_cli.commands.show.zoom_report import evaluation_json, evaluation_report
     from neurocal_cli.files.lens_points import read_lens_points
     from neurocal_cli.files.lens_yaml import read_lens
 
     learnt = read_lens(lens_file)
-    notes: list[str] = []
-    data = read_lens_points(points, notes=notes)
-    note(*notes)
+    data = noted(read_lens_points, points)
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     answer(
@@ -293,10 +288,7 @@ def evaluate(lens_file: str, points: str | None, plot: str | None, as_json: bool
         lambda: evaluation_report(evaluation, learnt.controls, verdict),
     )
     warn(*evaluation.warnings)
-    if plot is not None:
-        from neurocal_cli.commands.show.zoom_plots import draw_evaluation
-
-        write_plot(plot, draw_evaluation, evaluation, learnt.controls)
+    write_plot(plot, draw_evaluation, evaluation, learnt.controls)
     suggest(lens_file, "neurocal report {} -o report.html")
 
 

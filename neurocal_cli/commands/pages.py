@@ -81,8 +81,10 @@ def write_plots(plots: Plots, draw: Callable[..., bytes], *subject: Any) -> None
         write_plot(file, partial(draw, panel=panel), *subject)
 
 
-def write_plot(file: str, draw: Callable[..., bytes], *subject: Any) -> None:
-    """Draw and write a picture of a subject, of the `kind` that the file's name ends in."""
+def write_plot(file: str | None, draw: Callable[..., bytes], *subject: Any) -> None:
+    """Draw and write a picture of a subject, of the `kind` that its name ends in, unless there is none."""
+    if file is None:
+        return
     with ProgressBar(f"drawing {file}"):
         write_whole(file, draw(*subject, kind=os.path.splitext(file)[1][1:].lower()))
 

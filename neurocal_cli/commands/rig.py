@@ -11,7 +11,7 @@ import click
 from neurocal_cli.commands import options, preparation
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.pages import html_option, plot_option, write_page, write_plot
-from neurocal_cli.commands.streams import ProgressBar, concluding, note, suggest, warn
+from neurocal_cli.commands.streams import ProgressBar, concluding, noted, suggest, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -131,13 +131,12 @@ def rig(
     read = *inputs, *(file for _, file in known)
     preparation.check(read, (output, html), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
+    from neurocal_cli.commands.show.plot_pages import draw_rig
     from neurocal_cli.commands.show.rig_report import rig_json, rig_report
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
 
-    notes: list[str] = []
-    points = read_rig_points(named, notes)
-    note(*notes)
+    points = noted(read_rig_points, named)
     for what, given in (("--intrinsics", known), ("--distortion", models)):
         for name, _ in given:
             if name not in points:
@@ -156,10 +155,7 @@ def rig(
     with concluding(found, as_json, rig_json, rig_report):
         if not preparation.is_for_the_eye(output, "rig.yaml"):
             warn(*write_result(found, output, lean=lean))
-        if plot is not None:
-            from neurocal_cli.commands.show.plot_pages import draw_rig
-
-            write_plot(plot, draw_rig, found)
+        write_plot(plot, draw_rig, found)
         write_page(html, found, *inputs)
         suggest(output, "neurocal evaluate {}", "neurocal triangulate {} POINTS.csv -o XYZ.csv")
 

@@ -200,6 +200,7 @@ def simulate(
     if save is not None:
         _save(scene, save, levels, seed, images)
     from neurocal_cli.commands.show.methods_report import simulation_json, simulation_tables, text_of
+    from neurocal_cli.commands.show.simulation_plots import draw_simulation
     from neurocal_cli.simulation.noise import study_noise
 
     with ProgressBar() as progress:
@@ -210,10 +211,7 @@ def simulate(
         lambda: simulation_json(scene, seed, study, starts),
         lambda: text_of(*simulation_tables(study, starts, paper)),
     )
-    if plot is not None:
-        from neurocal_cli.commands.show.simulation_plots import draw_simulation
-
-        write_plot(plot, draw_simulation, study, starts, scene.unit)
+    write_plot(plot, draw_simulation, study, starts, scene.unit)
 
 
 def _scene(
@@ -264,15 +262,13 @@ def _starts(
 
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.commands.show.methods_report import rates_json, rates_tables, text_of
+    from neurocal_cli.commands.show.simulation_plots import draw_rates
     from neurocal_cli.simulation.rates import study_rates
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     answer(as_json, lambda: rates_json(study), lambda: text_of(*rates_tables(study)))
-    if plot is not None:
-        from neurocal_cli.commands.show.simulation_plots import draw_rates
-
-        write_plot(plot, draw_rates, study)
+    write_plot(plot, draw_rates, study)
 
 
 def _rig(

@@ -137,6 +137,14 @@ def note(*texts: str) -> None:
         say(f"note: {one_line(text)}")
 
 
+def noted(read: Callable[..., T], *given: Any, **how: Any) -> T:
+    """What a function returns; what it adds to its argument `notes` is reported."""
+    notes: list[str] = []
+    found = read(*given, notes=notes, **how)
+    note(*notes)
+    return found
+
+
 def note_once(remarks: Mapping[str, Sequence[str]]) -> None:
     """Report remarks, each with the first name of those that it is about, and their number."""
     for text, names in remarks.items():

@@ -44,7 +44,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
       neurocal target camera.yaml --board chessboard:9x6:25 -o again.yaml
     """  # noqa: D301 - as in the group
     preparation.check((camera, file), (output,), plots=(plot,), as_json=as_json)
-
+    from neurocal_cli.commands.show.camera_panels import draw_target
     from neurocal_cli.commands.show.camera_report import target_json, target_lines
     from neurocal_cli.files.board_yaml import read_board, write_board
     from neurocal_cli.files.calibration_tree import read_calibration
@@ -56,10 +56,7 @@ def target(camera: str, file: str | None, plot: str | None, as_json: bool, outpu
             f"{camera}: the target was taken as it was given, so its own file still holds; if it may have "
             "another shape, calibrate with --target free"
         )
-    if plot is not None:
-        from neurocal_cli.commands.show.camera_panels import draw_target
-
-        write_plot(plot, draw_target, calibration.target, calibration.unit)
+    write_plot(plot, draw_target, calibration.target, calibration.unit)
     known = calibration.target, calibration.unit, calibration.points.distances
     described = None
     if file is not None:

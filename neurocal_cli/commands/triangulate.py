@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options, preparation
-from neurocal_cli.commands.streams import end_waiting, note, print_summary, say, warn
+from neurocal_cli.commands.streams import end_waiting, note, noted, print_summary, say, warn
 from neurocal_cli.errors import UsageError, plural
 from neurocal_cli.files.writing import write_chunks
 
@@ -181,9 +181,7 @@ def _triangulate_many(
 
     rig = read_rig(file)
     preparation.warn_of_poor(rig, "; points in space may be far off")
-    notes: list[str] = []
-    seen = read_sightings(matches, notes)
-    note(*notes)
+    seen = noted(read_sightings, matches)
     if sigma is None and math.isnan(rig.sigma):
         note(f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma")
     sigma = sigma or (_USUAL_SIGMA if math.isnan(rig.sigma) else rig.sigma)

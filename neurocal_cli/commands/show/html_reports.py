@@ -35,7 +35,7 @@ from neurocal_cli.commands.show.html_page import (
     table,
     verdict_block,
 )
-from neurocal_cli.commands.show.plane_report import plane_table
+from neurocal_cli.commands.show.plane_report import plane_tables
 from neurocal_cli.commands.show.rig_panels import edge_coverage, rig_in_space
 from neurocal_cli.commands.show.rig_report import camera_rows as named_camera_rows
 from neurocal_cli.commands.show.rig_report import pose_rows
@@ -267,8 +267,8 @@ def _measurements(calibration: Calibration) -> str:
         "what the image shows, and the points are relative to the camera. For other distances: neurocal "
         "evaluate camera --at."
     )
-    rows = plane_table(calibration.errors_at(distance), calibration.unit)
-    return section("What it means for measurements", table(rows), f'<p class="soft">{escape(text)}</p>')
+    tables = map(table, plane_tables(calibration.errors_at(distance), calibration.unit))
+    return section("What it means for measurements", *tables, f'<p class="soft">{escape(text)}</p>')
 
 
 def _uncertainty(calibration: Calibration) -> str:

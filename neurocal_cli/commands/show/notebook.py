@@ -13,16 +13,18 @@ from neurocal_cli.commands.show.camera_report import parameter_rows
 from neurocal_cli.commands.show.html_page import table, verdict_block
 from neurocal_cli.commands.show.rig_report import pose_rows
 from neurocal_cli.commands.show.stereo_report import camera_rows, rig_rows
+from neurocal_cli.commands.show.text import Table
+from neurocal_cli.commands.show.zoom_report import network_rows
 
 
 def notebook_html(result: Calibration | StereoRig | Rig | ZoomLens) -> str:
     """The verdict and the parameters of a result."""
-    if isinstance(result, ZoomLens):
-        return verdict_block(judge_lens(result)) + f"<pre>{escape(result.summary())}</pre>"
     if isinstance(result, Calibration):
-        tables = [parameter_rows(result)]
+        tables: tuple[Table, ...] = (parameter_rows(result),)
+    elif isinstance(result, StereoRig):
+        tables = camera_rows(result), rig_rows(result)
     else:
-        both = [camera_rows(result), rig_rows(result)] if isinstance(result, StereoRig) else pose_rows(result)
-        tables = list(both)
-    head = "".join(f"<p>{escape(line)}</p>" for line in repr(result).splitlines()[:1])
-    return "".join([head, verdict_block(result.verdict), *map(table, tables)])
+        tables = (network_rows(result),) if isinstance(result, ZoomLens) else pose_rows(result)
+    verdict = judge_lens(result) if isinstance(result, ZoomLens) else result.verdict
+    head = f"<p>{escape(repr(result).splitlines()[0])}</p>"
+    return "".join([head, verdict_block(verdict), *map(table, tables)])

@@ -10,8 +10,10 @@ from neurocal_cli.camera.plane_points import PlaneErrors, Spread
 from neurocal_cli.commands.show.text import Table, number_or_none, printable, rounded, with_std
 
 
-def plane_table(errors: PlaneErrors, unit: str) -> Table:
+def plane_tables(errors: PlaneErrors | None, unit: str) -> list[Table]:
     """Rows, the heading first: a length and two points, with the shares of calibration and pixels."""
+    if errors is None:
+        return []
     unit = printable(unit)
     rows = [[f"at {errors.distance:g} {unit}", f"std [{unit}]", "of calibration", "of pixels"]]
     for what, spread in (
@@ -24,16 +26,18 @@ def plane_table(errors: PlaneErrors, unit: str) -> Table:
             continue
         told = spread.std, spread.by_calibration, spread.by_pixel
         rows.append([what, *(rounded(std, std)[0] for std in told)])
-    return rows
+    return [rows]
 
 
-def plane_json(errors: PlaneErrors) -> dict[str, Any]:
-    """The same as values for JSON."""
+def plane_json(errors: PlaneErrors | None) -> dict[str, Any]:
+    """The same as an entry of JSON; none without errors."""
+    if errors is None:
+        return {}
 
     def shares(spread: Spread) -> dict[str, float]:
         return {"std": spread.std, "calibration": spread.by_calibration, "pixels": spread.by_pixel}
 
-    return {
+    at = {
         "distance": errors.distance,
         "sigma_px": errors.sigma,
         "length": {"length": errors.length, **shares(errors.of_length)},
@@ -41,16 +45,17 @@ def plane_json(errors: PlaneErrors) -> dict[str, Any]:
         **({} if errors.of_depth is None else {"depth": shares(errors.of_depth)}),
         "worst": shares(errors.of_worst),
     }
+    return {"at": at}
 
 
-def position_table(positions: Mapping[str, CameraPosition], unit: str) -> Table:
-    """Rows, the heading first: where the camera was in each view."""
+def position_tables(positions: Mapping[str, CameraPosition], unit: str) -> list[Table]:
+    """Rows, the heading first: where the camera was in each view; no table without views."""
     rows = [["camera in", *(f"{axis} [{printable(unit)}]" for axis in "XYZ")]]
     for name, place in positions.items():
         pairs = zip(place.point.tolist(), place.std.tolist(), strict=True)
         cells = [with_std(value, std) if std > 0 else f"{value:.7g}" for value, std in pairs]
         rows.append([printable(name), *cells])
-    return rows
+    return [rows] if positions else []
 
 
 def positions_json(positions: Mapping[str, CameraPosition]) -> dict[str, Any]:

@@ -47,6 +47,11 @@ def joined(*blocks: Sequence[str]) -> str:
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
+def tabulated(tables: Iterable[Sequence[Sequence[str]]], below: Sequence[str]) -> str:
+    """Tables, and lines below them."""
+    return joined(*map(align, tables), below)
+
+
 def align(rows: Iterable[Sequence[str]]) -> list[str]:
     """Lines of a table: the first column to the left, the others to the right.
 
