@@ -103,10 +103,8 @@ def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs:
     import hashlib
     import shlex
 
-    from neurocal_cli.calibration.rig.rig import Rig
-    from neurocal_cli.calibration.rig.stereo_rig import StereoRig
     from neurocal_cli.commands.show.html_page import Origin, versions
-    from neurocal_cli.commands.show.html_reports import calibration_page, rig_page, stereo_page
+    from neurocal_cli.commands.show.html_reports import page_of
 
     files = {}
     for name in inputs:
@@ -115,10 +113,4 @@ def write_page(html: str | None, result: Calibration | StereoRig | Rig, *inputs:
             files[source] = hashlib.sha256(data).hexdigest()
     typed = click.get_current_context().meta.get(TYPED, ())
     origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
-    if isinstance(result, Rig):
-        text = rig_page(result, origin)
-    else:
-        text = (
-            stereo_page(result, origin) if isinstance(result, StereoRig) else calibration_page(result, origin)
-        )
-    write_whole(html, text)
+    write_whole(html, page_of(result, origin))

@@ -77,39 +77,36 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page about the result in the file."""
     from neurocal_cli.commands.show.html_page import Origin
-    from neurocal_cli.commands.show.html_reports import calibration_page, lens_page, stereo_page
+    from neurocal_cli.commands.show.html_reports import Result, page_of
 
+    result: Result
     if "neurocal_lens" in root:
         from neurocal_cli.files.lens_yaml import lens_from_field
 
-        if images:
-            raise UsageError("the page of a zoom lens shows no photographs; leave out --images")
-        return lens_page(lens_from_field(root), Origin(files))
-    if "stereo" in root:
+        result, block, cameras, none = lens_from_field(root), None, [], "a zoom lens"
+    elif "stereo" in root:
         from neurocal_cli.files.stereo_yaml import stereo_from_field
 
-        rig = stereo_from_field(root)
-        words = images * (3 - len(images))
-        shown = [
-            _photographs(camera, word, 2) for camera, word in zip((rig.left, rig.right), words, strict=False)
-        ]
-        origin = Origin(files, versions=_versions(root["left"]))
-        return stereo_page(rig, origin, (shown[0], shown[1]) if shown else None)
-    if "rig" in root and "cameras" in root:
-        from neurocal_cli.commands.show.html_reports import rig_page
+        result = rig = stereo_from_field(root)
+        block, cameras, none = root["left"], [rig.left, rig.right], ""
+    elif "rig" in root and "cameras" in root:
         from neurocal_cli.files.rig_yaml import rig_from_field
 
-        if images:
-            raise UsageError("the page of a rig of named cameras shows no photographs; leave out --images")
-        found = rig_from_field(root)
-        return rig_page(found, Origin(files, versions=_versions(root["cameras"][found.first])))
-    from neurocal_cli.files.calibration_tree import calibration_from_field
+        result = found = rig_from_field(root)
+        block, cameras, none = root["cameras"][found.first], [], "a rig of named cameras"
+    else:
+        from neurocal_cli.files.calibration_tree import calibration_from_field
 
-    calibration = calibration_from_field(root)
-    if len(images) > 1:
+        result = calibration = calibration_from_field(root)
+        block, cameras, none = root, [calibration], ""
+    if images and none:
+        raise UsageError(f"the page of {none} shows no photographs; leave out --images")
+    if len(images) > len(cameras) > 0:
         raise UsageError("the file is of one camera; give --images once")
-    origin = Origin(files, versions=_versions(root))
-    return calibration_page(calibration, origin, _photographs(calibration, images[0], 1) if images else None)
+    words = images * (len(cameras) if len(images) == 1 else 1)
+    shown = [_photographs(*one, len(cameras)) for one in zip(cameras, words, strict=False)]
+    versions = {} if block is None else _versions(block)
+    return page_of(result, Origin(files, versions=versions), shown)
 
 
 def _versions(root: Field) -> dict[str, str]:

@@ -48,10 +48,20 @@ _MOST_REJECTED = 200  # rows
 _SETTINGS = 25  # samples along a control
 
 
-def calibration_page(
-    calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
-) -> str:
-    """Make the page of a camera, with the images of views as JPEG files, if given."""
+Result = Calibration | StereoRig | Rig | ZoomLens
+Photographs = Sequence[Mapping[str, bytes]]  # of each camera: the images of its views as JPEG files
+
+
+def page_of(result: Result, origin: Origin, photographs: Photographs = ()) -> str:
+    """Make the page of a result, with the photographs of a camera or of both cameras of a pair, if given."""
+    if isinstance(result, Calibration):
+        return _calibration_page(result, origin, photographs)
+    if isinstance(result, StereoRig):
+        return _stereo_page(result, origin, photographs)
+    return _rig_page(result, origin) if isinstance(result, Rig) else _lens_page(result, origin)
+
+
+def _calibration_page(calibration: Calibration, origin: Origin, photographs: Photographs) -> str:
     size = calibration.image_size
     head = (
         f"images of {'unknown size' if size is None else f'{size[0]} x {size[1]} px'}, "
@@ -63,16 +73,13 @@ def calibration_page(
         verdict_block(calibration.verdict),
         section("Parameters", table(parameter_rows(calibration))),
         _measurements(calibration),
-        *_camera_parts(calibration, photographs or {}),
+        *_camera_parts(calibration, *photographs),
         _repeat("neurocal calibrate POINTS.csv", calibration, origin),
     ]
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
 
-def stereo_page(
-    rig: StereoRig, origin: Origin, photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None
-) -> str:
-    """Make the page of a rig; see `calibration_page`."""
+def _stereo_page(rig: StereoRig, origin: Origin, photographs: Photographs) -> str:
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
     pairs = [["pair", "left rms [px]", "right rms [px]"]]
     for a, b in rig.pairs:
@@ -97,8 +104,7 @@ def stereo_page(
     return page("Calibration of two cameras", parts)
 
 
-def rig_page(rig: Rig, origin: Origin) -> str:
-    """Make the page of a rig of any number of cameras; see `calibration_page`."""
+def _rig_page(rig: Rig, origin: Origin) -> str:
     cameras, first = list(rig.cameras), printable(rig.first)
     head = f"{len(cameras)} cameras connected by {len(rig.frames)} frames, rms {rig.rmse_px:.4g} px"
     frames = [["frame", *(f"{printable(name)} rms [px]" for name in cameras)]]
@@ -134,13 +140,12 @@ def rig_page(rig: Rig, origin: Origin) -> str:
     ]
     for name, camera in rig.cameras.items():
         parts.append(section(f"Camera {printable(name)}", " "))
-        parts += _camera_parts(camera, {})
+        parts += _camera_parts(camera)
     parts.append(_repeat("neurocal rig POINTS.csv...", rig.cameras[rig.first], origin))
     return page(f"Calibration of {len(cameras)} cameras", parts)
 
 
-def lens_page(lens: ZoomLens, origin: Origin) -> str:
-    """Make the page of a zoom lens; see `calibration_page`."""
+def _lens_page(lens: ZoomLens, origin: Origin) -> str:
     command = f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml"
     head, lines = lens_words(lens)
     parts = [
@@ -181,7 +186,7 @@ def _over_settings(lens: ZoomLens) -> str:
     )  # fmt: skip
 
 
-def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) -> list[str]:
+def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes] | None = None) -> list[str]:
     """Sections on a camera: drawings, views, rejected points and views, warnings."""
     parts: list[str] = []
     points, pixels = calibration.points, calibration.points.pixels
@@ -216,7 +221,7 @@ def _camera_parts(calibration: Calibration, photographs: Mapping[str, bytes]) ->
             _models(calibration),
             _board(calibration),
         ]
-        parts += _view_parts(calibration, residuals, size, scale, photographs)
+        parts += _view_parts(calibration, residuals, size, scale, photographs or {})
     return [*parts, _rejected(calibration), _warnings(calibration.warnings)]
 
 

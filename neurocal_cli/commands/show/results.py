@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from neurocal_cli.calibration.advice import advise
 from neurocal_cli.calibration.calibration import Calibration
@@ -12,7 +13,8 @@ from neurocal_cli.calibration.zoom.zoom_lens import ZoomLens
 from neurocal_cli.commands.show import CAMERA_PANELS
 from neurocal_cli.errors import InputError, UsageError, check_choice
 
-Result = Calibration | StereoRig | Rig | ZoomLens
+if TYPE_CHECKING:
+    from neurocal_cli.commands.show.html_reports import Result
 
 _KINDS = ("png", "svg", "pdf")
 
@@ -46,21 +48,11 @@ def report(result: Result, photographs: Mapping[str, bytes] | None = None) -> st
     >>> Path("report.html").write_text(report(camera), encoding="utf-8")  # doctest: +SKIP
     """
     from neurocal_cli.commands.show.html_page import Origin, versions
-    from neurocal_cli.commands.show.html_reports import (
-        calibration_page,
-        lens_page,
-        rig_page,
-        stereo_page,
-    )
+    from neurocal_cli.commands.show.html_reports import page_of
 
-    origin = Origin({}, versions=versions())
-    if isinstance(result, Calibration):
-        return calibration_page(result, origin, photographs)
-    if photographs:
+    if photographs and not isinstance(result, Calibration):
         raise UsageError("only the page of a Calibration shows photographs; leave them out")
-    if isinstance(result, StereoRig):
-        return stereo_page(result, origin)
-    return rig_page(result, origin) if isinstance(result, Rig) else lens_page(result, origin)
+    return page_of(result, Origin({}, versions=versions()), [photographs] if photographs else ())
 
 
 def plot(result: Result, panel: str | None = None, kind: str = "png") -> Picture:
