@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.circles.blobs import nearly_elliptic
+from neurocal_cli.detection.markers.codes import codes_in
+
 # With these limits test_other_targets.py recognises nothing in noise, blurred boards and sample images.
 _LONGEST = 1000  # px; larger images are reduced to this longer side, which still shows a target's marks
 _MARKERS = 3  # different ones of one family; noise sometimes gives one
-# Markers of a family that are looked for. Boards usually have the first ones, and 1000 take 7 times as long.
-_IDS = 100
+_IDS = 100  # first markers of a family that count; boards usually have them, and noise rarely
 _SMALLEST = 0.05  # least perimeter of a marker, in longer sides of the image; its bits are 2 px wide then
 _WINDOW = 23  # px of the adaptive threshold; one window is fast, and enough to find a few markers
 _FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
@@ -57,22 +59,22 @@ def _shows_markers(grey: NDArray[np.uint8]) -> bool:
     parameters = aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW
     parameters.minMarkerPerimeterRate = _SMALLEST
-    for family in _FAMILIES:
-        dictionary = aruco.getPredefinedDictionary(getattr(aruco, family))
-        dictionary.bytesList = dictionary.bytesList[:_IDS]
-        _, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
-        if ids is not None and len(np.unique(ids)) >= _MARKERS:
-            return True
-    return False
+    # The quadrangles do not depend on the family, so they are looked for once.
+    corners, _, rejected = aruco.ArucoDetector(aruco.getPredefinedDictionary(0), parameters).detectMarkers(
+        grey
+    )
+    found = codes_in(grey, np.array([*corners, *rejected], dtype=float).reshape(-1, 4, 2))
+    numbers = (marks.number for marks, _ in found if marks.dictionary in _FAMILIES)
+    return any(np.count_nonzero(number < _IDS) >= _MARKERS for number in numbers)
 
 
 def _shows_circles(image: NDArray[np.uint8]) -> bool:
     """Whether an image shows enough dark ellipses of similar size, evenly spaced and sharp."""
     level, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    darkest, brightest = np.quantile(image, [0.02, 0.98])
     found = _ellipses(image, level)
     if len(found) < _CIRCLES:
         return False
+    darkest, brightest = np.quantile(image, [0.02, 0.98])
     apart = np.hypot(*(found[:, None, :2] - found[None, :, :2]).T)
     np.fill_diagonal(apart, np.inf)
     low, middle, high = np.quantile(apart.min(axis=1), [0.1, 0.5, 0.9])
@@ -99,14 +101,13 @@ def _ellipses(image: NDArray[np.uint8], level: float) -> NDArray[np.float64]:
     """(n, 3) centres and areas of the dark ellipses of about the median size."""
     outlines, _ = cv2.findContours((image < level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     found = []
-    for outline in outlines:
-        if len(outline) < _OUTLINE:
-            continue
+    long = [np.asarray(outline)[:, 0] for outline in outlines if len(outline) >= _OUTLINE]
+    for outline in nearly_elliptic(long):
         (x, y), (a, b), turn = cv2.fitEllipse(outline)
         if not min(a, b) > 0:
             continue
         c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        across, along = ((outline[:, 0] - [x, y]) @ np.array([[c, -s], [s, c]]) / [a / 2, b / 2]).T
+        across, along = ((outline - [x, y]) @ np.array([[c, -s], [s, c]]) / [a / 2, b / 2]).T
         radius = np.hypot(across, along)
         if np.abs(radius.mean() - 1) < _ELLIPTIC and radius.std() < _ELLIPTIC:
             found.append((x, y, cv2.contourArea(outline)))

@@ -24,6 +24,18 @@ _EXTREME = 0.2  # share of the darkest and of the lightest cells that give the l
 _CONTRAST = 12.0  # DN, least difference of these
 _FEWEST = 2  # markers
 _UNIT = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+# Samples of any marker: 16 along its rim, which is dark, and 6 x 6 within. They save the cells of others.
+_RIM = 0.07  # of the marker's side, from its edge; half a cell of most codes
+_ALONG = (np.arange(4) + 0.5) / 4
+_AROUND = np.concatenate(
+    [
+        np.stack(np.broadcast_arrays(*one), axis=-1)
+        for at in (_RIM, 1 - _RIM)
+        for one in ((_ALONG, at), (at, _ALONG))
+    ]
+)
+_INSIDE = np.stack(np.meshgrid(*2 * [(np.arange(6) + 0.5) / 6]), axis=-1).reshape(-1, 2)
+_LIGHT_RIM = 0.5  # greatest share of light samples of a rim
 _ENOUGH = 12  # markers at a scale after which no other is tried
 
 
@@ -34,7 +46,7 @@ def read_codes(grey: NDArray[np.uint8]) -> list[tuple[Marks, int]]:
     """
     best: list[tuple[Marks, int]] = []
     for scale in scales_of(grey):
-        found = list(_read(grey, candidates(grey, scale)))
+        found = list(codes_in(grey, candidates(grey, scale)))
         if max((len(marks) for marks, _ in found), default=0) > max((len(one) for one, _ in best), default=0):
             best = found
         if best and max(len(marks) for marks, _ in best) >= _ENOUGH:
@@ -42,11 +54,15 @@ def read_codes(grey: NDArray[np.uint8]) -> list[tuple[Marks, int]]:
     return best
 
 
-def _read(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
-    """Markers of each dictionary and border in quadrangles (N, 4, 2)."""
+def codes_in(grey: NDArray[np.uint8], corners: Array) -> Iterator[tuple[Marks, int]]:
+    """Markers of each dictionary and border that has at least two within quadrangles (N, 4, 2)."""
     if not len(corners):
         return
     H = homographies(np.broadcast_to(_UNIT, corners.shape), corners)
+    framed = _is_framed(grey, H)
+    H, corners = H[framed], corners[framed]
+    if not len(corners):
+        return
     for border in (1, 2):
         for bits in sorted(set(DICTIONARIES.values())):
             light, good = _cells(grey, H, bits, border)
@@ -74,22 +90,41 @@ def numbers_in(light: NDArray[np.float32], corners: Array, dictionary: str, bord
     return np.where(good, _matched(cells, dictionary)[0], -1)
 
 
+def _is_framed(grey: NDArray[np.uint8], H: Array) -> NDArray[np.bool_]:
+    """Whether the rims (N,) of quadrangles are mostly dark, as those of markers of any code are."""
+    sampled = _sampled(grey, H, np.concatenate([_AROUND, _INSIDE]))
+    low, high = _levels(sampled)
+    light = sampled[:, : len(_AROUND)] > 0.5 * (low + high)[:, None]
+    return np.asarray((light.mean(axis=1) <= _LIGHT_RIM) & (high - low > 0.5 * _CONTRAST))
+
+
+def _sampled(grey: NDArray[np.uint8] | NDArray[np.float32], H: Array, places: Array) -> Array:
+    """Grey levels (N, K) at places (K, 2) of each quadrangle."""
+    pixels = homography_at(H, np.broadcast_to(places, (len(H), *places.shape))).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        nowhere = np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    sampled = cv2.remap(grey, nowhere, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+    return np.asarray(sampled, dtype=float).reshape(len(H), len(places))
+
+
+def _levels(grey: Array) -> tuple[Array, Array]:
+    """Dark and light level (N,) of the samples (N, K) of markers."""
+    ordered = np.sort(grey, axis=1)
+    some = max(1, round(_EXTREME * grey.shape[1]))
+    return ordered[:, :some].mean(axis=1), ordered[:, -some:].mean(axis=1)
+
+
 def _cells(
     grey: NDArray[np.uint8] | NDArray[np.float32], H: Array, bits: int, border: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Light cells (N, bits, bits) of codes, and (N,) whether the border is dark."""
     side = bits + 2 * border
     ticks = (np.arange(side)[:, None] + 0.5 + np.array(_WITHIN)).ravel() / side
-    places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(1, -1, 2)
-    pixels = homography_at(H, np.broadcast_to(places, (len(H), *places.shape[1:]))).astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        nowhere = np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)
-    sampled = cv2.remap(grey, nowhere, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+    places = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    sampled = _sampled(grey, H, places)
     n = len(_WITHIN)
-    level = np.asarray(sampled, dtype=float).reshape(len(H), side, n, side, n).mean(axis=(2, 4))
-    ordered = np.sort(level.reshape(len(H), -1), axis=1)
-    some = max(1, round(_EXTREME * side * side))
-    low, high = ordered[:, :some].mean(axis=1), ordered[:, -some:].mean(axis=1)
+    level = sampled.reshape(len(H), side, n, side, n).mean(axis=(2, 4))
+    low, high = _levels(level.reshape(len(H), -1))
     light = level > 0.5 * (low + high)[:, None, None]
     inner = light[:, border:-border, border:-border]
     around = side * side - bits * bits
