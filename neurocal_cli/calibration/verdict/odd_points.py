@@ -74,14 +74,12 @@ def odd_pixels(points: Correspondences) -> Iterator[Finding]:
             "multiply u,v by the width and the height of the image",
         )
         return
-    first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
-    pixels = points.pixels[first]
-    step = _step(pixels)
+    step = _step(points.pixels)
     if step:
         to = "whole numbers" if step == 1 else f"multiples of {step} px"
         yield 1, f"the pixels are rounded to {to}", "give sub-pixel coordinates, as `neurocal detect` does"
     else:
-        yield from _clipped(pixels)
+        yield from _clipped(points)
     yield from _outside(points)
 
 
@@ -92,12 +90,15 @@ def _step(pixels: Array) -> int:
     return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
 
 
-def _clipped(pixels: Array) -> Iterator[Finding]:
-    enough = max(_ALIKE, _ALIKE_SHARE * len(pixels))
-    for name, values in zip("uv", pixels.T, strict=True):
+def _clipped(points: Correspondences) -> Iterator[Finding]:
+    for name, values in zip("uv", points.pixels.T, strict=True):
         for limit in (values.min(), values.max()):
-            count = np.count_nonzero(values == limit)
-            if count >= enough:
+            alike = values == limit
+            count = int(alike.sum())
+            if count >= max(_ALIKE, _ALIKE_SHARE * len(values)):
+                copied = np.column_stack([points.pixels, points.world])[alike]
+                count = len(distinct_rows(copied)[0])  # copies count once
+            if count >= max(_ALIKE, _ALIKE_SHARE * len(values)):
                 yield (
                     1,
                     f"{count} points have the very same outermost {name} = {limit:.6g}: they are clipped",
@@ -139,8 +140,9 @@ def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
 
 def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     """Findings about views with the points of several images, or several pixels for the same point."""
-    table = np.column_stack([points.view_index, points.world])
-    first, label = distinct_rows(table)
+    _, first, label = np.unique(_own_points(points), return_index=True, return_inverse=True)
+    if len(first) == len(points):
+        return
     seen, _ = distinct_rows(np.column_stack([label, points.pixels]))
     different = np.bincount(label[seen])
     view = points.view_index[first]
@@ -157,14 +159,20 @@ def points_given_twice(points: Correspondences) -> Iterator[Finding]:
             yield 1, f"{name_some(np.array(points.view_names)[which])}: {reason}", advice
 
 
+def _own_points(points: Correspondences) -> NDArray[np.intp]:
+    """(N,) a number for each point of each view, the same for the same point."""
+    _, label = distinct_rows(np.round(points.world, 6))
+    return np.asarray(points.view_index * (label.max() + 1) + label, dtype=np.intp)
+
+
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
     """Names of views with the same pixels as an earlier view, and of views with duplicated rows."""
-    table = np.round(np.column_stack([points.pixels / _SAME, points.world]), 6)
-    order = np.lexsort((*table.T, points.view_index))
-    table, view = table[order], points.view_index[order]
-    again = (table[1:] == table[:-1]).all(axis=1) & (view[1:] == view[:-1])
+    rounded, label = np.round(points.pixels / _SAME), _own_points(points)
+    order = np.lexsort((*rounded.T, label))
+    rounded, label, view = rounded[order], label[order], points.view_index[order]
+    again = (label[1:] == label[:-1]) & (rounded[1:] == rounded[:-1]).all(axis=1)
     doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
-    of_views = np.split(np.round(table[:, :2]), np.cumsum(np.bincount(points.view_index))[:-1])
+    of_views = np.split(rounded, np.cumsum(np.bincount(points.view_index))[:-1])
     found, known = [], set()
     for name, pixels, twice in zip(points.view_names, of_views, doubled, strict=True):
         key = pixels.tobytes()
