@@ -156,8 +156,7 @@ def _runner(
 ) -> Run:
     """What does tasks: processes of this machine, or the workers of a cluster."""
     from neurocal_cli.commands import cluster
-    from neurocal_cli.files.processes import usable_cores
-    from neurocal_cli.files.worker_pool import work_off
+    from neurocal_cli.files.processes import usable_cores, work_off
 
     if scheduler is not None:
         client = stack.enter_context(cluster.running_cluster(scheduler))
@@ -267,8 +266,7 @@ class _Batch:
         if not former:
             return {}
         from neurocal_cli.commands.batch_drift import Pair, compare
-        from neurocal_cli.files.processes import usable_cores
-        from neurocal_cli.files.worker_pool import work_off
+        from neurocal_cli.files.processes import usable_cores, work_off
 
         pairs = [
             Pair(job.name, row["camera"], old, os.path.join(self._folder, job.name, job.result))

@@ -148,7 +148,7 @@ def _content(path: str) -> str:
 def work_off_by(
     client: Client, work: Callable[[Task], Result], tasks: Iterable[Task], ahead: int = _AHEAD
 ) -> Iterator[tuple[Task, Result | None]]:
-    """Tasks with their results as they are finished; see `worker_pool.work_off`.
+    """Tasks with their results as they are finished; see `processes.work_off`.
 
     A message takes the scheduler as long as many small tasks in it, so the workers get short tasks several
     at a time: chunks, of which `ahead` for each thread are with them. A worker that is killed takes all its

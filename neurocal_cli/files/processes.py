@@ -1,4 +1,7 @@
-"""Worker processes with one core each, which end with their parent."""
+"""Worker processes with one core each, which end with their parent.
+
+A task whose process was killed is tried once more in another one.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,22 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from typing import TypeVar
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Generic, TypeVar
 
+from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import NeurocalError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+_TRIES = 2
+_PATIENCE = 5.0  # seconds for a process to end by itself
 
 
 def usable_cores() -> int:
@@ -32,24 +41,118 @@ def work_through(
 ) -> Iterator[Result]:
     """Results of all tasks in their order, whatever the number of processes; with 1 in this one.
 
-    `work` is a function of a module, so that another process can import it; `prepare` is called in each
-    process before its first task, `start_worker` by default. Raises NeurocalError if a process was killed.
+    `work` and `prepare` are as for `work_off`. Raises what `work` raises, and NeurocalError if the processes
+    of a task were killed.
     """
     jobs = min(jobs, len(tasks))
     if jobs <= 1:
         yield from map(work, tasks)
         return
+    early: dict[int, tuple[Result] | Exception | None] = {}  # what came before results of earlier tasks
+    n_given = 0
+    for (place, _), outcome in work_off(partial(_tried, work), enumerate(tasks), jobs, prepare):
+        early[place] = outcome
+        while n_given in early:
+            found = early.pop(n_given)
+            if found is None:
+                raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1")
+            if isinstance(found, Exception):
+                raise found
+            yield found[0]
+            n_given += 1
+
+
+def _tried(work: Callable[[Task], Result], numbered: tuple[int, Task]) -> tuple[Result] | Exception:
+    """The result of a task, or what it raised."""
+    try:
+        return (work(numbered[1]),)
+    except Exception as error:
+        return error
+
+
+@frozen_dataclass(eq=False)
+class _Worker(Generic[Task]):
+    process: BaseProcess
+    connection: Connection
+    task: Task
+    tries: int  # of the task, with this one
+
+
+def work_off(
+    work: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    jobs: int,
+    prepare: Callable[[], None] | None = None,
+) -> Iterator[tuple[Task, Result | None]]:
+    """Tasks with their results as they are finished; None for a task whose processes were killed twice.
+
+    `work` is a function of a module that raises nothing. Each process has one task at a time, and ends with
+    its parent; `prepare` is called in it before its first task, `start_worker` by default.
+    """
     # Started afresh: a fork of a process whose libraries have threads may hang.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, prepare or start_worker)
-    try:
+    waiting: deque[tuple[Task, int]] = deque()
+    rest = iter(tasks)
+    workers: dict[Connection, _Worker[Task]] = {}
+
+    def next_task() -> tuple[Task, int] | None:
+        if waiting:
+            return waiting.popleft()
+        for task in rest:
+            return task, 1
+        return None
+
+    def start(task: Task, tries: int) -> None:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, work, prepare or start_worker), daemon=True)
         with interrupts_held():
-            results = pool.map(work, tasks)  # starts the processes
-        yield from results
-    except BrokenProcessPool as error:
-        raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
+            process.start()
+        theirs.close()  # so that its end is noticed here
+        workers[ours] = _Worker(process, ours, task, tries)
+        with suppress(OSError):  # its death is noticed below
+            ours.send(task)
+
+    try:
+        while len(workers) < jobs and (first := next_task()):
+            start(*first)
+        while workers:
+            for connection in wait(list(workers)):
+                assert isinstance(connection, Connection)
+                worker = workers.pop(connection)
+                try:
+                    result = connection.recv()
+                except (EOFError, OSError):
+                    connection.close()
+                    worker.process.join()
+                    if worker.tries < _TRIES:
+                        waiting.append((worker.task, worker.tries + 1))
+                    else:
+                        yield worker.task, None
+                    if following := next_task():
+                        start(*following)
+                    continue
+                if following := next_task():
+                    workers[connection] = _Worker(worker.process, connection, *following)
+                    with suppress(OSError):
+                        connection.send(following[0])
+                else:
+                    connection.close()
+                    worker.process.join(_PATIENCE)
+                yield worker.task, result
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        for worker in workers.values():
+            worker.process.terminate()
+            worker.connection.close()
+        for worker in workers.values():
+            worker.process.join(_PATIENCE)
+
+
+def _serve(connection: Connection, work: Callable[[Task], Result], prepare: Callable[[], None]) -> None:
+    """Do the tasks that arrive, until the other end is closed."""
+    prepare()
+    with suppress(EOFError, OSError):
+        while True:
+            connection.send(work(connection.recv()))
 
 
 @contextmanager
