@@ -413,6 +413,11 @@ def board_of_corners(command: F) -> F:
     return path("--board", "BOARD.yaml", what)(command)
 
 
+def named_board(name: str | None) -> Board | None:
+    """The board of ``--board``, a file or a short form; None without."""
+    return BoardOptions(name, None, None, None, None).read() if name else None
+
+
 def board(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     """Add the options of `BoardOptions`, a command's keyword ``board``."""
     size = partial(count, without="none", least=2, most=1000)

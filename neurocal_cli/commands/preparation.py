@@ -103,14 +103,10 @@ def given_points(*names: str, board: str | None = "") -> Correspondences:
     with repeatable_stdin() if "-" in names else nullcontext():
         points = None
         if board or not names[0].lower().endswith((".csv", ".txt", ".tsv")):
-            from neurocal_cli.commands.options import BoardOptions
-            from neurocal_cli.files.exchange.corners import read_corners
+            from neurocal_cli.files.exchange.corners import BOARD_ADVICE, read_corners
 
-            advice = "give --board chessboard:COLSxROWS:SQUARE"
-            if board == "":
-                advice = POINTS.instead.removeprefix("; ")
-            target = BoardOptions(board, None, None, None, None).read() if board else None
-            points = read_corners(names, target, notes, what="points", advice=advice)
+            advice = POINTS.instead.removeprefix("; ") if board == "" else BOARD_ADVICE
+            points = read_corners(names, options.named_board(board), notes, what="points", advice=advice)
         if points is None:
             points = read_points(names, notes=notes)
     note(*notes, *ids_at_two_places(points))

@@ -61,6 +61,7 @@ class _Command(options.Command):
     show_default="as --distortion",
     help="The distortion model of one camera, also written --distortion NAME=MODEL. It can be repeated.",
 )
+@options.board_of_corners
 @estimation_options(files=False)
 @plot_option("the cameras and the boards in space, and what pairs of cameras see together,")
 @html_option
@@ -71,6 +72,7 @@ def rig(
     files: tuple[str, ...],
     known: options.Named,
     models: options.Named,
+    board: str | None,
     estimation: Estimation,
     plot: str | None,
     html: str | None,
@@ -116,6 +118,9 @@ def rig(
       neurocal rig sample_data/rig_cam*.csv --type 2 --image-center 639.5 479.5 \\
           --skew auto -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --fix theta=90 --fix v0=479.5 -o rig.yaml
+      neurocal convert sample_data/rig_cam0.csv --to mrcal -o left.vnl
+      neurocal convert sample_data/rig_cam1.csv --to mrcal -o right.vnl
+      neurocal rig left.vnl right.vnl --board chessboard:6x5:80 -o mrcal.yaml
       neurocal rig sample_data/rig_cam*.csv --square-pixels -o rig.yaml
       neurocal rig sample_data/rig_cam*.csv --trainer backprop --epochs 20000 --rate 0.05 \\
           --rate-gamma 0.4 -o rig.yaml
@@ -128,7 +133,7 @@ def rig(
     estimation.check()
     named = [named_file(file) for file in files]
     inputs = [file for _, file in named]
-    read = *inputs, *(file for _, file in known)
+    read = *inputs, board, *(file for _, file in known)
     preparation.check(read, (output, html), plots=(plot,), as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_rig import calibrate_rig
     from neurocal_cli.commands.show.plot_pages import draw_rig
@@ -136,7 +141,7 @@ def rig(
     from neurocal_cli.files.result_files import write_result
     from neurocal_cli.files.rig_points import read_rig_points
 
-    points = noted(read_rig_points, named)
+    points = noted(read_rig_points, named, board=options.named_board(board))
     for what, given in (("--intrinsics", known), ("--distortion", models)):
         for name, _ in given:
             if name not in points:

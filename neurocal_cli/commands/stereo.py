@@ -18,6 +18,7 @@ from neurocal_cli.files.writing import write_whole
 @click.command(cls=options.Command)
 @options.argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
 @options.argument("right", "RIGHT.csv", "Points of the right camera.")
+@options.board_of_corners
 @estimation_options(files=False)
 @options.path(
     "--left-intrinsics",
@@ -48,6 +49,7 @@ from neurocal_cli.files.writing import write_whole
 def stereo(
     left: str,
     right: str,
+    board: str | None,
     estimation: Estimation,
     left_intrinsics: str | None,
     right_intrinsics: str | None,
@@ -93,6 +95,9 @@ def stereo(
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
+      neurocal convert sample_data/rig_cam0.csv --to mrcal -o left.vnl
+      neurocal convert sample_data/rig_cam1.csv --to mrcal -o right.vnl
+      neurocal stereo left.vnl right.vnl --board chessboard:6x5:80 -o mrcal.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --type 2 --image-center 319.5 239.5 --skew auto --json \\
           -o rig.yaml
@@ -121,13 +126,14 @@ def stereo(
         )
         options.note_unused("on cameras that are known", *known)
     inputs = left, right, left_intrinsics, right_intrinsics
-    preparation.check(inputs, (output, html, *ros_files), plots=files_of(plots), as_json=as_json)
+    preparation.check((*inputs, board), (output, html, *ros_files), plots=files_of(plots), as_json=as_json)
     from neurocal_cli.calibration.rig.calibrate_stereo import calibrate_stereo
     from neurocal_cli.commands.show.stereo_report import stereo_json, stereo_report, views_alone
     from neurocal_cli.files.result_files import write_result
 
     prepared = [
-        side.prepare(preparation.given_points(name)) for name, side in zip((left, right), sides, strict=True)
+        side.prepare(preparation.given_points(name, board=board))
+        for name, side in zip((left, right), sides, strict=True)
     ]
     points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:

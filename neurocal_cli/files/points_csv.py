@@ -34,7 +34,19 @@ OPTIONAL = {
 """Names of the optional columns, by their attribute of `Correspondences`."""
 _SETTINGS = ("zoom", "focus")
 # Names of columns in use elsewhere, in lower case without punctuation.
-_WORLD = ("{0}world", "world{0}", "{0}w", "obj{0}", "object{0}", "objloc{0}", "{0}3d", "{0}object")
+_WORLD = (
+    "{0}world",
+    "world{0}",
+    "{0}w",
+    "obj{0}",
+    "object{0}",
+    "objloc{0}",
+    "{0}3d",
+    "{0}object",
+    "{0}mm",
+    "{0}cm",
+    "{0}m",
+)
 _IMAGE = (
     "imgloc{1}", "img{1}", "image{1}", "pixel{1}", "{1}pixel", "{1}img", "{1}image", "{0}pixel", "pixel{0}",
     "{0}px", "{1}px", "{1}2d",
@@ -56,6 +68,7 @@ POINTS = Schema(
         "camera": ("camid", "cameraid", "cam", "port"),
         "time": ("frametime",),
     },
+    others=((tuple("xyz"), PLACE), (tuple("xy"), PIXEL), (("col", "row"), PIXEL), (("column", "row"), PIXEL)),
     instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 

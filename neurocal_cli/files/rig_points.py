@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.files.exchange.corners import BOARD_ADVICE, TABLES, read_corners
 from neurocal_cli.files.points_csv import POINTS, correspondences
 from neurocal_cli.files.table import Table, read_table
+from neurocal_cli.observations.board import Board
 from neurocal_cli.observations.points import Correspondences
 
 
 def read_rig_points(
-    files: Sequence[tuple[str, str]], notes: list[str] | None = None
+    files: Sequence[tuple[str, str]], notes: list[str] | None = None, board: Board | None = None
 ) -> dict[str, Correspondences]:
     """Read the points of each camera, by its name.
 
@@ -26,6 +29,8 @@ def read_rig_points(
         standard input. Several files of one camera are read as one.
     notes : list of str, optional
         Remarks about ignored columns are appended.
+    board : Board, optional
+        Of corners of other programs whose files do not have their places.
 
     Raises
     ------
@@ -35,12 +40,28 @@ def read_rig_points(
         A file holds several cameras, but a name is given for it.
     """
     tables: dict[str, list[Table]] = {}
+    remarks: list[str] = [] if notes is None else notes
+    found: dict[str, Correspondences] = {}
+    order: dict[str, None] = {}  # of the cameras, as they are given
     for name, path in files:
+        if path != "-" and (board is not None or not path.lower().endswith(TABLES)):
+            corners = read_corners([path], board, remarks, what="points", advice=BOARD_ADVICE)
+            if corners is not None:
+                if (name or Path(path).stem) in found:
+                    raise InputError(
+                        f"the camera {name or Path(path).stem} has several files of points; give one"
+                    )
+                found[name or Path(path).stem] = corners
+                order.setdefault(name or Path(path).stem)
+                continue
         table = read_table(path, POINTS)
         for camera, part in _by_camera(table, name):
             tables.setdefault(camera, []).append(part)
-    remarks: list[str] = [] if notes is None else notes
-    return {camera: correspondences(parts, remarks) for camera, parts in tables.items()}
+            order.setdefault(camera)
+    if twice := found.keys() & tables.keys():
+        raise InputError(f"the camera {min(twice)} has several files of points; give one")
+    found |= {camera: correspondences(parts, remarks) for camera, parts in tables.items()}
+    return {camera: found[camera] for camera in order}
 
 
 def _by_camera(table: Table, name: str) -> list[tuple[str, Table]]:

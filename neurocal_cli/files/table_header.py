@@ -24,10 +24,12 @@ is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmat
 _METADATA = re.compile(
     r"#\s*(image_size|image_center|unit|distances|undistorted|board(?=\s*:\s*\{))\s*:(.*)", re.DOTALL
 )
+_UNIT = re.compile(r"(\S+?)(?:\s*[\[(](\w+)[\])]|_(mm|cm|m|px))").fullmatch  # X [mm], x_mm
 _KEY_LIKE = re.compile(r"#\s*([A-Za-z][\w -]{2,20}?)\s*[:=].*", re.DOTALL)
 _ALIKE = 0.85  # difflib's ratio from which a word is a known key misspelt: units is, image_file is not
 _CALISCOPE = {"imglocx", "imglocy", "objlocx", "objlocy"}  # its columns, in px and m
 _COMMAS = 1.6  # values over those expected; u,v and most of X,Y,Z have decimals, labels have none
+_EXCEL = re.compile(r"sep=.?").fullmatch  # the first line of a file for spreadsheets
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
@@ -43,6 +45,7 @@ class Schema:
     aliases: Mapping[str, tuple[str, ...]] = field(
         default_factory=dict
     )  # plain names of columns, the best first
+    others: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()  # names that mean these with the others
     instead: str = ""  # advice for files of another kind
 
     @property
@@ -147,9 +150,12 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
             if line.startswith("#"):
                 metadata.take(line, number)
                 comments.append(line)
-            elif line:
+            elif line and not (number == 1 and _EXCEL(line)):
                 separator = _find_separator(line)
                 fields = split_fields(line, separator)
+                above = re.split(r"[\s,;]+", comments[-1].strip("# \t")) if comments else []
+                if len(above) == len(fields) and set(above) > set(schema.required):  # as savetxt writes it
+                    return Layout(separator, tuple(_renamed(above, schema)[0]), start, number - 1, metadata)
                 if all(is_number(text) for text in fields):
                     names = _headerless_names(fields, separator, comments, schema)
                     return Layout(separator, names, start, number - 1, metadata)
@@ -180,8 +186,9 @@ def plain(name: str) -> str:
 
 def _renamed(names: list[str], schema: Schema) -> tuple[list[str], str | None]:
     """Names of columns as the schema has them, from those in use elsewhere, and the world's unit."""
-    units = {name: re.fullmatch(r"(\S+?)\s*[\[(](\w+)[\])]", name) for name in names}
-    stated = {match[2] for match in units.values() if match and match[1] in ("X", "Y", "Z")}
+    units = {name: _UNIT(name) for name in names}
+    stated = {match[2] or match[3] for match in units.values() if match and match[1] in (*"XYZ", *"xyz")}
+    stated.discard("px")
     new = [match[1] if match and match[1] in schema.known else name for name, match in units.items()]
     if len(new) < len(names):  # a name twice, which is refused later
         return list(names), None
@@ -189,6 +196,10 @@ def _renamed(names: list[str], schema: Schema) -> tuple[list[str], str | None]:
         places = [k for form in forms for k, name in enumerate(new) if plain(name) == form]
         if column not in new and places:
             new[places[0]] = column
+    for theirs, ours in schema.others:
+        if set(theirs) <= set(new) and set(ours).isdisjoint(new):
+            trial = [dict(zip(theirs, ours, strict=True)).get(name, name) for name in new]
+            new = trial if set(schema.required) <= set(trial) else new
     caliscope = set(map(plain, names)) >= _CALISCOPE
     return new, next(iter(stated)) if len(stated) == 1 else "m" if caliscope else None
 
@@ -273,6 +284,10 @@ def _headerless_names(
 
 
 def _check_names(names: list[str], schema: Schema) -> None:
+    missing = [name for name in schema.required if name not in names]
+    if missing and names[0].startswith(("%YAML", "{", "<?xml", "[{")):
+        what = "a file of a camera, a rig or a lens"
+        raise InputError(f"is not a table of {schema.kind}, but {what}; give {schema.kind}")
     numbers = [text for text in names if is_number(text)]
     if len(numbers) >= len(schema.required) > 0 and set(names).isdisjoint(schema.required):
         raise InputError(
@@ -282,12 +297,8 @@ def _check_names(names: list[str], schema: Schema) -> None:
     for name, count in Counter(names).items():
         if name and count > 1:
             raise InputError(f"the column {one_line(name[:40])} appears twice; rename or remove one")
-    missing = [name for name in schema.required if name not in names]
     if not missing:
         return
-    if names[0].startswith(("%YAML", "{", "<?xml")):
-        what = "a file of a camera, a rig or a lens"
-        raise InputError(f"is not a table of {schema.kind}, but {what}; give {schema.kind}")
     lower = {name.lower(): name for name in names}
     similar = [f"{lower[name.lower()]} as {name}" for name in missing if name.lower() in lower]
     hint = f"write {', '.join(similar)}" if similar else f"name the columns {','.join(schema.required)}"

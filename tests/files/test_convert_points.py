@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.command_line import run
 from support.real_data import RealFiles
 
-from neurocal_cli import Board, Correspondences, calibrate, read_points, write_points
+from neurocal_cli import Board, Correspondences, calibrate, read_points, read_rig_points, write_points
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError
 from neurocal_cli.files.exchange.corner_texts import corner_text
@@ -330,3 +330,117 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(
     except FormatError as error:
         message = str(error)
     assert message.isprintable()
+
+
+def kept(form: str, seen: Array) -> object:
+    """Points of views as PhotonVision or people keep them in JSON."""
+    if form == "PhotonVision":
+        spots = [dict(zip("xyz", X, strict=True)) for X in (WORLD / 1000).tolist()]
+        views = [
+            {
+                "locationInObjectSpace": spots,
+                "locationInImageSpace": [
+                    dict(zip("xy", x, strict=True)) for x in np.nan_to_num(view, nan=-1).tolist()
+                ],
+                "snapshotName": f"im{k}",
+            }
+            for k, view in enumerate(seen)
+        ]
+        camera = {"rows": 3, "cols": 3, "data": [500, 0, 320, 0, 500, 240, 0, 0, 1]}
+        return {
+            "resolution": {"width": 640, "height": 480},
+            "cameraIntrinsics": camera,
+            "observations": views,
+        }
+    known = [np.isfinite(view).all(axis=1) for view in seen]
+    parts = [(WORLD[here].tolist(), view[here].tolist()) for here, view in zip(known, seen, strict=True)]
+    if form == "mapping":
+        return {
+            f"im{k}": {"object_points": X, "image_points": [[x] for x in u]} for k, (X, u) in enumerate(parts)
+        }
+    rows = [
+        [{**dict(zip("XYZ", X, strict=True)), "u": u, "v": v} for X, (u, v) in zip(*part, strict=True)]
+        for part in parts
+    ]
+    return [{"image": f"im{k}", "points": one} for k, one in enumerate(rows)]
+
+
+@pytest.mark.parametrize("form", ["PhotonVision", "mapping", "list"])
+def test_views_with_points_of_their_own_are_read(form: str, tmp_path: Path) -> None:
+    seen = pixels()
+    seen[0, 3] = np.nan
+    (tmp_path / "a.json").write_text(json.dumps(kept(form, seen)))
+    found = read_corners([tmp_path / "a.json"], None, [], what="points")
+    assert found is not None
+    assert np.array_equal(found.pixels, seen[np.isfinite(seen).all(axis=2)])
+    assert found.view_names == ("im0", "im1", "im2")
+    scale = 1000 if form == "PhotonVision" else 1
+    assert np.abs(found.world * scale - np.tile(WORLD, (3, 1))[np.arange(60) != 3]).max() < 1e-9
+    assert (found.unit, found.image_size) == (("m", (640, 480)) if scale == 1000 else ("unknown", None))
+
+
+def test_pixels_by_the_names_of_views_share_the_places(tmp_path: Path) -> None:
+    tree = {
+        "object_points": WORLD.tolist(),
+        "image_points": {f"b{k}": x.tolist() for k, x in enumerate(pixels())},
+    }
+    (tmp_path / "a.json").write_text(json.dumps(tree))
+    found = read_corners([tmp_path / "a.json"], None, [])
+    assert found is not None
+    assert found.view_names == ("b0", "b1", "b2")
+    assert np.array_equal(found.world, np.tile(WORLD, (3, 1)))
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (640, 480)])
+def test_a_shape_that_the_pixels_do_not_fit_is_width_and_height(
+    shape: tuple[int, int], tmp_path: Path
+) -> None:
+    seen = pixels() * [1, 0.7]
+    seen[0, 0] = 601, 10
+    np.savez(tmp_path / "a.npz", objpoints=[WORLD] * 3, imgpoints=seen, img_shape=shape)
+    found = read_corners([tmp_path / "a.npz"], None, [])
+    assert found is not None
+    assert found.image_size == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        ("image,X,Y,Z,x,y", [0, 1, 2, 3, 4]),
+        ("image,x,y,z,u,v", [0, 1, 2, 3, 4]),
+        ("image,X,Y,Z,row,col", [0, 1, 2, 4, 3]),
+        ("image,x_mm,y_mm,z_mm,x_px,y_px", [0, 1, 2, 3, 4]),
+        ("sep=,\nimage,X,Y,Z,u,v", [0, 1, 2, 3, 4]),
+        ("# view X Y Z u v", [0, 1, 2, 3, 4]),
+    ],
+)
+def test_columns_with_the_names_of_others_are_read(header: str, order: list[int], tmp_path: Path) -> None:
+    row = [0.0, 25.0, 1.0, 300.5, 200.25]
+    (tmp_path / "a.csv").write_text(f"{header}\na,{','.join(str(row[k]) for k in order)}\n")
+    found = read_points(tmp_path / "a.csv")
+    assert (found.world[0].tolist(), found.pixels[0].tolist(), found.unit) == (row[:3], row[3:], "mm")
+    assert found.view_names == ("a",)
+
+
+def test_a_file_without_points_is_no_table(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"foo": 1, "bar": 2, "baz": 3, "x": 4, "y": 5, "z": 6}')
+    with pytest.raises(FormatError, match="is not a table of points, but a file of a camera"):
+        read_points(tmp_path / "a.json")
+
+
+def test_corners_of_other_programs_make_a_rig_with_their_board(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", pixels())
+    write_points(points(pixels() + 1), tmp_path / "b.csv")
+    found = read_rig_points([("", str(tmp_path / "a.npy")), ("", str(tmp_path / "b.csv"))], board=BOARD)
+    assert list(found) == ["a", "b"]
+    assert np.array_equal(found["a"].world, found["b"].world)
+    assert found["a"].view_names == ("1", "2", "3")
+    with pytest.raises(FormatError, match="give --board chessboard:COLSxROWS:SQUARE"):
+        read_rig_points([("", str(tmp_path / "a.npy"))])
+
+
+def test_a_grid_with_other_ids_is_a_board_of_mrcal() -> None:
+    given = replace(points(pixels()), point=np.tile([f"p{k}" for k in range(20)], 3))
+    lines = str(corner_text(given, "mrcal", "")).splitlines()
+    assert len(lines) == 61
+    assert lines == str(corner_text(points(pixels()), "mrcal", "")).splitlines()

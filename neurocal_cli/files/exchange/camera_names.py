@@ -54,7 +54,7 @@ SIZE = (
     "dimensions", "framesize", "calibdimension", "cameraresolution", "imsize", "calibrationresolution",
     "capturedimagesize",
 )  # fmt: skip
-SHAPE = ("imageshape", "imgshape", "shape")  # NumPy's: height and width
+SHAPE = ("imageshape", "imgshape", "shape", "grayshape", "frameshape")  # NumPy's: height and width
 # Of all numbers in one list: fx, fy, cx, cy, and the coefficients.
 PARAMETERS = (*MATRIX, "calibration", "calib", "cameraparams", "cameraparameters", "params")
 NAME = ("cameraname",)

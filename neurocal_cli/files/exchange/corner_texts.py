@@ -16,6 +16,8 @@ from neurocal_cli.files.points_csv import format_points
 from neurocal_cli.files.yaml_text import number
 from neurocal_cli.observations.points import Correspondences
 
+_REGULAR = 1e-3  # share of a square's side by which sides may differ
+
 
 def corner_text(points: Correspondences, target: str, ending: str) -> str | bytes:
     """Write points for ``neurocal, opencv, matlab, json, npz`` or ``mrcal``; an `ending` is ".xml"."""
@@ -113,15 +115,21 @@ def _matlab(points: Correspondences, ending: str) -> bytes:
 
 def _mrcal(points: Correspondences, ending: str) -> str:
     """Write a line for each vertex of the board, row by row; ``-`` if it was not found."""
-    _, ids, pixels = _array(points)
+    world, ids, pixels = _array(points)
     try:
         grid = np.array([[int(part) for part in label.split(":")] for label in ids])
         cols, rows = (grid.max(axis=0) + 1).tolist()
-        place = {(c, r): k for k, (c, r) in enumerate(grid.tolist())}
-    except ValueError as error:
-        raise InputError(
-            "mrcal takes the vertices of one flat board, and some points are others; detect --points vertices"
-        ) from error
+    except ValueError:
+        grid = np.column_stack([np.unique(x, return_inverse=True)[1].ravel() for x in world[:, :2].T])
+        cols, rows = (grid.max(axis=0) + 1).tolist()
+        steps = np.concatenate([np.diff(np.unique(x)) for x in world[:, :2].T])
+        regular = np.ptp(steps) < _REGULAR * steps.max() if len(steps) else False
+        if world[:, 2].any() or cols * rows != len(world) or not regular:
+            raise InputError(
+                "mrcal takes the vertices of one flat board, and some points are others; detect --points "
+                "vertices"
+            ) from None
+    place = {(c, r): k for k, (c, r) in enumerate(grid.tolist())}
     lines = ["# filename x y level"]
     order = [place.get((c, r)) for r in range(rows) for c in range(cols)]
     for name, view in zip(points.view_names, pixels, strict=True):

@@ -23,6 +23,7 @@ import numpy as np
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.files.exchange.camera_names import SHAPE, plain
 from neurocal_cli.files.exchange.document import array_of, arrays_of, camera_matrix, few_numbers
 from neurocal_cli.files.exchange.loose_keys import LooseKeys
 from neurocal_cli.files.exchange.matlab import FIRST_PIXEL, STRUCTS, read_variables, unit_of
@@ -43,6 +44,9 @@ _WORLD = (
     "object_points", "objectPoints", "objpoints", "obj_points", "objPoints", "grid_points", "worldPoints",
     "WorldPoints", "world_points",
 )  # fmt: skip
+TABLES = (".csv", ".txt", ".tsv")  # endings of tables of points
+BOARD_ADVICE = "give --board chessboard:COLSxROWS:SQUARE"
+_HEAD = 1_000_000  # characters that show of what kind a file is
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
 # A header with names of X and v, or a first row of five numbers.
 _TABLE = re.compile(
@@ -99,7 +103,7 @@ def read_corners(
     if _TABLE.match(text):
         return _table_of(names, given)
     named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
-    if named or text.lstrip().startswith(("{", "<", "%YAML", "/")):
+    if named or text.lstrip().startswith(("{", "<", "%YAML", "/", "[{", "[\n")):
         return _corners(parse_tree(text, source), given)
     return None
 
@@ -135,11 +139,16 @@ def _corners(
     Without board points, `down` tells that the corners run along the columns of the board.
     """
     field = root.first(_IMAGE) if isinstance(root.value, dict) else None
-    if field is None:
+    if field is not None and isinstance(field.value, dict) and "data" not in field:
+        field = None  # by the names of views
+    views_apart = [] if field is not None else _views_apart(root)
+    if field is None and not views_apart:
         return None
-    if not given.points and LooseKeys(root).has_camera():
+    if isinstance(root.value, dict) and not given.points and LooseKeys(root).has_camera():
         given.notes.append(f"{root.source}: holds points as well as a camera; --what points converts these")
         return None
+    if field is None:
+        return _of_views(root, views_apart, given)
     board = given.board or board
     pixels = _stack(field, 2) - first
     views = len(pixels)
@@ -156,7 +165,78 @@ def _corners(
     if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
         field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
     points = _assembled(world, pixels, names, ids, stated, root.source)
-    return replace(points, image_size=LooseKeys(root).image_size())
+    return replace(points, image_size=_size(root, points.pixels))
+
+
+def _size(root: Field, pixels: Array) -> tuple[int, int] | None:
+    """Size of the images; a shape is height and width, or with pixels beyond it width and height."""
+    size = LooseKeys(root).image_size() if isinstance(root.value, dict) else None
+    shape = isinstance(root.value, dict) and any(plain(key) in SHAPE for key in root.value)
+    if size is not None and shape and (pixels > size).any() and (pixels <= size[::-1]).all():
+        return size[::-1]
+    return size
+
+
+def _views_apart(root: Field) -> list[tuple[str, Field, Field | None]]:
+    """Name, pixels and board points of each view, where a file has the views apart; none for others."""
+    images = root.first(_IMAGE) if isinstance(root.value, dict) else None
+    if images is not None:  # a mapping of pixels by the names of the views
+        places = root.first(_WORLD)
+        return [(name, entry, places) for name, entry in images.entries().items()]
+    value = root.value
+    for key in ("observations", "views", "images", "frames"):
+        if isinstance(value, dict) and isinstance(value.get(key), (list, dict)):
+            root, value = root[key], value[key]
+    parts = root.entries().items() if isinstance(value, dict) else enumerate(root.items())
+    found = []
+    for name, part in parts if isinstance(value, (list, dict)) else ():
+        pixels = (
+            part.first((*_IMAGE, "locationInImageSpace", "points")) if isinstance(part.value, dict) else None
+        )
+        if pixels is None:
+            return []
+        stated = part.first(("name", "image", "image_name", "file", "filename", "snapshotName"))
+        places = part.first((*_WORLD, "locationInObjectSpace", "points"))
+        found.append((str(name) if stated is None else stated.text(), pixels, places))
+    return found
+
+
+def _of_views(root: Field, views: list[tuple[str, Field, Field | None]], given: _Given) -> Correspondences:
+    """Points of views that stand apart, each with its own."""
+    world, pixels, names, ids = [], [], [], []
+    for name, measured, places in views:
+        uv = _listed(measured, "uv", "xy")
+        if places is None:
+            XYZ, own = _of_board(given.board, len(uv), measured, given.advice)
+            XYZ = XYZ[0]
+        else:
+            XYZ, own = _listed(places, "XYZ", "xyz"), [str(k) for k in range(len(uv))]
+        if len(XYZ) != len(uv):
+            measured.fail(f"{len(XYZ)} points, as there are places on the board")
+        known = np.isfinite(uv).all(axis=1) & (uv != -1).any(axis=1)  # PhotonVision has -1 without a corner
+        world.append(XYZ[known])
+        pixels.append(uv[known])
+        names += [name] * int(known.sum())
+        ids += [label for label, here in zip(own, known, strict=True) if here]
+    unit = root["unit"].text() if "unit" in root else given.unit
+    if unit is None and "locationInObjectSpace" in str(root.value)[:_HEAD]:
+        unit = "m"
+    labels = None if views[0][2] is not None else ids
+    seen = np.concatenate(pixels)
+    with value_failures(root.source):
+        return Correspondences(
+            np.concatenate(world), seen, np.array(names), _size(root, seen), point=labels,
+            unit=unit or (given.board.unit if given.board and labels else "unknown"), source=root.source,
+        )  # fmt: skip
+
+
+def _listed(entry: Field, *axes: str) -> Array:
+    """Points of one view, in lists of any depth or in mappings of x and y, or u and v."""
+    for names in axes:
+        first = entry.value[0] if isinstance(entry.value, list) and entry.value else None
+        if isinstance(first, dict) and set(names) <= set(first):
+            return np.array([[one[axis].number() for axis in names] for one in entry.items()])
+    return _stack(entry, len(axes[0]))[0]
 
 
 def _of_board(
