@@ -5,8 +5,9 @@ ROS has no names for wide lenses other than the fisheye, nor for thin prism and 
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from neurocal_cli.files.yaml_text import flow, mapping, number, text
 if TYPE_CHECKING:
     from neurocal_cli.camera.undistortion import Panorama
 
+_PACKED = "$base64$"
 _FORMULAS = {
     "cylinder": "u = f atan2(X, Z) + u0, v = f Y / hypot(X, Z) + v0",
     "equirectangular": "u = f atan2(X, Z) + u0, v = f atan2(Y, hypot(X, Z)) + v0",
@@ -46,6 +48,8 @@ def matrix_data(field: Field, length: int) -> Array:
     if isinstance(field.value, dict) and "rows" not in field and "data" in field:
         return matrix_data(field["data"], length)
     if isinstance(field.value, dict):
+        if _is_packed(field["data"].value):
+            field = Field({**field.value, "data": _unpacked(field["data"])}, field.source, field.path)
         nested = (
             field["data"].value
             and isinstance(field["data"].value, list)
@@ -69,6 +73,23 @@ def matrix_data(field: Field, length: int) -> Array:
     if length >= 0 and len(data) != length:
         field.fail(f"{length} numbers")
     return data
+
+
+def _is_packed(data: Any) -> bool:
+    """Whether OpenCV's FileStorage wrote the data of a matrix as base64."""
+    text = data[0] if isinstance(data, list) and data else data
+    return isinstance(text, str) and text.startswith((_PACKED, "MW"))  # MW begins the head "1d"
+
+
+def _unpacked(field: Field) -> list[float]:
+    """Numbers of base64: a head of 24 bytes with their type, such as 1d, and the bytes of all."""
+    words = field.value if isinstance(field.value, list) else field.value.split()
+    try:
+        data = base64.b64decode("".join(map(str, words)).removeprefix(_PACKED), validate=True)
+        kind = {"d": "<f8", "f": "<f4"}[data[:24].decode().strip()[-1:]]
+        return list(map(float, np.frombuffer(data[24:], kind).tolist()))
+    except (ValueError, KeyError):
+        field.fail("numbers, or OpenCV's base64 of them")
 
 
 def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:

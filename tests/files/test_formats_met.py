@@ -523,6 +523,54 @@ MET |= {
         D5,
         S,
     ),
+    "pycolmap": (
+        {"model": "OPENCV", **WH, "params": [800.5, 801.25, 321.8, 239.2, *D4]},
+        E,
+        D4,
+        S,
+    ),
+    "one focal length": (
+        {"f": 800.5, "cx": 321.3, "cy": 238.7, "k1": -0.31, "k2": 0.12},
+        ROUND,
+        [-0.31, 0.12],
+        None,
+    ),
+    "a matrix of raw images": ({"K": HALVED, "K_raw": K, "D": D5}, E, D5, None),
+    "numbers in a text": ({"K": " ".join(map(str, FLAT)), "D": str(D5)}, E, D5, None),
+    "a dictionary that Python prints": (f"{ {'mtx': np.array(K), 'dist': np.array([D5])} }\n", E, D5, None),
+    "a double sphere": (
+        {"model": "ds", **FXY, "xi": -0.2, "alpha": 0.6},
+        E,
+        ["double_sphere", -0.2, 0.6],
+        None,
+    ),
+    "rows of names": (lines("", "", **FXY, **NAMED).replace(":", ""), E, D5, None),
+    "rows of a matrix": (f"K {' '.join(map(str, FLAT))}\nD {' '.join(map(str, D5))}\n", E, D5, None),
+    "a matrix and its coefficients": (
+        "".join(f"{' '.join(map(str, row))}\n" for row in [*K, D5]),
+        E,
+        D5,
+        None,
+    ),
+    "definitions of C": (
+        lines("", "#define ", **{k.upper(): v for k, v in (FXY | NAMED).items()}).replace(":", ""),
+        E,
+        D5,
+        None,
+    ),
+    "matrices of C++": (
+        f"cv::Mat K = (cv::Mat_<double>(3, 3) << {str(FLAT)[1:-1]});\n"
+        f"cv::Mat D = (cv::Mat_<double>(1, 5) << {str(D5)[1:-1]});\n",
+        E,
+        D5,
+        None,
+    ),
+    "a RealSense's fisheye": (
+        STREAM.format("Fisheye 1", "Kannala Brandt4", f"{str(FOUR)[1:-1].replace(',', '')} 0"),
+        E,
+        FISH,
+        S,
+    ),
     "messages of ROS": ("".join(f"header:\n  seq: {k}\n{ECHO}---\n" for k in range(2)), E, D5, S),
     "R3LIVE": (
         lines(
@@ -807,3 +855,14 @@ def test_an_array_that_is_no_camera_matrix_is_told(tmp_path: Path) -> None:
     np.save(tmp_path / "D.npy", [D5])
     with pytest.raises(FormatError, match="is an array of 1 x 5 numbers; give the camera matrix"):
         read_cameras([tmp_path / "D.npy"])
+
+
+@pytest.mark.parametrize(("ending", "packed"), [(".yml", 64), (".json", 64), (".xml", 64), (".yml.gz", 0)])
+def test_opencv_s_packed_files_are_read(ending: str, packed: int, tmp_path: Path) -> None:
+    import cv2
+
+    file = cv2.FileStorage(str(tmp_path / f"a{ending}"), cv2.FILE_STORAGE_WRITE | packed)
+    file.write("camera_matrix", np.array(K))
+    file.write("distortion_coefficients", np.array([D5]))
+    file.release()
+    check(read_cameras([tmp_path / f"a{ending}"]).cameras[0], E, D5)

@@ -198,6 +198,11 @@ def expected(entries: list[float], lens: list[Any], points: Array) -> Array:
         rho, t = np.hypot(X, Y), np.arctan2(np.hypot(X, Y), Z)
         bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
         x, y = bent * X / rho, bent * Y / rho
+    elif lens[:1] == ["double_sphere"]:
+        xi, alpha = lens[1:]
+        d1 = np.sqrt(X * X + Y * Y + Z * Z)
+        d2 = np.sqrt(X * X + Y * Y + (xi * d1 + Z) ** 2)
+        x, y = (w / (alpha * d2 + (1 - alpha) * (xi * d1 + Z)) for w in (X, Y))
     else:
         k1, k2, p1, p2, k3, k4, k5, k6 = [*lens, *[0.0] * 8][:8]
         a, b = X / Z, Y / Z

@@ -7,7 +7,7 @@ import re
 # Of the images as they were taken, where a file has the matrix of undistorted ones as well.
 ORIGINAL = (
     "cammatrixoriginal", "cameramatrixoriginal", "originalcameramatrix", "originalcammatrix", "koriginal",
-    "korig", "originalk", "mtxoriginal",
+    "korig", "originalk", "mtxoriginal", "kraw", "rawk", "cameramatrixraw", "kdistorted",
 )  # fmt: skip
 # The first are written here and by ROS and OpenCV; in OpenCV's stereo sample the left camera has M1 and D1.
 MATRIX = (
@@ -56,7 +56,7 @@ SIZE = (
 )  # fmt: skip
 SHAPE = ("imageshape", "imgshape", "shape", "grayshape", "frameshape")  # NumPy's: height and width
 # Of all numbers in one list: fx, fy, cx, cy, and the coefficients.
-PARAMETERS = (*MATRIX, "calibration", "calib", "cameraparams", "cameraparameters", "params")
+PARAMETERS = (*MATRIX, "calibration", "calib", "cameraparams", "cameraparameters")
 NAME = ("cameraname",)
 
 # Keys whose text names the distortion model; an unknown word is refused in the first, ignored in the others.

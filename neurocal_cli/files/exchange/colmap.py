@@ -85,17 +85,31 @@ def read_folder(folder: str) -> CameraSet:
 
 
 def is_cameras(document: Document) -> bool:
-    """Whether this is ``cameras.txt`` or ``cameras.bin``."""
+    """Whether this is ``cameras.txt``, ``cameras.bin`` or a dictionary of a camera."""
     data = document.data
+    if _stated_model(document) is not None:
+        return True
     if len(data) < 48 or document.is_text:
         return bool(_LINE(document.text))
     count, _, model, width, height = struct.unpack_from("<QiiQQ", data)
     return bool(0 < count < 10_000 and 0 <= model < 30 and 0 < width < 10**6 and 0 < height < 10**6)
 
 
+def _stated_model(document: Document) -> str | None:
+    """The model of a dictionary of a camera, as pycolmap and hloc have it; None for other files."""
+    tree = document.tree
+    name = str(tree.get("model", tree.get("camera_model", ""))).rpartition(".")[2]
+    known = name in _MODELS or name in _OTHERS.values()
+    return name if known and {"params", "width", "height"} <= set(tree) else None
+
+
 def read_file(document: Document) -> CameraSet:
     """Read ``cameras.txt`` or ``cameras.bin`` with one camera."""
     source = document.source
+    if (stated := _stated_model(document)) is not None:
+        sides = [document.root[side].integer(1) for side in ("width", "height")]
+        words = ["1", stated, *map(str, sides), *map(repr, document.root["params"].array(-1).tolist())]
+        return CameraSet((_camera(words, source, 1),), program="COLMAP")
     lines = _lines(document.text) if document.is_text else _unpacked(document.data, "cameras", source)
     return CameraSet(tuple(_cameras(lines, source).values()), program="COLMAP")
 
@@ -299,7 +313,7 @@ FORMAT = Format(
     _text,
     is_cameras,
     read_file,
-    files="cameras.txt and the rest of a text model; cameras.bin and the rest of a binary one",
+    files="cameras.txt or cameras.bin, with the rest of a model; dictionary of a camera",
     poses=True,
     most_cameras=99,
     needs_size=True,

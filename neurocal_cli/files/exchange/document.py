@@ -34,6 +34,9 @@ FROM_ZERO = (
     "its first pixel is taken as 0, as OpenCV has it; if MATLAB calibrated the camera, subtract 1 from the "
     "principal point"
 )
+# A matrix of OpenCV in C++.
+_FILLED = re.compile(r"(?:[\w:]+\s+)?(\w+)\s*=\s*\(\s*(?:cv::)?Mat_<\w+>\([\d, ]+\)\s*<<([^;)]*)\)")
+_COEFFICIENTS = (4, 5, 8, 12, 14)
 _MATLAB = re.compile(r"=\s*\[[^\]\n]*;|^\s*%", re.MULTILINE).search
 _MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _HEAD = re.compile(r"\A\s*header:.*?^(?=height:)", re.MULTILINE | re.DOTALL)
@@ -80,6 +83,8 @@ class Document:
         size: tuple[int, int] | None = None,
     ) -> None:
         self.data, self.source = read_bytes(name)
+        if self.data.startswith(b"\x1f\x8b"):  # OpenCV's FileStorage packs .yml.gz
+            self.data = unpacked(self.data, self.source)
         self.notes, self.warnings = notes, warnings
         self.distortion, self.size = distortion, size
         self.is_script = False  # of MATLAB or Octave, perhaps
@@ -129,11 +134,14 @@ class Document:
             root = parse_tree(text, self.source)
         except FormatError as error:
             failed, root = error, Field("", self.source)
-        if isinstance(root.value, str) and (tree := stated(text)) is not None:
+        if (root.value is None or isinstance(root.value, str)) and (tree := stated(text)) is not None:
             self.is_script = bool(_MATLAB(text))
             return Field(tree, self.source)
         if failed is not None:
-            if (plain := _PRINTED.sub(_with_commas, text)) != text:
+            plain = re.sub(
+                r"\barray\(|(?:, *dtype=[\w.]+)?\)", "", text
+            )  # of a dictionary that Python prints
+            if (plain := _PRINTED.sub(_with_commas, plain)) != text:
                 return parse_tree(plain, self.source)
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             alike = sum(":" in line or line[0] in "-#{}[]<," for line in lines)
@@ -268,6 +276,18 @@ def sections(text: str, source: str) -> dict[str, Any]:
     return {name: {key: _value(value) for key, value in parser[name].items()} for name in parser.sections()}
 
 
+def unpacked(data: bytes, source: str) -> bytes:
+    """The contents of a file that gzip packed."""
+    unpacker = zlib.decompressobj(31)
+    try:
+        found = unpacker.decompress(data, _MOST_BYTES)
+    except zlib.error as error:
+        raise FormatError("is a damaged .gz file; give it unpacked", source) from error
+    if unpacker.unconsumed_tail or not unpacker.eof:
+        raise FormatError("is cut off, or unpacks to more than 500 MB; give it unpacked", source)
+    return found
+
+
 def stated(text: str) -> dict[str, Any] | None:
     """Numbers and matrices by the names before them, or in the row below those of a table; None without."""
     lines = [re.split(r"[ \t]*[,;\t][ \t]*", line.strip()) for line in text.splitlines() if line.strip()]
@@ -275,7 +295,19 @@ def stated(text: str) -> dict[str, Any] | None:
         tree: dict[str, Any] = dict(zip(lines[0], map(_value, lines[1]), strict=True))
         return None if any(map(is_number, lines[0])) else tree
     tree = {}
+    text = _FILLED.sub(r"\1 = [\2]", re.sub(r"^[ \t]*#define", "", text, flags=re.MULTILINE))
     text = re.sub(r"(?:[%#]|//)[^\n]*", "", text)
+    rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
+    if all(len(row) > 1 and all(map(is_number, row[1:])) for row in rows):
+        counts = [len(row) for row in rows]
+        if all(map(is_number, (row[0] for row in rows))):
+            if counts[:-1] not in ([3, 3, 3], [9]) or counts[-1] not in _COEFFICIENTS:
+                return None
+            return {"K": [float(word) for row in rows[:-1] for word in row], "D": list(map(float, rows[-1]))}
+        names = [row[0] for row in rows]
+        if len(set(names)) < len(names) or any(map(is_number, names)):
+            return None
+        return {name: float(row[0]) if len(row) == 1 else list(map(float, row)) for name, *row in rows}
     if re.search(r"[\[\]]|\d\.\d", _STATED.sub("", text)):  # numbers without a name
         return None
     for name, value in _STATED.findall(text):
@@ -286,9 +318,9 @@ def stated(text: str) -> dict[str, Any] | None:
             tree[name] = float(value) if is_number(value) else value
             continue
         nested = re.findall(r"\[([^\[\]]+)\]", value) if "[[" in re.sub(r"\s", "", value) else None
-        rows = [row.replace(",", " ").split() for row in nested or value.strip("[]").split(";")]
-        if all(is_number(word) for row in rows for word in row):
-            numbers = [[float(word) for word in row] for row in rows if row]
+        parts = [part.replace(",", " ").split() for part in nested or value.strip("[]").split(";")]
+        if all(is_number(word) for part in parts for word in part):
+            numbers = [[float(word) for word in part] for part in parts if part]
             tree[name] = numbers if nested or len(numbers) > 1 else (numbers or [[]])[0]
     return tree if len(tree) > 1 else None
 

@@ -248,9 +248,9 @@ class LooseKeys:
         four = [entry.number() for entry in found if entry is not None]
         if len(four) < 4:
             focal, centre = (self.find(names, "", is_numbers) for names in (FOCAL, CENTRE))
-            assert focal is not None
-            assert centre is not None  # `has_entries`
-            four = [*(2 * flat(focal.value))[:2], *flat(centre.value)]
+            assert focal is not None  # `has_entries`
+            own = four[-2:] if centre is None else flat(centre.value)
+            four = [*(2 * flat(focal.value))[:2], *own]
             size = self.image_size()
             ratio = self.find(ASPECT, "", is_numbers)
             if len(flat(focal.value)) == 1 and ratio is not None and ratio.number() not in (0, 1):
@@ -302,6 +302,10 @@ class LooseKeys:
         xi = self.find(("xi",), side, is_numbers)
         coefficients, named = self._coefficients(side)
         model = self._stated_model(side)
+        if model in ("double_sphere", "eucm") and coefficients is None:
+            found = [self.find((name,), side, is_numbers) for name in MODELS[model]]
+            if all(found):
+                return Distortion(model, np.array([entry.number() for entry in found if entry]))
         if coefficients is None:
             if xi is not None:
                 raise InputError(
@@ -378,6 +382,7 @@ def _count(value: Any) -> int:
 def _omnidirectional(xi: Field, coefficients: Array, model: str) -> Distortion:
     """Distortion of OpenCV's omnidirectional camera, whose xi is a separate key."""
     value = xi.number() if isinstance(xi.value, (int, float)) else float(matrix_data(xi, 1)[0])
+    coefficients = coefficients[:4] if not coefficients[4:].any() else coefficients
     if model != "omnidir" or len(coefficients) != 4:
         raise InputError(
             f"has xi of an omnidirectional camera, and {len(coefficients)} coefficients of the distortion "

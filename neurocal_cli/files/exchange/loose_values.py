@@ -46,13 +46,16 @@ def has_entries(value: Any) -> bool:
         return False
     names = {plain(str(key)) for key, entry in value.items() if not isinstance(entry, (dict, list))}
     pairs = {plain(str(key)) for key, entry in value.items() if is_numbers(entry)}
-    return all(not names.isdisjoint(entry) for entry in ENTRIES) or not (
+    one = not names.isdisjoint(FOCAL)  # for both axes
+    return all(not names.isdisjoint(entry) for entry in ENTRIES[2 if one else 0 :]) or not (
         pairs.isdisjoint(FOCAL) or pairs.isdisjoint(CENTRE)
     )
 
 
 def plain_lists(tree: Any, depth: int = 5) -> Any:
-    """The tree with lists for the mappings 0, 1, ... of JavaScript's arrays."""
+    """The tree with lists for the mappings 0, 1, ... of JavaScript's arrays, and for numbers in a text."""
+    if isinstance(tree, str) and len(words := tree.replace(",", " ").strip(" []").split()) > 3:
+        return [float(word) for word in words] if all(map(is_number, words)) else tree
     if not isinstance(tree, dict) or depth == 0:
         return tree
     if tree and all(key == str(k) and is_numbers(value) for k, (key, value) in enumerate(tree.items())):

@@ -93,6 +93,7 @@ def _read_realsense(document: Document) -> CameraSet:
                 f"the model {found['model']} of RealSense is not known here; calibrate its images, or use "
                 "streams that the camera undistorts"
             )
+        k = k[:4] if found["model"].startswith("Kannala") and not k[4:].any() else k
         values = {key: found[key] for key in ("fx", "fy", "cx", "cy", "model")}
         tree = {**values, "D": k.tolist(), "size": size}
         name = found.groupdict().get("name") or "camera"
