@@ -143,7 +143,7 @@ def test_it_takes_calibrates_options() -> None:
 
     commands = [neurocal.get_command(Context(neurocal), name) for name in ("calibrate", "stereo")]
     one, two = ({p.name for p in command.params} for command in commands if command is not None)
-    assert one - two == {"points", "board", "intrinsics", "extrinsics", "camera_name"}
+    assert one - two == {"points", "intrinsics", "extrinsics", "camera_name"}
 
 
 def error(result: Result, *parts: str) -> None:
