@@ -1,8 +1,9 @@
 """Make the sample photographs: a printed chessboard in a hand, rendered like the pictures of a phone.
 
-The paper bends, a little differently each time. The light is uneven, things lie behind the board, a thumb
-holds its margin, and the pictures have the lens, the noise and the compression of a simple camera. Run
-``python sample_data/make_photos.py`` to write the files again.
+The paper bends and ripples, a little differently each time, and the printer was not exact. The light is
+uneven, things lie behind the board, a thumb holds its margin, and the pictures have the soft lens, the noise
+that is partly smoothed, and the compression of a simple camera in a room. Run ``python
+sample_data/make_photos.py`` to write the files again.
 """
 
 from __future__ import annotations
@@ -27,9 +28,13 @@ CAMERA = Camera(
 SQUARES, SIDE, MARGIN = (10, 7), 25.0, 15.0  # squares across and down, mm, mm of white paper around them
 HALF = 0.5 * SIDE * np.array(SQUARES)  # of the pattern, from its middle [mm]
 CURL, ANEW = 0.5, 0.1  # mm that the paper bends, in all pictures alike and anew in each
+RIPPLE, RIPPLES = 0.07, 120.0  # mm: amplitude and length of the paper's waves, anew in each picture
+PRINTED, PRINTS = 0.03, 60.0  # mm: the same of the printer's errors
+WAVES = 4  # that make a surface of these
 SEED = 100
-FINE = 4  # rays across and down in each pixel
-BLUR, FULL_WELL, GAMMA, QUALITY = 0.9, 900.0, 2.2, 80
+FINE = 2  # rays across and down in each pixel
+BLUR, SMOOTHED = 1.2, 0.8  # px, of the lens, and of the picture with its noise
+FULL_WELL, READ, GAMMA, QUALITY = 40.0, 1.2, 2.2, 80
 # Of each picture: where the board's middle is in the image, its distance [mm], tilt, side of the tilt, and
 # roll [degrees].
 VIEWS = (
@@ -50,15 +55,31 @@ def poses(views: Sequence[tuple[float, ...]] = VIEWS) -> Iterator[Pose]:
         yield Pose(R, distance * ray)
 
 
+def waves(rng: np.random.Generator, length: float) -> Array:
+    """Waves in any direction, of about this length [mm]: their vectors and phases, (3, n)."""
+    vectors = rng.normal(0, 2 * np.pi / length, (2, WAVES))
+    return np.vstack([vectors, rng.uniform(0, 2 * np.pi, WAVES)])
+
+
+def surface(x: Array, y: Array, made: Array) -> Array:
+    """The sum of `waves` at places, of rms 1."""
+    return np.asarray(sum(np.cos(k * x + m * y + phase) for k, m, phase in made.T) / np.sqrt(WAVES / 2))
+
+
+PRINTER = [waves(np.random.default_rng(seed), PRINTS) for seed in (1, 2)]
+
+
 def height(x: Array, y: Array, bend: Array) -> Array:
     """Height of the paper [mm] at places from its middle."""
     a, b = x / HALF[0], y / HALF[1]
-    return bend[0] * (a * a - 1 / 3) + bend[1] * (b * b - 1 / 3) + bend[2] * a * b
+    curved = bend[0] * (a * a - 1 / 3) + bend[1] * (b * b - 1 / 3) + bend[2] * a * b
+    return np.asarray(curved + RIPPLE * surface(x, y, bend[3:].reshape(3, -1)))
 
 
 def bent(rng: np.random.Generator, anew: float = ANEW) -> Array:
-    """How the paper bends in a picture [mm]."""
-    return CURL * np.array([1.0, -0.3, 0.4]) + anew * rng.standard_normal(3)
+    """How the paper bends in a picture [mm], and its waves."""
+    curved = CURL * np.array([1.0, -0.3, 0.4]) + anew * rng.standard_normal(3)
+    return np.concatenate([curved, waves(rng, RIPPLES).ravel()])
 
 
 def photograph(
@@ -72,13 +93,14 @@ def photograph(
     rays = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
     direction, centre = rays @ pose.R, -pose.R.T @ pose.t  # in the paper's frame
     z = np.zeros(rays.shape[:2])
-    for _ in range(5):
+    for _ in range(3):
         along = (z - centre[2]) / direction[..., 2]
         x, y = (centre[k] + along * direction[..., k] for k in (0, 1))
         z = height(x, y, bend)
     on_paper = (np.abs(x) < HALF[0] + MARGIN) & (np.abs(y) < HALF[1] + MARGIN) & (along > 0)
     on_pattern = (np.abs(x) < HALF[0]) & (np.abs(y) < HALF[1])
-    dark = (np.floor((x + HALF[0]) / SIDE) + np.floor((y + HALF[1]) / SIDE)) % 2 == 0
+    printed = [one + PRINTED * surface(x, y, errors) for one, errors in zip((x, y), PRINTER, strict=True)]
+    dark = sum(np.floor((one + half) / SIDE) for one, half in zip(printed, HALF, strict=True)) % 2 == 0
     paper = np.where(on_pattern & dark, 0.05, 0.82)
     slope = 2 * bend[0] * x / HALF[0] ** 2
     light = 1.0 + 8.0 * slope + 0.0006 * (0.7 * x - y)
@@ -88,7 +110,8 @@ def photograph(
     seen = cv2.blur(cv2.GaussianBlur(seen, (0, 0), BLUR), (moved, max(1, moved // 2)))
     rho = np.hypot(*np.meshgrid(np.linspace(-1, 1, width), np.linspace(-0.75, 0.75, height_px))) / 1.25
     seen = np.clip(seen * (0.86 - 0.2 * rho**2), 0, 1)
-    electrons = rng.poisson(FULL_WELL * seen) + rng.normal(0, 14.0, seen.shape)
+    electrons = rng.poisson(FULL_WELL * seen) + rng.normal(0, READ, seen.shape)
+    electrons = cv2.GaussianBlur(electrons, (0, 0), SMOOTHED)
     return np.clip(255 * np.clip(electrons / FULL_WELL, 0, 1) ** (1 / GAMMA), 0, 255)
 
 

@@ -69,7 +69,7 @@ SETS: dict[str, Callable[[], Iterator[np.ndarray]]] = {
     "one-side": lambda: rendered(UPRIGHT, 400),
     "few": lambda: of_samples((2, 5, 9)),
     "soft": lambda: rendered(GOOD, 500, anew=1.5),
-    "autofocus": lambda: rendered(GOOD, 600, zoom=0.004),
+    "autofocus": lambda: rendered(GOOD, 600, zoom=0.012),
 }
 
 

@@ -13,8 +13,8 @@ from style import BLUE, INK, ORANGE, SAMPLES, figure, save
 from neurocal_cli import Calibration, calibrate, evaluate_camera, read_image
 from neurocal_cli.calibration.verdict.assessment import uncertainty_over_image
 
-SHOWN, ENLARGED = "photo02", 1000
-LEVELS = (0.003, 0.006, 0.01, 0.03, 0.1, 0.3, 1.0)  # px
+SHOWN, ENLARGED = "photo02", 200
+LEVELS = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0)  # px
 matplotlib.rcParams.update({"font.size": 11.5, "axes.titlesize": 13})
 
 

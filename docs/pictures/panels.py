@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import numpy as np
+from PIL import Image
 
 from neurocal_cli import Board, Correspondences, calibrate, detect_points, read_image
 from neurocal_cli.calibration.drift import find_drift
@@ -55,6 +57,11 @@ def main() -> None:
     }
     for name, content in pictures.items():
         (HERE / name).write_bytes(content)
+    # Below each other, for a screen that is too narrow for the page.
+    narrow = Image.fromarray(
+        np.vstack([np.asarray(Image.open(HERE / file).convert("RGB")) for file in PANELS])
+    )
+    narrow.quantize(96).save(HERE / "panels-narrow.png", optimize=True)
     grey = read_image(str(SAMPLES / "photo02.jpg")).grey
     overlay = draw_detection(grey, detect_points(grey, BOARD))[OVERLAY]
     cv2.imwrite(str(HERE / "overlay.jpg"), overlay[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])

@@ -132,7 +132,7 @@ def batch(
     from neurocal_cli.commands import cluster
 
     if not cluster.is_installed() and (workers or scheduler):
-        raise NeurocalError(f"{chosen[0]} needs Dask; pip install 'neurocal[fleet]', or use --jobs")
+        raise NeurocalError(f"{chosen[0]} needs Dask; pip install 'dask[distributed]', or use --jobs")
     from neurocal_cli.commands.batch_jobs import job_of
     from neurocal_cli.files.fleet_csv import read_fleet
     from neurocal_cli.files.job_files import locked
