@@ -31,9 +31,8 @@ from neurocal_cli.calibration.lens_choice.model_selection import (
 )
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.findings import pixel_spread
+from neurocal_cli.calibration.verdict.findings import LEVEL, MISFIT, pixel_spread
 from neurocal_cli.calibration.verdict.noise import stated_noise
-from neurocal_cli.calibration.verdict.rival import LEVEL
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -52,7 +51,6 @@ _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
 _STARTS = 20
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
-_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
 _BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
 # Prior standard deviations of one view's change of zoom, of its centre over the pixels' spread, and of its
@@ -145,7 +143,7 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
         how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
         shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
         return how + _or_bent(shift / camera.entries[0])
-    if free > _BLURRED * pixel_spread(points):
+    if free > MISFIT * pixel_spread(points):
         return otherwise
     if plain.rms < _HOLDS * free:
         times = f"{plain.rms / rmse_px:.2g} times that of the others"

@@ -36,8 +36,8 @@ from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration.calibration import Rejected
 from neurocal_cli.calibration.fit import fit, fit_again
 from neurocal_cli.calibration.other_causes import contradicts_sigma, error_of_view, why_odd
-from neurocal_cli.calibration.point_errors import largest_expected, point_errors, rms
-from neurocal_cli.calibration.verdict.findings import MISFIT, pixel_spread
+from neurocal_cli.calibration.point_errors import FLOOR, largest_expected, point_errors, rms
+from neurocal_cli.calibration.verdict.findings import MISFIT, TOLD, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.network.consensus import (
@@ -55,12 +55,10 @@ from neurocal_cli.observations.target import distinct_points
 # Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
 # test_wrong_inputs.py.
-_EXACT = 1e-9  # of the pixels' spread: rms errors below this are rounding
 _ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
 _PASSES = 12
 _LITTLE = 0.05  # share of the points that can change without another minimum being the lowest
 NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
-_FITS = 4.0  # standard deviations of a view's squared error: one that fits so well is not wrong
 _MAJORITY = 0.5  # share of the points that must be left
 _LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
 _FEW = 30.0  # spare equations below which points are left out only if the evidence favours it
@@ -140,7 +138,7 @@ def _is_more_probable(kept: _Kept, solution: Solution, first: Solution) -> bool:
 def _evidence(solution: Solution) -> float:
     """Log evidence of the fit of some points; see the module."""
     half = 0.5 * max(solution.spare_equations, 1e-9)
-    floor = (_EXACT * pixel_spread(solution.problem.points)) ** 2
+    floor = (FLOOR * pixel_spread(solution.problem.points)) ** 2
     return lgamma(half) - half * log(pi * (solution.squared_error + floor))
 
 
@@ -354,7 +352,7 @@ def _with_fitting_views(
     points, usual, fitting = problem.points, rms(solution) ** 2, []
     for name in kept.wrong_views:
         one = points.select(_is_of(points, name))
-        chance = 1 + _FITS * np.sqrt(2.0 / max(2 * len(one) - 6, 1))
+        chance = 1 + TOLD * np.sqrt(2.0 / max(2 * len(one) - 6, 1))
         if error_of_view(one, solution.camera) ** 2 <= chance * usual:
             fitting.append(name)
     if not fitting:

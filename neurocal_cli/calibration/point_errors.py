@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.common_noise import common_share, measured, with_common_share
 from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.solution import Solution
-from neurocal_cli.calibration.verdict.findings import pixel_spread
+from neurocal_cli.calibration.verdict.findings import FEW_POINTS, pixel_spread
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.measured_directions import single, unit, variance_across
@@ -20,10 +20,9 @@ from neurocal_cli.observations.points import Correspondences
 
 # Repeated by test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong; clean data
 # are the same to the last bit with and without the rejection).
-_FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
+FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
 _CHANCE = 0.01  # of calling any point of a good data set wrong
 _WORST_VIEW = 3.0  # cap on a view's own noise level, in units of the noise level of all views
-_ENOUGH = 12  # fewest points of a view from which its noise level is estimated
 _ORDINARY = 6.0  # times the median error: only points below test whether the stated sigmas hold
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
@@ -145,9 +144,9 @@ def largest_expected(errors: PointErrors, kept: NDArray[np.bool_], points: Corre
     counts = np.bincount(index, minlength=points.n_views)
     pieces = np.split(rows[np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
     for view, piece in enumerate(pieces):
-        if len(piece) >= _ENOUGH:
+        if len(piece) >= FEW_POINTS:
             by_view[view] = errors.sigma(piece)
-    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * pixel_spread(points)
+    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + FLOOR * pixel_spread(points)
     return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
 
 

@@ -16,13 +16,13 @@ from neurocal_cli.calibration.rig.problem import (
     RigProblem,
 )
 from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.calibration.verdict.findings import TOLD
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, orthonormalised
 
 # A state, its normal equations, and those of the unknowns that move.
 _Linearised = tuple[RigState, Arrowhead, Arrowhead]
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
-_LEVEL = 3.09  # standard deviations of a normal variable, exceeded by chance once in 1000
 
 
 @frozen_dataclass(eq=False)
@@ -62,14 +62,14 @@ def scatter(fit: RigFit) -> tuple[float, int]:
 
 
 def is_significant(squares: float, degrees: int) -> bool:
-    """Whether a sum of squares is larger than by chance: a chi-squared test at the level of 0.001.
+    """Whether a sum of squares is larger than by chance: a chi-squared test by the level of all causes.
 
     Examples
     --------
     >>> is_significant(70.0, 54), is_significant(100.0, 54)
     (False, True)
     """
-    return degrees > 0 and bool(squares / degrees > exceeded_by_chance(degrees, _LEVEL))
+    return degrees > 0 and bool(squares / degrees > exceeded_by_chance(degrees, TOLD))
 
 
 def adjust_rig(problem: RigProblem, start: RigState, free: NDArray[np.bool_]) -> RigFit:

@@ -30,7 +30,17 @@ from neurocal_cli.calibration.rig.rig import Rig, of_two
 from neurocal_cli.calibration.rig.rivals import named_cause
 from neurocal_cli.calibration.rig.stereo_rig import StereoRig
 from neurocal_cli.calibration.verdict.assessment import assess
-from neurocal_cli.calibration.verdict.findings import WORDS, Finding, Limit, name_some, verdict_of
+from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
+    HELD_OUT,
+    SHARE,
+    TOLD,
+    WORDS,
+    Finding,
+    Limit,
+    name_some,
+    verdict_of,
+)
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
@@ -38,13 +48,7 @@ from neurocal_cli.camera.geometry import Array, median
 # in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 5.4 times
 # as much as noise explains.
 _SCATTER = Limit(6.0, 12.0)
-_GROWTH = Limit(1.6, 2.3)
-_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
-_DISTANCE = Limit(0.01, 0.05)  # std over the distance
-_DEPTH = Limit(0.01, 0.05)  # std over the depth
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the views
-_ONE_PLACE = 3.0  # standard deviations; cameras that are nearer are at one place
-_TOLD = 3.0  # standard deviations of a delay
 _FOLDS = 5
 
 
@@ -194,7 +198,7 @@ def _distances(rig: Rig) -> tuple[tuple[tuple[str, str], float], tuple[str, str]
     for k, name in enumerate(names[1:], 1):
         nearest = names[int(np.argmin(apart[k]))]
         pair = rig.pair(nearest, name)
-        if pair.baseline < _ONE_PLACE * pair.std["baseline"]:
+        if pair.baseline < TOLD * pair.std["baseline"]:
             together = (nearest, name)
         share = pair.std["baseline"] / max(pair.baseline, 1e-3 * usual)
         worst = max(worst, ((nearest, name), share), key=lambda one: one[1])
@@ -263,7 +267,7 @@ def _left_out(rig: Rig) -> Iterator[Finding]:
 
 def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     """Findings about frames that do not agree on one rig."""
-    late = {name: delay for name, (delay, std) in rig.delays.items() if abs(delay) > _TOLD * std}
+    late = {name: delay for name, (delay, std) in rig.delays.items() if abs(delay) > TOLD * std}
     if late:
         unit = "s" if rig.timed else "of the time between frames"
         told = name_some(
@@ -277,7 +281,7 @@ def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         )
     if e.cause is not None:
         yield (
-            max(1, _SCATTER.grade(e.scatter), _GROWTH.grade(e.growth), e.cause.grade),
+            max(1, _SCATTER.grade(e.scatter), CONTRADICTION.grade(e.growth), e.cause.grade),
             e.cause.text,
             e.cause.advice,
         )
@@ -288,7 +292,7 @@ def _frames(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     if late:
         why = "the target moves unevenly between frames, or the cameras are not fixed to each other"
     yield (
-        max(_SCATTER.grade(e.rest), _GROWTH.grade(e.growth)),
+        max(_SCATTER.grade(e.rest), CONTRADICTION.grade(e.growth)),
         f"the relative poses of the cameras differ from frame to frame, by {e.rest:.2g} times what noise "
         f"explains (rms {rig.rmse_px:.3g} px together, {rig.rmse_px / e.growth:.3g} px each camera alone), "
         f"and no single known cause explains it: {why}",
@@ -301,7 +305,7 @@ def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
         first, second = e.one_place
         yield (
             2,
-            f"{first} and {second} are at the same place: their distance is less than {_ONE_PLACE:g} times "
+            f"{first} and {second} are at the same place: their distance is less than {TOLD:.2g} times "
             "its std",
             "check that each file is of a camera of its own",
         )
@@ -317,17 +321,17 @@ def _precision(rig: Rig, e: _Evidence) -> Iterator[Finding]:
     more = f"add frames that {both}, with the target near and tilted, so that it fills the images"
     of_two = f" of points that {first} and {second} see" if len(seen) > 2 else ""
     yield (
-        _DEPTH.grade(e.depth_share),
+        SHARE.grade(e.depth_share),
         f"the std of triangulated depth{of_two} is {100 * e.depth_share:.2g} % of the depth",
         more,
     )
     what = "the baseline"
     if len(seen) > 2:
         what = f"the distance of {second} from {first}, its nearest neighbour,"
-    yield _DISTANCE.grade(share), f"the std of {what} is {100 * share:.2g} % of its length", more
+    yield SHARE.grade(share), f"the std of {what} is {100 * share:.2g} % of its length", more
     if np.isfinite(e.held_out):
         yield (
-            _HELD_OUT.grade(e.held_out),
+            HELD_OUT.grade(e.held_out),
             f"the cross-validation error is {e.held_out * rig.rmse_px:.3g} px, but the error on all data "
             f"{rig.rmse_px:.3g} px",
             "add frames",

@@ -26,7 +26,8 @@ from neurocal_cli.camera.pinhole import Pose
 # repeat that faults are found and sound pairs kept.
 _SHARE = 0.1
 _SIGMAS = 30.0
-_MOST_HYPOTHESES = 40
+HYPOTHESES = 40
+"""Most pairs of which each is tried as the one that is right."""
 _EXCHANGED = 6.0  # largest distance of an exchanged pair, whose intrinsic parameters fit roughly only ...
 _NEARER = 0.4  # ... and the same as a share of the distance of the pair as it is
 _TURNED = "the target is turned by {} degrees in one of the images"
@@ -39,7 +40,8 @@ _FAULTS = (
     *((_TURNED.format(d), euler_to_rotation(0.0, 0.0, np.radians(d)), np.eye(3)) for d in (90, 270, 180)),
     *((_MIRRORED, np.diag(of_target), _IMAGE_MIRRORED) for of_target in np.where(np.eye(3)[::-1], -1.0, 1.0)),
 )
-_AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
+AGREED, LEAST_AGREED = 0.8, 3
+"""Share of the pairs, and fewest pairs, that must agree once a mistake is undone."""
 
 UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
 PAIR_ANEW = (
@@ -80,11 +82,11 @@ def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> 
     odd = {a: b for (a, b), reason in faults.items() if reason == UNSYNCHRONISED}
     for word in SHIFTED:
         moved = [pair for pair in neighbours(problem.pairs, word) if pair[0] in odd]
-        if len(moved) < _LEAST_AGREED:
+        if len(moved) < LEAST_AGREED:
             continue
         shifted = stereo_problem(*_two(problem), moved)
         fits = _distance(shifted, _poses(shifted), rig.R[None], rig.t[None])[0] < 1
-        if fits.sum() >= max(_LEAST_AGREED, _AGREED * len(moved)):
+        if fits.sum() >= max(LEAST_AGREED, AGREED * len(moved)):
             names = [a for (a, _), one in zip(shifted.pairs, fits, strict=True) if one]
             return {**faults, **{(a, odd[a]): SHIFTED[word] for a in names}}
     return dict(faults)
@@ -92,12 +94,12 @@ def with_shifted(problem: RigProblem, rig: Pose, faults: Mapping[Pair, str]) -> 
 
 def all_shifted(problem: RigProblem) -> str:
     """The word for the pairs whose right views the left views fit, if all are paired wrongly; else empty."""
-    if len(problem.paired) < 2 * _LEAST_AGREED:
+    if len(problem.paired) < 2 * LEAST_AGREED:
         return ""
     for word in SHIFTED:
         shifted = stereo_problem(*_two(problem), neighbours(problem.pairs, word))
         reasons = find_consensus(shifted).reasons
-        if reasons.count("") > _AGREED * len(reasons):
+        if reasons.count("") > AGREED * len(reasons):
             return word
     return ""
 
@@ -124,7 +126,7 @@ class _Poses:
     def rigs(self) -> tuple[Array, Array]:
         """R and t of single pairs, for an even choice of the pairs."""
         n = len(self.R[0])
-        some = np.linspace(0, n - 1, min(n, _MOST_HYPOTHESES)).astype(int)
+        some = np.linspace(0, n - 1, min(n, HYPOTHESES)).astype(int)
         R = self.R[1][some] @ np.swapaxes(self.R[0][some], 1, 2)
         return R, self.m[1][some] - (R @ self.m[0][some][..., None])[..., 0]
 

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.reprojection import squared_errors
 from neurocal_cli.calibration.rig.adjust import RigFit, adjust_rig
 from neurocal_cli.calibration.rig.consensus import (
+    AGREED,
+    LEAST_AGREED,
     OPPOSITE,
     PAIR_ANEW,
     SHIFTED,
@@ -35,10 +37,9 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 
 _PARTNERS = 4  # cameras with which each camera is compared, those with which it has most frames in common
-_LEAST_FRAMES, _MOST = 4, 0.8  # that must agree once a mistake is undone, and their share
-# Frames of an edge that must agree on one relative pose, and their share: where the target moves between late
+# Share of the frames of an edge that must agree on one relative pose: where the target moves between late
 # images, only those in which it is slow agree.
-_FEWEST, _LEAST_AGREED = 3, 0.1
+_SLOW = 0.1
 
 Pair = tuple[int, int]
 
@@ -63,7 +64,7 @@ class Edge:
     def is_sound(self) -> bool:
         """Whether so many of its frames agree on one relative pose that it is not by chance."""
         n = len(self.consensus.reasons)
-        return self.n_agreed >= min(max(_LEAST_AGREED * n, _FEWEST), n)
+        return self.n_agreed >= min(max(_SLOW * n, LEAST_AGREED), n)
 
 
 def examined(problem: RigProblem, seen: NDArray[np.bool_]) -> list[Edge]:
@@ -171,7 +172,7 @@ def _why_apart(edges: Sequence[Edge], names: Sequence[str], parts: Sequence[list
 
 def _agree(problem: RigProblem) -> bool:
     reasons = find_consensus(problem).reasons
-    return len(reasons) >= _LEAST_FRAMES and reasons.count("") > _MOST * len(reasons)
+    return len(reasons) >= LEAST_AGREED and reasons.count("") > AGREED * len(reasons)
 
 
 def _size_of_right(problem: RigProblem) -> float | None:
@@ -186,7 +187,7 @@ def _size_of_right(problem: RigProblem) -> float | None:
         (right.R[problem.paired_right] @ left.R[problem.paired_left].swapaxes(1, 2)).sum(axis=0)
     )
     first, second = left.t[problem.paired_left] * scale @ R.T, right.t[problem.paired_right] * scale
-    if len(first) < _LEAST_FRAMES:
+    if len(first) < LEAST_AGREED:
         return None
     # Without t, by differences from the means.
     apart, there = second - second.mean(axis=0), first - first.mean(axis=0)

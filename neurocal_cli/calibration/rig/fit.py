@@ -48,14 +48,12 @@ from neurocal_cli.calibration.rig.refinement import adjusted
 from neurocal_cli.calibration.rig.result import RigAssembly
 from neurocal_cli.calibration.rig.rig import Rig
 from neurocal_cli.calibration.rig.rivals import log_evidence, named_cause
-from neurocal_cli.calibration.verdict.rival import LEVEL
+from neurocal_cli.calibration.verdict.findings import LEVEL, TOLD
 from neurocal_cli.camera.geometry import Array
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 
 _HERE = Pose(np.eye(3), np.zeros(3))
-_ONE_PLACE = 3.0  # a baseline below this number of standard deviations counts as 0
-
 _TRIES = 2  # for the place and the kind of a change
 
 _LeftOut = dict[tuple[int, str], str]  # views, by the index of the camera, and why
@@ -277,7 +275,7 @@ def _refuse_one_place(rig: Rig) -> None:
     if len(rig.cameras) > 2:
         return  # others may still determine the points
     pair = rig.pair(*rig.cameras)
-    if pair.baseline <= _ONE_PLACE * pair.std["baseline"]:
+    if pair.baseline <= TOLD * pair.std["baseline"]:
         raise CoincidentCamerasError(
             f"both cameras are at the same place: the baseline is {pair.baseline:.3g} +- "
             f"{pair.std['baseline']:.2g} {rig.unit}; give the points (or calibrations) of two "

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.normal_equations import solve_scaled
 from neurocal_cli.calibration.rig.adjust import RigFit
 from neurocal_cli.calibration.rig.causes import MOVED_CAMERA
+from neurocal_cli.calibration.rig.consensus import HYPOTHESES
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.rivals import along, seen_by
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
@@ -28,7 +29,6 @@ SUSPECT = 60.0
 # with the rig as without it.
 _OWN_SHARE = 3.0
 _MUCH_LARGER = 2.0  # ratio of a view's variance to that of all; 50 equations reach it once in 10 million
-_MOST_STARTS = 40
 _STEPS = 10  # most concentration steps; fewer suffice
 
 
@@ -92,7 +92,7 @@ def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_
     places = np.flatnonzero(used)
     if len(places) < 3:
         return none
-    starts = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_STARTS)).astype(int))]
+    starts = places[np.unique(np.linspace(0, len(places) - 1, min(len(places), HYPOTHESES)).astype(int))]
     best, lowest = none, np.inf
     for start in starts:
         total, core = _concentrated(poses, places, start)

@@ -11,10 +11,10 @@ from neurocal_cli.calibration.rig.combine import free_parameters
 from neurocal_cli.calibration.rig.problem import RigProblem
 from neurocal_cli.calibration.rig.result import non_monotonic_sides
 from neurocal_cli.calibration.rig.state import RigState
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION
 
 # Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
 # refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
-_SPOILS = 1.6
 
 
 def adjusted(
@@ -32,7 +32,7 @@ def adjusted(
             + [np.ones(problem.n_rig, dtype=bool)]
         )
         fit = adjust_rig(problem, start, free)
-        if any(moving) and np.sqrt(fit.variance) > _SPOILS:
+        if any(moving) and np.sqrt(fit.variance) > CONTRADICTION.good:
             moving = [False] * len(moving)
             warnings = [
                 "the pairs of views contradict each other, so the cameras keep the result of their own views"

@@ -23,15 +23,14 @@ from neurocal_cli.calibration.rig.adjust import RigFit, is_significant, scatter
 from neurocal_cli.calibration.rig.causes import CAUSES, Named, RigCause
 from neurocal_cli.calibration.rig.motion import motion_of
 from neurocal_cli.calibration.rig.problem import RigProblem
-from neurocal_cli.calibration.verdict.findings import in_sequence
-from neurocal_cli.calibration.verdict.rival import LEVEL
+from neurocal_cli.calibration.verdict.findings import EXPLAINED, LEVEL, in_sequence
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array, median
 
 _LEAST_FRAMES = 2  # of each part before and after a change
 # Least share of what exceeds chance that a named cause explains, and the same where the target's motion
 # between frames, which is known roughly, belongs to the fit.
-_EXPLAINED, _OF_MOTION = 0.5, 0.8
+_OF_MOTION = 0.8
 _FREE = np.array([0, 2, *POSE_COLUMNS])  # alpha_u, alpha_v and the pose of a view in its camera
 _ROUNDING = 1e-14
 
@@ -62,7 +61,7 @@ def named_cause(
         return None, rest
     found = list(_ranked(fit, names, squares, degrees, causes, np.flatnonzero(free)))
     best = max(found, key=lambda one: one.evidence, default=None)
-    least = _EXPLAINED if fit.problem.motion is None else _OF_MOTION
+    least = EXPLAINED if fit.problem.motion is None else _OF_MOTION
     if best is None or best.evidence < LEVEL or best.explained < least:
         return None, rest
     return best, float(np.sqrt(max(1.0 - best.explained, 0.0) * max(squares / degrees - 1.0, 0.0) + 1.0))

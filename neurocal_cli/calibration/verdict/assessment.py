@@ -34,7 +34,15 @@ from neurocal_cli.calibration.calibration import (
 )
 from neurocal_cli.calibration.verdict.contest import Contest, contest
 from neurocal_cli.calibration.verdict.evidence import Evidence, cover
-from neurocal_cli.calibration.verdict.findings import SPARE, Finding, pixel_spread, verdict_of
+from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
+    EXACT,
+    EXPLAINED,
+    SPARE,
+    Finding,
+    pixel_spread,
+    verdict_of,
+)
 from neurocal_cli.calibration.verdict.given_parameters import hidden_by_lens, hidden_by_target
 from neurocal_cli.calibration.verdict.noise import noise_shape, stated_noise, stated_survey
 from neurocal_cli.calibration.verdict.odd_points import repeated_views, with_rejected
@@ -56,9 +64,6 @@ from neurocal_cli.observations.target import scale_of
 
 _STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
-_CONTRADICTED = 1.6  # error over the noise floor from which on the board's proportions are tested
-_EXACT = 1e-4  # of the spread of the pixels: negligible errors
-_MOST = 0.5  # share of the squared error, outliers included, that a cause explains
 _DISTANT = 10.0  # times the distance of the farthest point
 
 
@@ -266,7 +271,7 @@ class _AtMinimum:
             yield from stated_survey(target, self.calibration.rmse_px, given_px)
 
     def _is_exact(self) -> bool:
-        return self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
+        return self.calibration.rmse_px < EXACT * pixel_spread(self.points)
 
     @cached_property
     def networks(self) -> Array:
@@ -318,7 +323,7 @@ class _AtMinimum:
         start = normalised(self.calibration.state(points.view_names), views)
         state = adjust(views.batches, start, self.free, self.free_poses, _STEPS).state
         held = self._contest_at(views, state)
-        if held is None or not held.causes or held.explained < _MOST:
+        if held is None or not held.causes or held.explained < EXPLAINED:
             return None
         first = held.causes[0]
         if first.pattern != "all" or first.rival.of_board:
@@ -346,7 +351,7 @@ class _AtMinimum:
 
     def _proportions(self, contradiction: float) -> Proportions | None:
         given = self.calibration.target is None and self.calibration.type in (1, 2)
-        if not given or self._is_exact() or not contradiction > _CONTRADICTED:
+        if not given or self._is_exact() or not contradiction > CONTRADICTION.good:
             return None
         return proportions(self.points)
 

@@ -8,13 +8,20 @@ import numpy as np
 
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.contest import Contest
-from neurocal_cli.calibration.verdict.findings import DISPLACED, ERROR, Finding, Limit, image_diagonal
-from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Told
+from neurocal_cli.calibration.verdict.findings import (
+    DISPLACED,
+    ERROR,
+    EXPLAINED,
+    LEVEL,
+    Finding,
+    Limit,
+    image_diagonal,
+)
+from neurocal_cli.calibration.verdict.rival import Estimate, Told
 
-_BIASED = Limit(2.0, 5.0)  # std of the focal lengths and the centre, by which a cause biases them
-_TOLD = 5.0  # std by which given values and poses are wrong
+_BIASED = Limit(2.0, 5.0)  # std of the focal lengths and the centre by which a cause biases them, or by which
+# given values and poses are wrong
 _MOST = 0.75  # share of the squared error that other given values explain, if they are far better
-_EXCESS = 0.5  # least share of the squared error above the noise floor that named causes explain
 _UNCLEAR = 5.0  # times the level: a weaker further cause, or one of single views, is not told if others tie
 _LEFT = 1.25  # rms error over the noise floor that may remain however much they explain
 
@@ -28,7 +35,7 @@ def explains(contest: Contest, contradiction: float, error: float) -> bool:
         return False
     excess = 1.0 - contradiction**-2
     left = contradiction * float(np.sqrt(max(1.0 - contest.explained, 0.0)))
-    return not (left > _LEFT and contest.explained < _EXCESS * excess)
+    return not (left > _LEFT and contest.explained < EXPLAINED * excess)
 
 
 def findings(contest: Contest, calibration: Calibration, given_told: bool) -> Iterator[Finding]:
@@ -84,7 +91,7 @@ def _is_uncertain(found: Estimate, contest: Contest, calibration: Calibration) -
     alpha = float(lin.state.entries[0, 0]) * lin.views.pixel_scale
     names = ("alpha_u", "theta", "alpha_v", "u0", "v0")
     known = zip(places, found.amounts.tolist(), strict=True)
-    return all(abs(by) * alpha <= _TOLD * std.get(names[k], 0.0) for k, by in known)
+    return all(abs(by) * alpha <= _BIASED.poor * std.get(names[k], 0.0) for k, by in known)
 
 
 def closest(contest: Contest | None, calibration: Calibration) -> str:
@@ -99,7 +106,7 @@ def _graded(contest: Contest, found: Estimate, calibration: Calibration) -> tupl
     told = Told(contest.lin, found, calibration.unit, calibration.std, diagonal, contest.std_of_poses)
     reason, size = found.rival.say(told)
     grade = found.rival.limit.grade(size)
-    if found.rival.of_given and told.moved_poses > _TOLD:
+    if found.rival.of_given and told.moved_poses > _BIASED.poor:
         grade = max(grade, 1 + int(found.explained > _MOST))
     # Outliers were left out of the calibration, and what differs from view to view is in the std.
     if contest.of_outliers or not found.weights.size:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from neurocal_cli.adjustment.adjust import adjust
 from neurocal_cli.adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.adjustment.views import Views
+from neurocal_cli.calibration.verdict.findings import LEVEL
 from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
-from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate, Rival, estimates, including
+from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates, including
 from neurocal_cli.calibration.verdict.rivals import EFFECTS, RIVALS
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array

@@ -19,8 +19,7 @@ from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration.calibration import Calibration
 from neurocal_cli.calibration.verdict.causes import given_camera
 from neurocal_cli.calibration.verdict.contest import contest
-from neurocal_cli.calibration.verdict.findings import Finding
-from neurocal_cli.calibration.verdict.rival import LEVEL
+from neurocal_cli.calibration.verdict.findings import LEVEL, Finding
 from neurocal_cli.calibration.verdict.rivals import GIVEN, RIVALS, SAME
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.state import CameraState

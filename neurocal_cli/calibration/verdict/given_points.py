@@ -12,10 +12,12 @@ from neurocal_cli.calibration.drift import Drift
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.causes import given_camera as against_given
 from neurocal_cli.calibration.verdict.findings import (
+    ELSEWHERE,
     ERROR,
+    EXACT,
+    TOLD,
     WORDS,
     Finding,
-    Limit,
     image_diagonal,
     pixel_spread,
     two_digits,
@@ -23,12 +25,6 @@ from neurocal_cli.calibration.verdict.findings import (
 )
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.observations.points import Correspondences
-
-# Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
-# test_given_points.py.
-_LARGER = Limit(1.5, 4.0)
-_CHANCE = 3.0  # standard deviations by which the rms error of few points may be larger
-_ROUNDING = 1e-4  # of the pixels' spread: smaller errors are negligible
 
 
 @frozen_dataclass
@@ -107,10 +103,10 @@ def given_error(
     # With few points, the error of a calibration on its own points is too small, so use cross-validation.
     held_out = verdict.measures.get("held_out_px", np.nan)
     own = float(np.fmax(rmse_px, held_out))
-    own = max(own, _ROUNDING * pixel_spread(own_points))
+    own = max(own, EXACT * pixel_spread(own_points))
     # The relative standard deviation of an rms error of n numbers is 1 / sqrt(2 n); a point has two.
-    ratio = error / (own * (1 + _CHANCE / np.sqrt(4 * seen)))
-    grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
+    ratio = error / (own * (1 + TOLD / np.sqrt(4 * seen)))
+    grade = max(ELSEWHERE.grade(ratio), ERROR.grade(error / image_diagonal(own_points)))
     return (
         grade,
         f"the rms error of {error:.3g} px on the given points is {two_digits(error / own)} times the "

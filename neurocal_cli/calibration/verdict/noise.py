@@ -10,9 +10,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from neurocal_cli.adjustment.chi_squared import exceeded_by_chance
 from neurocal_cli.adjustment.common_noise import common_share, measured
-from neurocal_cli.calibration.verdict.findings import Finding, name_some, pixel_spread
+from neurocal_cli.calibration.verdict.findings import (
+    CORRELATED,
+    EXACT,
+    FEW_POINTS,
+    Finding,
+    name_some,
+    pixel_spread,
+)
 from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.observations.points import Correspondences
 from neurocal_cli.observations.target import Target
@@ -20,15 +26,12 @@ from neurocal_cli.observations.target import Target
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
 _ONE_WAY = 2.5  # rms along u over that along v, or the reverse
 _VIEW = 4.0  # rms of a view over the lower quartile of all views
-_SYSTEMATIC = 0.5  # correlation of neighbouring residuals above which the target or the lens is the cause
-_FEWEST = 12  # fewest points; 12 determine a std to a fifth
-_ROUNDING = 1e-4  # of the pixels' spread
 _SHARE = 0.5  # common share of the noise from which on the stated sigmas are wrong
 # Points with a sigma below this share of the median one are compared with the others, from so many on.
 _FAR_BELOW, _FEWEST_SMALL = 0.5, 6
-_CHANCE = 4.75  # sigmas: one clean set in a million
 _TAKEN_IN = 1e-2  # share of the error that is left
-_FACTOR = 2.0  # between views whose sigma is too small and the others
+# Between views or points whose sigma is too small and the others; six points reach it once in 500,000 sets.
+_FACTOR = 2.0
 
 
 def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
@@ -36,10 +39,10 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
 
     Neighbouring residuals that are correlated are no measurement noise.
     """
-    if points.covariance is not None or len(points) < _FEWEST or correlation > _SYSTEMATIC:
+    if points.covariance is not None or len(points) < FEW_POINTS or correlation > CORRELATED.good:
         return
     u, v = np.sqrt((residuals**2).mean(axis=0))
-    least = _ROUNDING * pixel_spread(points)
+    least = EXACT * pixel_spread(points)
     if max(u, v) > max(_ONE_WAY * min(u, v), least):
         ratio, (most, other) = max(u, v) / max(min(u, v), 1e-12), ("u", "v") if u > v else ("v", "u")
         yield (
@@ -51,7 +54,7 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
     counts = np.bincount(index, minlength=n_views)
     rms = np.sqrt(np.bincount(index, (residuals**2).sum(axis=1), n_views) / counts)
     usual = float(np.interp(0.25 * (n_views - 1), np.arange(n_views), np.sort(rms)))
-    off = (rms > max(_VIEW * usual, least)) & (counts >= _FEWEST)
+    off = (rms > max(_VIEW * usual, least)) & (counts >= FEW_POINTS)
     if n_views > 2 and off.any():
         names = np.array(points.view_names)[off]
         yield (
@@ -74,7 +77,7 @@ def stated_noise(points: Correspondences, residuals: Array, correlation: float) 
         return
     advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
     if common_share(covariance, residuals) < _SHARE:
-        if correlation <= _SYSTEMATIC:
+        if correlation <= CORRELATED.good:
             yield from _too_small_at_some(np.sqrt(covariance[:, 0]), residuals, advice)
         return
     V = points.n_views
@@ -83,7 +86,7 @@ def stated_noise(points: Correspondences, residuals: Array, correlation: float) 
     level = np.sqrt(np.bincount(points.view_index, squared, V) / counts)
     order = np.sort(level)
     step = int(np.argmax(order[1:] / order[:-1])) if V > 1 else 0  # the largest gap between two views
-    small = (level > order[step]) & (counts >= _FEWEST)
+    small = (level > order[step]) & (counts >= FEW_POINTS)
     if V > 1 and small.any() and order[step + 1] > _FACTOR * order[step]:
         names = np.array(points.view_names)[small]
         factor = float(np.median(level[small])) / float(np.median(level[~small]))
@@ -101,7 +104,7 @@ def _too_small_at_some(sigma: Array, residuals: Array, advice: str) -> Iterator[
         return
     squared = (residuals**2).sum(axis=1) / sigma**2
     ratio = float(squared[few].mean() / max(squared[~few].mean(), 1e-300))
-    if ratio > max(_FACTOR**2, float(exceeded_by_chance(2 * n, _CHANCE))):
+    if ratio > _FACTOR**2:
         yield (
             1,
             f"{n} points have a stated sigma of {median(sigma[few]):.2g} px, but their residuals are "

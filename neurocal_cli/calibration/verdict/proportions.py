@@ -22,6 +22,7 @@ from neurocal_cli.adjustment.problem import problem_for
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.calibration.fit import fit
 from neurocal_cli.calibration.verdict.effects import stretch
+from neurocal_cli.calibration.verdict.findings import CONTRADICTION
 from neurocal_cli.calibration.verdict.linearised import linearised
 from neurocal_cli.calibration.verdict.odd_points import units_mixed, worlds_by_view
 from neurocal_cli.calibration.verdict.rival import estimates
@@ -39,7 +40,7 @@ _MOST, _SCANNED = 2000.0, 440  # metres and millimetres
 _FEWEST_VIEWS, _FEWEST_POINTS = 4, 6  # one view more than the unknowns need
 _ENOUGH_VIEWS, _STARTS = 40, 20
 _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such small errors fit
-_LEFT, _FLOOR = 0.25, 2.0  # squared error over that as given, and variance over that of separate cameras
+_LEFT = 0.25  # squared error over that as given
 _FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
@@ -175,4 +176,4 @@ def _is_noise(solution: Solution) -> bool:
     """Whether a separate camera for each view would hardly lower the error."""
     views, cost = solution.problem.views, float(solution.adjusted.cost.sum())
     variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
-    return variance < _FLOOR * variance_of_views(views, solution.state)
+    return variance < CONTRADICTION.good**2 * variance_of_views(views, solution.state)

@@ -3,7 +3,7 @@
 A rival adds a few unknowns. Its evidence is the logarithm of the probability of the data with it over that
 without it: poses, camera and its unknowns are integrated out, the noise is what it leaves, the size of its
 unknowns is the most probable one of a grid, and the logarithm of the number of choices among rivals of the
-same kind is taken off. Clean data hardly ever give more than `LEVEL`.
+same kind is taken off. Clean data hardly ever give more than `findings.LEVEL`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,6 @@ from neurocal_cli.calibration.verdict.linearised import Effect, Linearised
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
 
-# Repeated by test_rivals.py (slow). Of 399 clean sets, with all lenses, the best of all rivals exceeds it in
-# four, of which the verdict names one: in the others it displaces no pixels, or cannot be told from another.
-LEVEL = 6.0
-"""Log odds from which on a rival is more than chance, and by which it has to beat another one."""
 _SIZES = np.exp(np.linspace(np.log(1e-6), np.log(0.3), 20))  # prior std of an unknown
 _NOTHING, _NO_COST, _ROUNDING = 1e-300, 1e-12, 1e-9
 _ITERATIONS = 3  # the noise is what the rival leaves

@@ -7,13 +7,12 @@ views share it (`patterns`), and its words. Ten lines are usual.
 from __future__ import annotations
 
 from neurocal_cli.calibration.verdict import effects, patterns, words
-from neurocal_cli.calibration.verdict.findings import DISPLACED, Limit
+from neurocal_cli.calibration.verdict.findings import DISPLACED, SHARE, Limit
 from neurocal_cli.calibration.verdict.rival import Rival
 from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 
 # A result is off by half of a change; careful calibrations state 0.05 %.
 _CHANGED = Limit(0.001, 0.05)  # of the focal length
-_APART = Limit(0.01, 0.05)  # of the focal length
 # Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 %.
 _OFF = Limit(0.005, 0.05)  # of the focal length
 GIVEN = Limit(0.002, 0.05)
@@ -86,7 +85,7 @@ RIVALS: tuple[Rival, ...] = (
         "each view asks for a focal length of its own",
         "calibrate one zoom and one focus at a time; switch autofocus off",
         words.zooming,
-        _APART,
+        SHARE,
         steps=effects.focal_length,
     ),
     Rival(
@@ -103,7 +102,7 @@ RIVALS: tuple[Rival, ...] = (
             "two groups of views, each with one camera: other images, crops, images turned or exchanged",
             _APART_ADVICE,
             words.two_cameras,
-            _APART,
+            SHARE,
             patterns.grouped,
             steps=steps,
         )

@@ -12,10 +12,16 @@ from neurocal_cli.calibration.verdict.causes import closest, explains
 from neurocal_cli.calibration.verdict.causes import findings as causes
 from neurocal_cli.calibration.verdict.evidence import Evidence
 from neurocal_cli.calibration.verdict.findings import (
+    CONTRADICTION,
+    CORRELATED,
     DISPLACED,
     ERROR,
+    EXACT,
+    HELD_OUT,
+    SHARE,
     SPARE,
     STRETCHED_PRINT,
+    TOLD,
     WRONG_PRINT,
     Finding,
     Limit,
@@ -33,14 +39,9 @@ from neurocal_cli.observations.target import Target
 
 # Repeated by test_wrong_inputs.py, in which no wrong input may be good, and by test_verdict.py,
 # in which real and simulated good data are good. The limits are what a user would call large.
-_CONTRADICTION = Limit(1.6, 2.3)
-_HELD_OUT = 1.3  # over the rms error
 _DISAGREEMENT = Limit(6.0, 40.0)
-_CORRELATION = Limit(0.5, 0.85)
 _UNCOVERED = Limit(0.6, 0.9)  # share of the image
 _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
-_ALPHA = Limit(0.01, 0.05)  # std over the value
-_CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
 _FEW_POSES = 10  # fewer poses are reported if views repeat them
@@ -53,7 +54,6 @@ _SKEW, _LEAN = 0.003, 0.004
 _STRETCHED_POOR = 0.025  # stretch of one side against the other
 _SPACING = 0.004  # rms over rms; of nine boards of photographs none is off by more than 0.0017
 _STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
-_TOLD = 3.0  # standard deviations
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
@@ -126,10 +126,10 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     )
     # Given poses that are wrong leave such errors as well, so they are not excused.
     flexes = calibration.target is not None and calibration.type != 4 and _by_flexing(e, diagonal)
-    unexcused = e.rmse_px > 1e-4 * spread and not flexes
+    unexcused = e.rmse_px > EXACT * spread and not flexes
     if unexcused:
         yield (
-            _CONTRADICTION.grade(e.contradiction),
+            CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
             f"(the error of a separate camera for each view){_unexplained(calibration, e)}",
             "check that all views are of one camera at one zoom and focus, that the target has the true "
@@ -138,7 +138,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if e.rmse_px > 1e-6 * spread:
         # Too few data make the standard deviations large, which are judged by themselves.
         yield (
-            int(e.held_out_px > _HELD_OUT * e.rmse_px),
+            int(e.held_out_px > HELD_OUT.good * e.rmse_px),
             f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
             f"{e.rmse_px:.3g} px",
             "add points and views",
@@ -151,7 +151,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "flat",
         )
         yield (
-            _CORRELATION.grade(e.correlation) if unexcused and not _is_common_noise(e) else 0,
+            CORRELATED.grade(e.correlation) if unexcused and not _is_common_noise(e) else 0,
             f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
             "model or the target does not fit",
             "try another --distortion, or measure the target",
@@ -160,7 +160,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 def _is_common_noise(e: Evidence) -> bool:
     """Whether no cause at all is probable: neighbours share their noise, which the std count."""
-    return e.contest is not None and not e.contest.causes and not _CONTRADICTION.grade(e.contradiction)
+    return e.contest is not None and not e.contest.causes and not CONTRADICTION.grade(e.contradiction)
 
 
 def _unexplained(calibration: Calibration, e: Evidence) -> str:
@@ -242,9 +242,9 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
         share = calibration.relative_std_of_scale
-        yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
+        yield SHARE.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
     off_centre = list(_off_centre(calibration))
-    if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > _ALPHA.good):
+    if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > SHARE.good):
         yield (
             1,
             f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
@@ -263,7 +263,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
         yield (
-            _CENTRE.grade(centre / A.alpha_u),
+            SHARE.grade(centre / A.alpha_u),
             f"the std of the image centre is {two_digits(centre)} px",
             more,
         )
@@ -284,7 +284,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
             "few cameras have such pixels; otherwise check the size of the squares along X and Y",
         )
-    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + _TOLD * std["theta"]:
+    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + TOLD * std["theta"]:
         yield (
             1,
             f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.2f} degrees",
@@ -335,7 +335,7 @@ def _oblong(calibration: Calibration) -> bool:
     """Whether the pixels are not square: significantly, or by far."""
     A, std = calibration.intrinsics, calibration.std
     ratio = A.alpha_u / A.alpha_v
-    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    told = TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
     return abs(ratio - 1) > _OBLONG + told or max(ratio, 1 / ratio) > _STRETCHED
 
 
@@ -344,7 +344,7 @@ def _off_centre(calibration: Calibration) -> Iterator[Finding]:
     if size is None or ("u0" in calibration.fixed and calibration.type != 2):
         return
     off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
-    uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
+    uncertain = TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
     if (off > np.array(size) / 2).any():
         known = bool((uncertain < _CROPPED * np.array(size)).all())
         yield (

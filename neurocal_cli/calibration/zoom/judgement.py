@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from neurocal_cli.calibration.calibration import Verdict
-from neurocal_cli.calibration.verdict.findings import Finding, Limit, verdict_of
+from neurocal_cli.calibration.verdict.findings import ELSEWHERE, ERROR, SHARE, Finding, Limit, verdict_of
 from neurocal_cli.calibration.zoom.camera_errors import odd_camera
 from neurocal_cli.calibration.zoom.parameter_networks import local_to_outputs
 from neurocal_cli.calibration.zoom.settings import describe, middles
@@ -24,13 +24,8 @@ from neurocal_cli.calibration.zoom.zoom_lens import Prediction, ZoomLens
 _CONTRADICTION = Limit(1.3, 2.3)  # rms error over the noise floor
 # Noise floor over that with a pose for each view: 0.99 to 1.02 if camera and target stood still, 1.9 if they
 # moved by 0.002 rad or 3 mm from setting to setting (test_a_camera_that_moved_a_little_is_told).
-_MOVED = Limit(1.2, 2.3)
-_BETWEEN = Limit(1.5, 4.0)  # cross-validation error over the settings, over the noise floor
 _ONE = Limit(2.5, 10.0)  # rms error of the worst setting over the median
 _REJECTED = Limit(0.0, 0.2)  # share of the settings
-_ALPHA = Limit(0.01, 0.05)  # std over the value, of the worst setting
-_CENTRE = Limit(0.01, 0.05)  # std over alpha, as of one camera
-_ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal, as of one camera
 _MORE_CAMERAS = "check the numbers of each camera, and add cameras where the parameters change most"
 
 
@@ -39,7 +34,7 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
     everywhere = lens.predict(np.concatenate([lens.settings, middles(lens.settings)]))
     share = float((everywhere.std[:, :2] / everywhere.local[:, :2]).max())
     uncertain = (
-        _ALPHA.grade(share),
+        SHARE.grade(share),
         f"the std of the focal length is up to {100 * share:.2g} % of its value between the settings",
         _MORE_CAMERAS if lens.known else "add settings where the parameters change most, and points",
     )
@@ -49,7 +44,7 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict:
         return verdict_of(findings, measures)
     floor = lens.noise_floor_px
     elsewhere = (
-        _BETWEEN.grade(elsewhere_px / max(floor, 1e-9)),
+        ELSEWHERE.grade(elsewhere_px / max(floor, 1e-9)),
         f"the error at the given points is {elsewhere_px:.3g} px, but the noise floor {floor:.3g} px",
         "check that target and camera are where they were, the unit of X,Y,Z and the names of the settings, "
         "or add settings where the parameters change most",
@@ -84,7 +79,7 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
         "check the name and the points of this setting",
     )
     yield (
-        _MOVED.grade(floor / max(lens.free_pose_px, 1e-9)),
+        _CONTRADICTION.grade(floor / max(lens.free_pose_px, 1e-9)),
         f"the noise floor is {floor:.3g} px with one pose for all settings, {lens.free_pose_px:.3g} px with "
         "a pose for each: the camera or the target moved between the settings",
         "give --camera moving, or keep both where they are",
@@ -98,7 +93,7 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
     )
     if not _CONTRADICTION.grade(times):
         yield (
-            _BETWEEN.grade(lens.left_out_px / max(floor, 1e-9)),
+            ELSEWHERE.grade(lens.left_out_px / max(floor, 1e-9)),
             f"the error at settings left out is {lens.left_out_px:.3g} px, but the noise floor "
             f"{floor:.3g} px, so the lens changes too much between the settings",
             "add settings where the parameters change most",
@@ -121,7 +116,7 @@ def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Findin
             yield 2, f"the image centre at {where} lies outside the image", f"{check}; check image_size"
     share = float((everywhere.std[:, 2:4] / everywhere.local[:, :1]).max())
     yield (
-        _CENTRE.grade(share),
+        SHARE.grade(share),
         f"the std of the image centre is up to {100 * share:.2g} % of the focal length between the settings",
         _MORE_CAMERAS,
     )
@@ -130,7 +125,7 @@ def _of_known_cameras(lens: ZoomLens, everywhere: Prediction) -> Iterator[Findin
 def _large_error(lens: ZoomLens, rmse_px: float) -> Iterator[Finding]:
     if lens.image_size is not None:
         yield (
-            _ERROR.grade(rmse_px / float(np.hypot(*lens.image_size))),
+            ERROR.grade(rmse_px / float(np.hypot(*lens.image_size))),
             f"the rms reprojection error of {rmse_px:.3g} px is large",
             "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
         )
