@@ -13,16 +13,15 @@ reason for which it was left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
 
 import numpy as np
 
 from neurocal_cli.adjustment.adjust import Adjusted, adjust
 from neurocal_cli.adjustment.board.find import Found, counted_again, gain_over_given, views_for_target
-from neurocal_cli.adjustment.normal_equations import ROUNDING, eliminate
 from neurocal_cli.adjustment.problem import Problem, in_pixels, normalised, problem_for
-from neurocal_cli.adjustment.reprojection import POSE_COLUMNS, displaced_blocks, predicted_pixels
+from neurocal_cli.adjustment.reprojection import predicted_pixels
 from neurocal_cli.adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.adjustment.solution import Solution
 from neurocal_cli.adjustment.views import arrange
@@ -31,8 +30,13 @@ from neurocal_cli.calibration.lens_choice.model_selection import (
 )
 from neurocal_cli.calibration.point_errors import places_of_views
 from neurocal_cli.calibration.verdict.contest import Contest, contest
-from neurocal_cli.calibration.verdict.findings import LEVEL, MISFIT, pixel_spread
+from neurocal_cli.calibration.verdict.effects import bends
+from neurocal_cli.calibration.verdict.findings import LEVEL, pixel_spread
+from neurocal_cli.calibration.verdict.linearised import Linearised, linearised
 from neurocal_cli.calibration.verdict.noise import stated_noise
+from neurocal_cli.calibration.verdict.patterns import common
+from neurocal_cli.calibration.verdict.rival import Estimate, Rival, estimates
+from neurocal_cli.calibration.verdict.rivals import RIVALS
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
 from neurocal_cli.camera.geometry import Array
@@ -51,12 +55,21 @@ _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
 _STARTS = 20
 _ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
+_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
 _CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
 _BY_BENDING = 0.03  # of the focal length: a bent or stretched target looks like a zoom or crop of this size
-# Prior standard deviations of one view's change of zoom, of its centre over the pixels' spread, and of its
-# target's bends over its size.
-_ZOOMS, _CROPS, _BENDS = 0.2, 0.3, 0.03
 _FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
+
+
+def _of_one_view(cause: str, places: tuple[int, ...]) -> Rival:
+    """A rival as that of a single view, in which these of the given entries of A change over alpha_u."""
+    rival = next(one for one in RIVALS if one.cause == cause)
+    steps = (lambda lin: lin.state.entries[0, 0] * np.eye(lin.width)[:, places]) if places else None
+    return replace(rival, patterns=common, steps=steps)
+
+
+_ZOOMED, _MOVED = _of_one_view("a zoom that moves", _FOCAL), _of_one_view("image stabilisation", _CENTRE)
+_BENT = _of_one_view("a target that is bent in one view", ())
 
 
 def has_other_cause(solution: Solution, found: Found) -> bool:
@@ -128,22 +141,23 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     zoomed, moved = (_fit(points, start, some) for some in (_FOCAL, _CENTRE))
     free = _fit(points, start, (*_FOCAL, *_CENTRE)).rms
     odds = _Odds.of(points, plain, rmse_px)
-    bent = max(odds.bent(), odds.of_error(plain.rms))
-    least = max(bent + LEVEL, odds.zoomed(zoomed.rms), odds.moved(moved.rms))
+    bent = max(odds.evidence(_BENT), 0.0)
+    of_zoom, of_crop = odds.evidence(_ZOOMED, zoomed.rms), odds.evidence(_MOVED, moved.rms)
+    least = max(bent + LEVEL, of_zoom, of_crop)
     for reason, other, scale in _mistakes(points, camera):
         if other < limit and odds.of_error(other / scale) > least:
             return reason
-    if zoomed.rms < limit and odds.zoomed(zoomed.rms) > bent + LEVEL:
+    if zoomed.rms < limit and of_zoom > bent + LEVEL:
         scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
             how = f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
             return how + _or_bent(abs(scale[0] - 1))
-    if moved.rms < limit and odds.moved(moved.rms) > bent + LEVEL:
+    if moved.rms < limit and of_crop > bent + LEVEL:
         entries = moved.entries
         how = f"it fits another camera or crop: the image centre ({entries[3]:.0f}, {entries[4]:.0f})"
         shift = float(np.hypot(*(entries[3:] - np.array(camera.entries)[3:])))
         return how + _or_bent(shift / camera.entries[0])
-    if free > MISFIT * pixel_spread(points):
+    if free > _BLURRED * pixel_spread(points):
         return otherwise
     if plain.rms < _HOLDS * free:
         times = f"{plain.rms / rmse_px:.2g} times that of the others"
@@ -153,58 +167,40 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
 
 @frozen_dataclass(eq=False)
 class _Odds:
-    """Log odds of what is wrong with one view, its pose integrated out.
+    """Evidence over nothing of what is wrong with one view, by the rule of all causes.
 
-    An unknown costs what the points tell of it beyond its prior, so that a turned image, which needs none, is
-    more probable than a crop that looks the same by chance. Errors below the other views' do not count.
+    A turned image needs no unknowns, so it is more probable than a crop that looks the same by chance. Errors
+    below the other views' do not count.
     """
 
-    N: Array  # (D, D) normal matrix at the view's pose, with three bends of the target before the residual
-    state: CameraState
-    n: int  # points
-    least: float  # rms error of the other views, normalised
-    scale: float  # px
+    lin: Linearised  # at the view's pose
+    found: Mapping[str, Estimate]  # by cause
+    points: int
+    least: float  # rms error of the other views [px]
 
     @classmethod
     def of(cls, points: Correspondences, plain: _Fitted, rmse_px: float) -> _Odds:
         assert plain.state is not None
-        views = arrange(points)
-        batches, axes = views.batches, views.basis[0]
+        views, given = arrange(points), np.zeros(5 + plain.state.k.shape[-1], dtype=bool)
+        lin = linearised(views, plain.state, given, True, (bends,), points.image_size, richer=False)
+        found = estimates(lin, lin.spare, (_ZOOMED, _MOVED, _BENT), -np.inf)
+        return cls(lin, {one.rival.cause: one for one in found}, len(points), rmse_px)
 
-        def displaced(chunk: slice) -> Array:
-            x, y = (np.einsum("tin,i->tn", batches.local[chunk], axes[:, k]) for k in (0, 1))
-            heights = np.stack([x * x, x * y, y * y], axis=1)
-            return np.asarray(heights[:, :, None] * axes[:, 2][:, None])
+    def of_error(self, rms: float) -> float:
+        """Evidence of what leaves an rms error [px] without any unknowns."""
+        return 0.5 * self.lin.spare * float(np.log(self.lin.cost / self._cost(rms)))
 
-        N = displaced_blocks(batches, plain.state, 3, displaced)[0]
-        scale = views.pixel_scale
-        return cls(N, plain.state, len(points), rmse_px / scale, scale)
+    def evidence(self, rival: Rival, rms: float | None = None) -> float:
+        """Evidence of a rival, which leaves an rms error [px], by default that of its linearisation."""
+        one = self.found.get(rival.cause)
+        if one is None:
+            return -np.inf
+        left = (1.0 - one.explained) * self.lin.cost
+        after = max(left, self._cost(self.least)) if rms is None else self._cost(rms)
+        return one.evidence + 0.5 * self.lin.spare * float(np.log(left / after))
 
-    def of_error(self, rms: float, columns: tuple[int, ...] = (), size: float = 1.0) -> float:
-        """Log odds of an rms error [px] with some unknowns, of a prior standard deviation."""
-        error = max(rms / self.scale, self.least)
-        odds = -max(2 * self.n - 6, 1) * float(np.log(error))
-        if not columns:
-            return odds
-        left, _ = eliminate(self.N, np.array(columns), POSE_COLUMNS, ROUNDING)
-        told = np.eye(len(columns)) + 2 * (size / error) ** 2 * left
-        return odds - 0.5 * float(np.linalg.slogdet(told)[1])
-
-    def zoomed(self, rms: float) -> float:
-        """Log odds of another focal length."""
-        return self.of_error(rms, _FOCAL, _ZOOMS * float(self.state.entries[0, 0]))
-
-    def moved(self, rms: float) -> float:
-        """Log odds of another image centre."""
-        return self.of_error(rms, _CENTRE, _CROPS)
-
-    def bent(self) -> float:
-        """Log odds of a target that is bent as a paraboloid, to first order."""
-        end = len(self.N) - 1
-        columns = np.append(POSE_COLUMNS, end - 3 + np.arange(3))
-        left, _ = eliminate(self.N, np.array([end]), columns, ROUNDING)
-        rms = float(np.sqrt(max(left[0, 0], 0.0) / self.n)) * self.scale
-        return self.of_error(rms, (end - 3, end - 2, end - 1), _BENDS)
+    def _cost(self, rms: float) -> float:
+        return self.points * (max(rms, self.least) / self.lin.views.pixel_scale) ** 2
 
 
 def _mistakes(points: Correspondences, camera: Camera) -> Iterator[tuple[str, float, float]]:

@@ -69,8 +69,7 @@ CONTRADICTION = Limit(1.6, 2.3)
 HELD_OUT = Limit(1.3, 2.0)
 """Limits of the cross-validation error over the error on all data."""
 ELSEWHERE = Limit(1.5, 4.0)
-"""Limits of the error at other points over that at the own ones. Good cameras stay below the first on 200 sets:
-test_given_points.py."""
+"""Limits of the error at other points over that at the own ones: see test_given_points.py."""
 CORRELATED = Limit(0.5, 0.85)
 """Limits of the correlation of neighbouring residuals, from which on they are no measurement noise."""
 
