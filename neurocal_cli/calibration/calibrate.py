@@ -260,8 +260,12 @@ def calibrate(
 
 def _true_cause(points: Correspondences, type: int) -> str:
     """Why points are refused, if it is another cause than what the refusal says; else ""."""
-    from neurocal_cli.calibration.verdict.exchanged_rows import exchanged_rows
-    from neurocal_cli.calibration.verdict.proportions import MEASURE_AXES, proportions, unlike_axes
+    from neurocal_cli.calibration.verdict.proportions import (
+        MEASURE_AXES,
+        exchanged_rows,
+        proportions,
+        unlike_axes,
+    )
 
     exchanged = exchanged_rows(points)
     if exchanged:

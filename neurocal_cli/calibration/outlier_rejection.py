@@ -298,9 +298,7 @@ def _without_outlier_views(
                 fewer = fewer.without(points, outlier)
                 seen = _fitted(problem, fewer.mask, pinhole)
         if fewer is not kept:
-            solution = _fitted(problem, fewer.mask, options)
-            left_out = [name for name in fewer.wrong_views if name not in kept.wrong_views]
-            kept, solution = _with_returned(problem, options, fewer, solution, left_out)
+            kept, solution = fewer, _fitted(problem, fewer.mask, options)
     while (outlier := _outlier_view(points, kept, solution)) is not None:
         kept = kept.without(points, outlier)
         solution = _fitted(problem, kept.mask, options)
@@ -311,20 +309,6 @@ def _outlier_view(points: Correspondences, kept: _Kept, solution: Solution) -> s
     """The view that contradicts the others most; None if there is none, or a third is left out already."""
     most = (points.n_views - 1) // 3
     return find_outlier_view(solution) if len(kept.wrong_views) < most else None
-
-
-def _with_returned(
-    problem: Problem, options: Options, kept: _Kept, solution: Solution, names: list[str]
-) -> tuple[_Kept, Solution]:
-    """Take back those of the named views that fit the camera once it has a distortion model."""
-    for name in names:
-        mask = kept.mask | _is_of(problem.points, name)
-        with suppress(DegenerateGeometryError):
-            more = _fitted(problem, mask, options)
-            if not more.refusal and rms(more) <= NO_WORSE * rms(solution):
-                wrong = {view: reason for view, reason in kept.wrong_views.items() if view != name}
-                kept, solution = _Kept(mask, wrong), more
-    return kept, solution
 
 
 def _all_judged(

@@ -76,7 +76,7 @@ def _chosen(seen: NDArray[np.bool_]) -> list[Pair]:
     """Pairs of cameras: those that connect all, and of each camera those with most frames in common."""
     common = seen.astype(int) @ seen.T.astype(int)
     np.fill_diagonal(common, 0)
-    wanted = {pair for pair in _tree(common) if common[pair]}
+    wanted = {(min(pair), max(pair)) for pair in _tree(common) if common[pair]}
     for a, row in enumerate(common):
         best = np.argsort(-row, kind="stable")[:_PARTNERS]
         wanted |= {(min(a, int(b)), max(a, int(b))) for b in best if row[b]}

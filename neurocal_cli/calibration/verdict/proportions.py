@@ -1,4 +1,6 @@
-"""Test whether the two axes of a flat board have different units, or its squares are not square.
+"""Test whether a flat board is described wrongly: its axes in different units, or rows for columns.
+
+`proportions` tests whether the two axes have different units, or the squares are not square.
 
 A board that is turned in its plane from view to view fits no camera then: where one axis is s times too
 short, each view asks for another ratio of alpha_u to alpha_v. The columns h_1, h_2 of the homography of a
@@ -9,6 +11,10 @@ board whose first axis is multiplied by s fulfil
 which is linear in omega for a given s. A camera is fitted to the board with the s whose equations have the
 smallest residual, and the rival of a stretched target refines it. It is the cause if the camera then fits
 nearly as well as a separate camera for each view, and far better than with the coordinates as they are given.
+
+`exchanged_rows` tests whether the numbers of rows and columns were exchanged, so that rows end too late. The
+points of a view are then those of a grid with as many columns as it should have rows, in the same order. A
+homography maps the right grid to the pixels, but for distortion, and no homography maps the wrong one.
 """
 
 from __future__ import annotations
@@ -29,7 +35,7 @@ from neurocal_cli.calibration.verdict.rival import estimates
 from neurocal_cli.calibration.verdict.rivals import RIVALS
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.frozen_dataclass import frozen_dataclass
-from neurocal_cli.camera.geometry import Array
+from neurocal_cli.camera.geometry import Array, median
 from neurocal_cli.camera.pinhole import omega_of, product_of
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.network.options import options_for
@@ -43,6 +49,8 @@ _AWAY = 0.02  # least difference from 1; prints are less off, and boards of such
 _LEFT = 0.25  # squared error over that as given
 _FITS = 0.01  # most error over the spread of the pixels; more is left by lenses that fold the image
 _FLAT = 1e-6  # largest extent of the third axis over that of the others
+_GRID_FITS = 0.03  # rms error of a homography over the spread of the pixels; lenses leave less
+_GRID_BETTER = 5.0  # times smaller than the error with the rows as given
 MEASURE_AXES = "give X,Y,Z in one unit, and check the size of the squares along both sides of the board"
 
 
@@ -177,3 +185,49 @@ def _is_noise(solution: Solution) -> bool:
     views, cost = solution.problem.views, float(solution.adjusted.cost.sum())
     variance = cost / max(views.n_equations - 7 - 6 * views.n_views, 1)
     return variance < CONTRADICTION.good**2 * variance_of_views(views, solution.state)
+
+
+def exchanged_rows(points: Correspondences) -> str:
+    """Say that rows and columns are exchanged, if a grid with them exchanged fits; "" otherwise."""
+    sides = [np.unique(points.world[:, axis]) for axis in range(3)]
+    axes = [axis for axis in range(3) if len(sides[axis]) > 1]
+    if len(axes) != 2:
+        return ""
+    first = points.world[points.view_index == 0]
+    # The axis that changes more often from point to point runs along the rows.
+    slow, fast = sorted(axes, key=lambda axis: np.count_nonzero(np.diff(first[:, axis])))
+    columns, rows = len(sides[fast]), len(sides[slow])
+    if columns == rows:
+        return ""
+    column, row = (np.searchsorted(sides[axis], points.world[:, axis]) for axis in (fast, slow))
+    place = row * columns + column
+    as_given, exchanged = np.column_stack([column, row]), np.column_stack([place % rows, place // rows])
+    counts = np.bincount(points.view_index)
+    some = np.flatnonzero(counts >= _FEWEST_POINTS)[:_ENOUGH_VIEWS]
+    if not some.size:
+        return ""
+    members = [points.view_index == view for view in some]
+    given, other = (
+        median(np.array([_misfit(grid[one].astype(float), points.pixels[one]) for one in members]))
+        for grid in (as_given, exchanged)
+    )
+    if not (other < _GRID_FITS and other * _GRID_BETTER < given):
+        return ""
+    return (
+        f"the points fit a board of {rows} columns and {columns} rows, but are given with {columns} columns "
+        f"and {rows} rows: rows and columns are exchanged; exchange --cols and --rows, or the numbers in "
+        "the file"
+    )
+
+
+def _misfit(grid: Array, pixels: Array) -> float:
+    """Rms error of a homography over the spread of the pixels."""
+    spread = float(np.sqrt(pixels.var(axis=0).sum()))
+    if not (spread > 0 and (grid.std(axis=0) > 0).all()):
+        return np.inf
+    scaled = (pixels - pixels.mean(axis=0)) / spread
+    seen = np.column_stack([grid, np.ones(len(grid))]) @ homography(grid, scaled).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = seen[:, :2] / seen[:, 2:] - scaled
+        rms = float(np.sqrt((off**2).sum(axis=1).mean()))
+    return rms if np.isfinite(rms) else np.inf
