@@ -335,7 +335,7 @@ def _oblong(calibration: Calibration) -> bool:
     """Whether the pixels are not square: significantly, or by far."""
     A, std = calibration.intrinsics, calibration.std
     ratio = A.alpha_u / A.alpha_v
-    told = TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    told = TOLD * np.hypot(std["alpha_u"], std["alpha_v"]) / A.alpha_v
     return abs(ratio - 1) > _OBLONG + told or max(ratio, 1 / ratio) > _STRETCHED
 
 
