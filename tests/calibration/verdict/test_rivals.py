@@ -19,7 +19,8 @@ from support.wrong_inputs import by_rolling_shutter, of_cameras
 from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.calibration.verdict.assessment import gather_evidence
 from neurocal_cli.calibration.verdict.contest import Contest
-from neurocal_cli.calibration.verdict.rival import LEVEL, Estimate
+from neurocal_cli.calibration.verdict.findings import LEVEL
+from neurocal_cli.calibration.verdict.rival import Estimate
 from neurocal_cli.camera.geometry import Array
 
 OFF = np.array([45.0, -45.0])  # px; of the image centre from where the simulated cameras have it
